@@ -1,4 +1,4 @@
-"""A training step beside processes that never rest, and the share of the machine that is fair."""
+"""A training step while other processes never rest, and the share of the machine that is fair."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ def fair_factor(threads: int, cores: int, processes: int = PROCESSES) -> float:
 
 
 def time_beside(name: str, make: Maker, repeats: int) -> dict[str, Any]:
-    """Time steps alone and beside busy processes.
+    """Time steps alone and while other processes are busy.
 
     Means over all steps, as a step that is held up for long counts in full.
 
     Args:
         name: of what is trained.
         make: makes the run of an engine in a folder.
-        repeats: turns of `STEPS` steps, alone and beside.
+        repeats: turns of `STEPS` steps, alone and among them.
     """
     threads, cores = torch.get_num_threads(), os.cpu_count() or 1
     if threads > cores:

@@ -1,4 +1,4 @@
-"""The scenes that are timed: made from a seed, with the numbers that decide their cost written beside the times."""
+"""The scenes that are timed: made from a seed, with the numbers that decide their cost written with the times."""
 
 from __future__ import annotations
 

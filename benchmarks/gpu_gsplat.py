@@ -1,4 +1,4 @@
-"""Time gsplat beside the CUDA backend, on the same tensors in the same process, one after the other.
+"""Time gsplat and the CUDA backend, on the same tensors in the same process, one after the other.
 
     python benchmarks/gpu_gsplat.py out.json [--cases 270k_1.6MP] [--scenes packed/scenes/garden.npz ...]
 

@@ -3,10 +3,10 @@
     python benchmarks/gpu_kernels.py out.json [--cases 270k_1.6MP] [--scenes packed/scenes/garden.npz ...]
 
 Correctness first: every case begins with the gradients of the two backward families, which must agree; where they do
-not, `failed` says so beside the times. Every part of a case is written when it is there, and one that raises takes
-nothing from the others. Times are medians of CUDA events after warm-up, in milliseconds; beside each stands the sum of
-the kernels' own times by the profiler, and beside every kernel what it has to do at least and its floor on this card
-(`gpu_floors`). `gpu_gsplat.py` puts gsplat's times beside these.
+not, `failed` says so. Every part of a case is written when it is there, and one that raises takes
+nothing from the others. Times are medians of CUDA events after warm-up, in milliseconds; with each stands the sum of
+the kernels' own times by the profiler, and with every kernel what it has to do at least and its floor on this card
+(`gpu_floors`). `gpu_gsplat.py` adds gsplat's times.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def photograph_of(scene: dict[str, Tensor], case: GpuCase) -> Tensor:
 
 
 def by_kernel(scene: dict[str, Tensor], photograph: Tensor, card: Card, backward: str) -> dict[str, Any]:
-    """Time every kernel of a POP step, beside its work and floor."""
+    """Time every kernel of a POP step, with its work and floor."""
     times, loads = kernel_times(scene, photograph, max(STEPS // 4, 1), backward=backward)
     least = floors(loads, card)
     pixels = loads.pixels

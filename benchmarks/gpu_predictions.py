@@ -27,7 +27,7 @@ NOTES = Path(__file__).resolve().parent / "NOTES.md"
 H200 = Card(4.2e12, 132 * 128 * 1.755e9)
 # 270,000 Gaussians, 160,000 of them visible, 1.6 MP, 120 evaluated and 35 contributing pairs a pixel
 CASE = Loads(270_000, 160_000, 2_000_000, 192_000_000, 56_000_000, 1_600_000)
-# assumed: the share of the issue slots, or of the bandwidth, that a kernel keeps busy; what a node costs beside it, ms
+# assumed: the share of the issue slots, or of the bandwidth, that a kernel keeps busy; what a node costs besides, ms
 USED, NODE = 0.7, 0.004
 # kernels, sorting passes and fills that a POP step launches, by the function that launches them
 NODES = {

@@ -30,7 +30,7 @@ class GpuCase:
         n: Gaussians.
         width, height: px.
         size: median of the shorter standard deviations on the screen, px; 0 for a trained scene, which is not made so.
-        seen: share of the Gaussians in front of the camera's frustum; the others stand beside it.
+        seen: share of the Gaussians in front of the camera's frustum; the others stand outside it.
         gathered: share of the seen ones that stand in clusters, so that some tiles have many and others few.
     """
 
@@ -79,7 +79,7 @@ def activated_scene(case: GpuCase, device: torch.device, seed: int = 0) -> dict[
     def normal(*shape: int) -> Tensor:
         return torch.randn(shape, generator=g)
 
-    # places on the screen in widths and heights from its middle: everywhere, around centres, and beside the screen
+    # places on the screen in widths and heights from its middle: everywhere, around centres, and off the screen
     place = uniform(n, 2) - 0.5
     centers, member = 0.8 * (uniform(CLUSTERS, 2) - 0.5), torch.randint(0, CLUSTERS, (n,), generator=g)
     n_gathered = round(n_seen * case.gathered)

@@ -161,7 +161,7 @@ def _render(case: Case, path: Path, backend: str) -> dict[str, Any]:
 
 
 def measured(name: str, case: Case) -> dict[str, Any]:
-    """Do a case in a child and return its peak beside its bound."""
+    """Do a case in a child and return its peak with its bound."""
     with tempfile.TemporaryDirectory() as folder:
         make(case, Path(folder))
         start = time.perf_counter()

@@ -22,7 +22,7 @@ from record import read_json
 
 SASS: Final = Path(__file__).resolve().parent / "results" / "sass.json"
 TILE: Final = 16
-# of a strip: f3 x^2 + linear x + constant; what is left of e beside its integer, six terms, the integer, the scaling;
+# of a strip: f3 x^2 + linear x + constant; what is left of e after its integer, six terms, the integer, the scaling;
 # ceiling, floor and stop with their selections, T - T alpha, T alpha
 EXPONENT, POWER, TAKE = 2, 9, 8
 # whether T went down, sum of weights, three colours; comparison, two selections and the entry's number of dominance

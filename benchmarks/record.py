@@ -1,4 +1,4 @@
-"""What stands beside every result, and how results are written."""
+"""What is noted with every result, and how results are written."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def write_json(path: Path, result: dict[str, Any]) -> None:
-    """Write results beside and rename, so that a file is whole or not there."""
+    """Write results under a temporary name and rename, so that a file is whole or not there."""
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_suffix(".part")
     beside.write_text(text_of(result), encoding="utf-8")

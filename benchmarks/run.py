@@ -5,7 +5,7 @@
     python benchmarks/run.py --capture DIR --factor 4 also training steps on a real capture, and `pop train` on it
 
 Every time is the median of `--repeats` runs in one process after warm-up, in which the backends take turns, so that the
-ratios hold on a noisy machine; threads, machine and load are written beside. No speed is reported on a red gate.
+ratios hold on a noisy machine; threads, machine and load are noted. No speed is reported on a red gate.
 `python docs/tables.py --write` and `python benchmarks/step_tables.py --write` put the results into README.md and
 NOTES.md.
 """
@@ -83,7 +83,7 @@ def memory(_: argparse.Namespace) -> Any:
 
 
 def busy(given: argparse.Namespace) -> Any:
-    """Time training steps beside processes that take all they get."""
+    """Time training steps while other processes take all they get."""
     case = RASTER_CASES[0]
     rows = [time_beside(case.name, lambda folder, engine: run_of_case(case, folder, engine), given.repeats)]
     if given.capture:

@@ -110,14 +110,14 @@ def _shares(did: Mapping[str, int]) -> str:
 
 
 def busy(timed: Mapping[str, Any]) -> str:
-    """Make the table of steps beside busy processes."""
+    """Make the table of steps among busy processes."""
     rows = []
     for case in timed["busy"]:
         for engine, found in case["engines"].items():
             times = [f"{found[name]:.1f} ms" for name in ("alone_ms", "beside_ms")]
             rows.append([case["name"], NAMES[engine], *times, f"{found['of_fair_share']:.2f}"])
     first = timed["busy"][0]
-    head = ["case", "engine", "alone", f"beside {first['processes']} busy processes", "times the fair share"]
+    head = ["case", "engine", "alone", f"among {first['processes']} busy processes", "times the fair share"]
     share = f"({first['processes']} + {first['threads']}) / {first['cores']} = {first['fair_factor']:g}"
     return f"{_table(head, rows)}\n\nThe fair share is {share} times the time alone; means over all steps."
 

@@ -2,7 +2,7 @@
 
     python -m cuda_ext.build [--arch sm_90] [--jobs 2]
 
-No torch is linked, so the module works beside any torch; the Python ABI is the stable one where nanobind offers it
+No torch is linked, so the module works with any torch; the Python ABI is the stable one where nanobind offers it
 (Python 3.12 and newer).
 """
 
@@ -32,7 +32,7 @@ class BuildError(RuntimeError):
 def build(
     arch: str | list[str] | None = None, jobs: int = 2, folder: Path | None = None, verbose: bool = False
 ) -> Path:
-    """Compile the kernels and put the module beside this file.
+    """Compile the kernels and put the module next to this file.
 
     Args:
         arch: for example "sm_90" or ["sm_80", "sm_90"]; None takes this machine's GPU, or 75, 80 and 90 without one.

@@ -29,7 +29,7 @@ _ACTS_AFTER: Final = {
     **dict.fromkeys(("method", "max_steps", "prune_shares", "rounds_start_iter", "score_divisor"), "rounds_start_iter"),
     "sampling_factor": "sample_iter",
 }
-# what a result is collected from, beside what the checkpoint holds
+# what a result is collected from, besides what the checkpoint holds
 _RECORDS: Final = ("cfg.json", "metrics.jsonl", BESIDE, PROBE, "stats/*", "report_data/opacity_*")
 # of the result folder of a base: its checkpoints that rows begin from, until none needs them any more
 _KEPT: Final = "base"

@@ -56,7 +56,7 @@ class Job:
 
     @property
     def factor(self) -> int:
-        """What the scene's photographs are shrunk by, beside what they were published as."""
+        """What the scene's photographs are shrunk by, relative to the published size."""
         return self.scale.factors[self.scene.name]
 
     @property

@@ -20,7 +20,7 @@ __all__ = ["hours", "hours_by_row", "lacking"]
 
 # of one Gaussian in training: parameters, gradients and two moments in float32; a checkpoint has no gradients
 _TRAINING, _CHECKPOINT, _PLY = 4 * 236, 3 * 236, 248
-# beside the Gaussians and photographs: the program and its libraries, and what a GPU's renderer lists and sorts
+# besides the Gaussians and photographs: the program and its libraries, and what a GPU's renderer lists and sorts
 _PROGRAM: Final = 4 * 2**30
 # of each of the twelve renders that a row keeps for its figures: render, photograph and dominant Gaussian of a pixel
 _RENDERS, _OF_PIXEL = 12, 10

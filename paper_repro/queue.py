@@ -55,7 +55,7 @@ class _Child:
         environment = dict(os.environ)
         if threads > 0:
             environment["OMP_NUM_THREADS"] = str(threads)
-        # a session of its own: a terminal's Ctrl-C would reach it beside what is passed on, and two mean "at once"
+        # a session of its own: a terminal's Ctrl-C would reach it as well as what is passed on, and two mean "at once"
         self._process = subprocess.Popen(command, env=environment, start_new_session=True)
         if self.stop:
             self._process.terminate()

@@ -1,8 +1,8 @@
 """The paper's five tables, and one of what goes beyond it, from results: ours, the paper's, the difference, the runs.
 
-At scale "paper" a cell is a mean over the scenes of a data set, as in the paper, and stands beside the paper's number.
+At scale "paper" a cell is a mean over the scenes of a data set, as in the paper, and is followed by the paper's number.
 At any other scale the photographs are others, so there is one block a capture, no difference from any number of the
-paper, and in place of that ratios to one line of the same table, beside the same ratios in the paper.
+paper, and in place of that ratios to one line of the same table, with the same ratios in the paper.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ SEE_MAIN: Final = "see tables 1 and 2"
 
 @dataclass(frozen=True)
 class Cell:
-    """One number of ours beside one of the paper's; every text says something.
+    """One number of ours with one of the paper's; every text says something.
 
     Attributes:
         value: ours; None where there is none.
@@ -119,7 +119,7 @@ class Table:
         header: sentences that stand above it; the first says whether this is the paper's protocol.
         metrics: its columns.
         blocks: one a data set or capture.
-        ratios: ratios to one line, beside the paper's; None at scale "paper".
+        ratios: ratios to one line, with the paper's; None at scale "paper".
         remarks: what of the paper's numbers in it cannot be compared, by label.
     """
 
@@ -173,7 +173,7 @@ def beyond_rows() -> dict[str, str]:
 
 
 def beyond(scale: str, results: Iterable[Result], absent: Iterable[str] = ()) -> Table:
-    """Make the table of what goes beyond the paper: PSNR against bytes, beside the paper's method.
+    """Make the table of what goes beyond the paper: PSNR against bytes, and the paper's method.
 
     Raises:
         PopError: there is no such scale.

@@ -169,7 +169,7 @@ def _train(job: Job, result: Result, options: Options, place: Path, steps: int |
     }
     command = python_command("-c", _TRAIN, json.dumps(asked))
     clone, work = place / "clone", job.work(place / "work")
-    # a session of its own: a terminal's Ctrl-C would reach it beside what is passed on, and two mean "at once"
+    # a session of its own: a terminal's Ctrl-C would reach it as well as what is passed on, and two mean "at once"
     with open(place / "log.txt", "w") as log:
         process = subprocess.Popen(
             command,

@@ -1,6 +1,6 @@
 """Raw parameters to what the renderer uses: scales, opacities, unit quaternions.
 
-The optimizer works on unbounded numbers; these three maps put them in range. Each stands beside its transpose.
+The optimizer works on unbounded numbers; these three maps put them in range. Each stands with its transpose.
 """
 
 from __future__ import annotations

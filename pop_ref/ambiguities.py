@@ -225,7 +225,7 @@ AMBIGUITIES: Final = (
         "A28",
         "M",
         'What is "div = n" in the comparison of L1 and L2?',
-        "L1 / n beside an unchanged D-SSIM, n from 1 to 100",
+        "L1 / n with an unchanged D-SSIM, n from 1 to 100",
         "pop_ref.recipes:L1_DIVIDED",
         ("Recipe.lambda_ssim = 0.0",),
     ),

@@ -1,6 +1,6 @@
 """What rounding may do to a photometric loss and its gradient: running error analysis of D-SSIM, window by window.
 
-Each array carries, beside its values, a bound on their absolute rounding error in units of the arithmetic's eps, to
+Each array carries, besides its values, a bound on their absolute rounding error in units of the arithmetic's eps, to
 first order: a sum inherits its operands' errors, a product inherits |y| ex + |x| ey, and each operation adds the size
 of its result once. A sum under the window is one operation, charged with the sum of absolute values.
 

@@ -1,4 +1,4 @@
-"""L1, L2, and the two photometric objectives, each beside its transpose; SSIM itself is in `ssim`.
+"""L1, L2, and the two photometric objectives, each with its transpose; SSIM itself is in `ssim`.
 
 A mask (True = keep) acts the same way in every loss: the render is replaced by the photograph where the mask is False,
 and the mean runs over the kept pixels only (for SSIM: over the windows whose centre is kept). A pixel that is left out

@@ -1,6 +1,6 @@
 """What rounding may do to the numbers a render decides on: running error analysis of the stages before a pixel.
 
-Each number carries, beside its value, a bound on its absolute rounding error in units of the arithmetic's eps, to first
+A number carries, besides its value, a bound on its absolute rounding error in units of the arithmetic's eps, to first
 order: a sum inherits its operands' errors, a product inherits |y| ex + |x| ey, and each operation adds the size of its
 result once, unless the operands are exact and so is the result in float32. The bound knows conditioning: a depth that
 is a difference of large numbers, or the conic of a needle, carries a large one. `margins` divides distances from

@@ -38,7 +38,7 @@ class DensityConfig:
         grow_grad2d: tau_Den, in NDC units (A9: not retuned for L2).
         inclusive: True selects `>=` tau_Den as Inria does, False `>` as gsplat does.
         grad_denominator: "visible_views" averages over the views that saw the Gaussian, "window" over all (A23).
-        grow_on_gradient: use the gradient rule, eq. 3 (A8: beside the blur rule).
+        grow_on_gradient: use the gradient rule, eq. 3 (A8: in addition to the blur rule).
         grow_on_gradient_in_blur_window: ... also inside the blur window, where else the blur rule works alone (A8).
         grow_scale3d: a Gaussian is small if its largest scale is at most this share of the scene's (A14).
         prune_too_big: prune Gaussians that grow excessively large (A16: off in POP, on where opacities are reset;

@@ -1,4 +1,4 @@
-"""SSIM and D-SSIM, window by window, beside their transposes.
+"""SSIM and D-SSIM, window by window, with their transposes.
 
 SSIM compares a render x with a photograph y through local moments under an 11 x 11 Gaussian window w of sigma 1.5:
 

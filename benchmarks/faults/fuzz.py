@@ -32,7 +32,7 @@ from .readers import READERS, Reader
 
 # of one input: seconds, bytes over what importing takes, letters of a refusal
 SECONDS, MEMORY, LONGEST = 60, 2**30, 1_300
-# of a reader's turn, seconds: long beside the start of a child
+# of a reader's turn, seconds: long compared with the start of a child
 TURN = 4.0
 OUTCOMES = ("read", "refused", "told", "escaped", "crashed", "hung")
 FAILURES = OUTCOMES[3:]

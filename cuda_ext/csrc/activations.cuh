@@ -1,4 +1,4 @@
-// Raw parameters to what the renderer uses; beside pop_ref/activations.py.
+// Raw parameters to what the renderer uses; the counterpart of pop_ref/activations.py.
 #pragma once
 
 #include "real.cuh"

@@ -1,4 +1,4 @@
-// One splat at one pixel; beside pop_ref/alpha.py.
+// One splat at one pixel; the counterpart of pop_ref/alpha.py.
 //
 // Twice: as the oracle writes it, and as the kernels run it. The kernels' form folds log2(e) into the conic once per
 // splat, so that a pair costs two fused multiply-adds, a subtraction and a comparison before the first that needs exp2:

@@ -1,4 +1,4 @@
-// World to camera: centre, directions, points, covariances, the near-plane cull; beside pop_ref/camera.py.
+// World to camera: centre, directions, points, covariances, the near-plane cull; the counterpart of pop_ref/camera.py.
 #pragma once
 
 #include "profile.cuh"

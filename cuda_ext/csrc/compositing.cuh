@@ -1,4 +1,4 @@
-// Front-to-back blending of a column of pixels, and two ways back; beside pop_ref/pixel.py and compositing.py.
+// Front-to-back blending of a column of pixels, and two ways back; the counterpart of pop_ref/pixel.py and compositing.py.
 //
 // A lane owns ROWS pixels under one another, so that what depends on x alone is computed once for all of them.
 // With G = o exp(-sigma) v_alpha the cotangents of a splat are linear in six sums over pixels, its moments:
@@ -27,7 +27,7 @@ struct ForwardColumn {
     int last[ROWS];  // list position of the splat that stopped the pixel, or behind the last
 };
 
-// what a forward pass tells beside the image
+// what a forward pass tells besides the image
 enum class Collect { nothing, dominant, everything };
 
 template <class Real, int ROWS>

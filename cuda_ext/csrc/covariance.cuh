@@ -1,4 +1,4 @@
-// World covariances, Sigma = R diag(s)^2 R^T; beside pop_ref/covariance.py.
+// World covariances, Sigma = R diag(s)^2 R^T; the counterpart of pop_ref/covariance.py.
 #pragma once
 
 #include "activations.cuh"

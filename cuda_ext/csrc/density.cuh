@@ -1,4 +1,4 @@
-// Density control of one row; beside pop_ref/density.py and density_rows.py.
+// Density control of one row; the counterpart of pop_ref/density.py and density_rows.py.
 #pragma once
 
 #include "activations.cuh"

@@ -1,4 +1,4 @@
-// Which Gaussian a pixel belongs to; beside pop_ref/dominance.py.
+// Which Gaussian a pixel belongs to; the counterpart of pop_ref/dominance.py.
 #pragma once
 
 #include "real.cuh"

@@ -1,4 +1,4 @@
-// The splat on the screen: low-pass, antialiasing factor, conic, extents; beside pop_ref/footprint.py.
+// The splat on the screen: low-pass, antialiasing factor, conic, extents; the counterpart of pop_ref/footprint.py.
 #pragma once
 
 #include "profile.cuh"

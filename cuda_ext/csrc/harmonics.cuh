@@ -1,4 +1,4 @@
-// Spherical harmonics to colour; beside pop_ref/harmonics.py, whose signs and homogeneous polynomials it keeps.
+// Spherical harmonics to colour; the counterpart of pop_ref/harmonics.py, whose signs and homogeneous polynomials it keeps.
 #pragma once
 
 #include "real.cuh"

@@ -77,7 +77,7 @@ struct Halo {
     }
 };
 
-// A run across: RUN blurred values of every map, beside one another. inputs(at, values) gives four values of each map,
+// A run across: RUN neighbouring blurred values of every map. inputs(at, values) gives four values of each map,
 // those at `at` of the tile and behind it.
 template <int MAPS, class Inputs>
 __device__ __forceinline__ void blur_across(float (*rows)[HALO][SIDE], Inputs inputs) {

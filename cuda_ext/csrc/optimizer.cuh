@@ -1,4 +1,4 @@
-// Adam on one number; beside pop_ref/optimizer.py.
+// Adam on one number; the counterpart of pop_ref/optimizer.py.
 #pragma once
 
 #include "real.cuh"

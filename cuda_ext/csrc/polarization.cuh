@@ -1,4 +1,4 @@
-// The pull of the polarized opacity prior, and of the entropy that is its rival; beside pop_ref/polarization.py.
+// The pull of the polarized opacity prior, and of the entropy that is its rival; the counterpart of pop_ref/polarization.py.
 #pragma once
 
 #include "activations.cuh"

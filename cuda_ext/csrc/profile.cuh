@@ -1,4 +1,4 @@
-// The table of constants that defines a render; beside pop_ref/constants.py, whose names it keeps.
+// The table of constants that defines a render; the counterpart of pop_ref/constants.py, whose names it keeps.
 #pragma once
 
 #include "real.cuh"

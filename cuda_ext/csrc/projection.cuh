@@ -1,4 +1,4 @@
-// Camera to screen: centres by the pinhole, covariances by its Jacobian; beside pop_ref/projection.py.
+// Camera to screen: centres by the pinhole, covariances by its Jacobian; the counterpart of pop_ref/projection.py.
 #pragma once
 
 #include "profile.cuh"

@@ -1,4 +1,4 @@
-// What a pixel adds to the sums that passes over a view make of every splat; beside pop_ref/contributions.py,
+// What a pixel adds to the sums that passes over a view make of every splat; the counterpart of pop_ref/contributions.py,
 // sensitivity.py, fisher.py and chord.py.
 #pragma once
 

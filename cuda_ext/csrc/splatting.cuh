@@ -1,4 +1,4 @@
-// All that happens to a Gaussian before a pixel is touched, and its transpose; beside pop_ref/splatting.py.
+// All that happens to a Gaussian before a pixel is touched, and its transpose; the counterpart of pop_ref/splatting.py.
 #pragma once
 
 #include "camera.cuh"

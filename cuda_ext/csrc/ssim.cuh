@@ -1,4 +1,4 @@
-// SSIM of one window and its derivatives by the window's moments; beside pop_ref/ssim.py.
+// SSIM of one window and its derivatives by the window's moments; the counterpart of pop_ref/ssim.py.
 #pragma once
 
 #include "real.cuh"

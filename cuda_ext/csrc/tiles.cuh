@@ -1,4 +1,4 @@
-// Which tiles a splat overlaps; beside pop_ref/tiles.py. The exact test is this code's own: it only drops tiles in
+// Which tiles a splat overlaps; the counterpart of pop_ref/tiles.py. The exact test is this code's own: it only drops tiles in
 // which no pixel can reach the alpha floor, so that it changes no image where extents are opacity-aware.
 #pragma once
 

@@ -23,7 +23,7 @@ def count_gpus(check: Check) -> int:
 def ranks_stage(check: Check) -> dict[str, Any]:
     """Train on the first capture by 1, 2, 4 ... GPUs, each step of as many views as the node has GPUs.
 
-    The bits must be the same. What a rank received of the others (`received_bytes`) stands beside the seconds.
+    The bits must be the same. What a rank received of the others (`received_bytes`) stands with the seconds.
     """
     gpus, captures = count_gpus(check), captures_of(check)
     if gpus < 2:

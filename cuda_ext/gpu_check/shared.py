@@ -201,7 +201,7 @@ class Check:
         commit: names trainings that may be gone on with.
         rehearsal: the emulator takes the GPU's place, with tiny cases.
         note: keeps what a stage has found so far.
-        beside: commands that run beside the stages, by name.
+        beside: commands that run along with the stages, by name.
     """
 
     seconds: float

@@ -58,7 +58,7 @@ def bench_stage(check: Check) -> dict[str, Any]:
 
 
 def gsplat_stage(check: Check) -> dict[str, Any]:
-    """Time gsplat beside it, when its own compilation, begun beside earlier stages, has come to an end."""
+    """Time gsplat too, when its own compilation, begun during earlier stages, has come to an end."""
     compiling = check.beside.get("gsplat")
     if compiling is None:
         return skipped("gsplat is not among the wheels that were brought along, or nothing was built")

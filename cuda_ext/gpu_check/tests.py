@@ -33,7 +33,7 @@ LAWS_REHEARSED = "remaining_light_lies"
 
 
 def smoke_stage(check: Check) -> dict[str, Any]:
-    """Replay graphs, overflow buffers, take ten steps beside the CPU, and draw an image beside the oracle's."""
+    """Replay graphs, overflow buffers, compare ten steps with the CPU's and an image with the oracle's."""
     return _pytest(check, "smoke", SMOKE)
 
 
@@ -48,7 +48,7 @@ def laws_of_gaussian_parallel_stage(check: Check) -> dict[str, Any]:
 
 
 def steps_stage(check: Check) -> dict[str, Any]:
-    """Take ten training steps beside the CPU, the same bits twice, overflows, and short trainings beside the CPU's.
+    """Compare ten training steps with the CPU's, the bits of two runs, overflows, and short trainings with the CPU's.
 
     And hold single kernels, rows of every place and size, and other readings of the paper, to the CPU.
     """

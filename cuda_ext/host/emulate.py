@@ -32,7 +32,7 @@ HERE, CUDA_EXT = Path(__file__).parent, Path(cuda_ext.__file__).parent
 FLAGS = ("-std=c++17", "-O1", "-fPIC", "-shared", "-ffp-contract=off", "-fno-strict-aliasing", "-U_FORTIFY_SOURCE")
 # more flags: POP_EMULATED_FLAGS="-fsanitize=address --param asan-stack=0", with libasan preloaded, watches every access
 FLAGS += tuple(os.environ.get("POP_EMULATED_FLAGS", "").split())
-# a domain of its own: beside the compiled extension in one process, its types are not taken for the extension's
+# a domain of its own: with the compiled extension in one process, its types are not taken for the extension's
 FLAGS += ("-fvisibility=hidden", "-Wno-attributes", '-DPOP_CUDA_ARCHS="emulated"', "-DNB_DOMAIN=emulated")
 _LAUNCH = re.compile(r"([A-Za-z_]\w*(?:<[\w\s,:]*>)?)\s*<<<")
 # what the host asks and gets answered at once, also while a graph is captured

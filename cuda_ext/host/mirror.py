@@ -48,7 +48,7 @@ def build_mirror(folder: Path) -> Path:
     if library.exists():
         return library
     folder.mkdir(parents=True, exist_ok=True)
-    # beside and then renamed, so that two test processes cannot load half a library
+    # under a temporary name and then renamed, so that two test processes cannot load half a library
     partial = library.with_suffix(f".{os.getpid()}")
     command = [*compiler, *FLAGS, "-x", "c++", str(HERE / "mirror.cpp"), "-o", str(partial)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -1,4 +1,4 @@
-"""Count the instructions of every kernel's loops in the machine code, beside registers, shared memory and occupancy.
+"""Count the instructions of every kernel's loops in the machine code, with registers, shared memory and occupancy.
 
     python -m cuda_ext.machine_code.count_sass [--arch sm_80 sm_90] [--only blend] [--json out.json] [--notes NOTES.md]
 
@@ -149,7 +149,7 @@ def _loop_entry(loop: Loop, sources: dict[str, list[str]]) -> dict[str, Any]:
 
 
 def _set_iterations(loops: list[dict[str, Any]], places: list[Any]) -> None:
-    """Find how many iterations an unrolled body holds: by its exponentials, or beside the loop that does the rest.
+    """Find how many iterations an unrolled body holds: by its exponentials, or by the loop that does the rest.
 
     Args:
         loops: as described; their iterations are set.

@@ -95,7 +95,7 @@ def count_under_losses(asked: Asked) -> Drawn:
     found = _counts(chosen)
     note = foot(
         *(asked, chosen),
-        "SSIM has weight 0.01 beside 0.99 L1 or L2. Growth by gradient alone: no blur rule, no prior, no reset.",
+        "SSIM has weight 0.01, L1 or L2 0.99. Growth by gradient alone: no blur rule, no prior, no reset.",
     )
     sheet = Sheet(note, 1.75)
     axes = sheet.panel(Margins(right=0.72))

@@ -1,4 +1,4 @@
-"""Where names stand beside the markers of a figure: each at its own, none over another."""
+"""Where names stand next to the markers of a figure: each at its own, none over another."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ Cited = tuple[Any, str]
 
 @dataclass(frozen=True, kw_only=True)
 class Pinned:
-    """A method's table; every value stands beside the place that it is from.
+    """A method's table; every value names the place that it is from.
 
     Attributes:
         method: its name for `pop train --method`.

@@ -222,7 +222,7 @@ def train_capture(
 
     Args:
         config: the settings.
-        options: what `arguments` returns beside them.
+        options: what `arguments` returns with them.
         chosen: a line on the backend.
         argv: the words after `pop train`, for commands.json.
         ranks: the processes that train together.

@@ -65,7 +65,7 @@ FLAGS: Final = (
 # whole vectors where there are any: compilers halve those of sixteen floats unasked, which costs the transpose a fifth
 TUNING: Final = (("-march=native", "-mprefer-vector-width=512"), ("-march=native",), ("-mcpu=native",), ())
 # What a wheel brings for a kind of machine, the highest level first: the compiler's name of the level, and the features
-# by which Linux tells that a processor has it, beside those of the lower ones (the x86-64 psABI, section 3.1.1).
+# by which Linux tells that a processor has it, besides those of the lower ones (the x86-64 psABI, section 3.1.1).
 LEVELS: Final = {
     "x86_64": (
         ("x86-64-v4", "avx512f avx512bw avx512cd avx512dq avx512vl"),
@@ -155,7 +155,7 @@ def build(verbose: bool = False) -> Path:
         return library
     compiler = _compiler()
     try:
-        # beside and then renamed, so that nobody loads half a library
+        # under a temporary name and then renamed, so that nobody loads half a library
         descriptor, partial = tempfile.mkstemp(dir=HERE, prefix="_partial_", suffix=".so")
     except OSError as error:
         raise BuildError(f"{HERE} cannot be written to ({error.strerror}); install the package for yourself") from error

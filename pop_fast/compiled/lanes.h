@@ -285,7 +285,7 @@ template <> inline void sums_of_rows<float>(const float *rows, float sums[16]) {
 // far under any alpha floor. 2^e = 2^i 2^f with |f| <= 1/2: the minimax polynomial of degree 6 is 1.9e-9 off.
 inline Vec<float> exp2_of(Vec<float> e) {
 #ifdef __AVX512DQ__
-  // what is left of e beside the nearest integer, and the scaling by 2^i, are instructions
+  // what is left of e after the nearest integer, and the scaling by 2^i, are instructions
   const Vec<float> f = Vec<float>(_mm512_reduce_ps(__m512(e), _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC));
 #else
   e = select(e < -126.0f, all(-126.0f), e);

@@ -252,7 +252,7 @@ def test_the_same_splat_gives_the_same_bytes(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["spz", "spz-4", "sog", "gltf-spz"])
 def test_a_small_format_is_small(name: str) -> None:
-    # noise hardly compresses; beside a PLY's 248 bytes it is small
+    # noise hardly compresses; compared with a PLY's 248 bytes it is small
     assert len(encoded(name, many(3000))) < 248 * 3000 / 4
 
 

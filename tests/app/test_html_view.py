@@ -104,7 +104,7 @@ def test_a_page_of_a_result_starts_at_a_training_camera_and_asks_for_nothing(
     assert all(url.startswith(("file:", "blob:", "about:", "data:")) for url in tab.requests)
     files = {url.partition("#")[0] for url in tab.requests if url.startswith("file:")}
     assert files == {(tmp_path / "x.html").as_uri()}
-    # beside what the browser changes, what SPZ loses
+    # besides what the browser changes, what SPZ loses
     assert psnr(picture, rendered(splat.params, ViewTensors.of(views[first]), config, splat.sh_degree)) > 40.0
 
 

@@ -1,4 +1,4 @@
-"""Real photographs, where they lie beside the repository: loaded whole, posed right, quickly."""
+"""Real photographs, where they lie next to the repository: loaded whole, posed right, quickly."""
 
 from __future__ import annotations
 

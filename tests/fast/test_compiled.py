@@ -1,4 +1,4 @@
-"""The compiled stages' own promises; the laws judge its numbers, and here they are held beside those of torch."""
+"""The compiled stages' own promises; the laws judge its numbers, and here they are compared with those of torch."""
 
 from __future__ import annotations
 
@@ -292,7 +292,7 @@ def test_no_splat_on_the_screen_makes_empty_lists() -> None:
     assert lists.offsets.tolist() == [0] * (6 * 5 + 1)
 
 
-# The compiled sums over pixels beside torch's: any tile size, long lists, clamped alphas, any number of threads.
+# The compiled sums over pixels against torch's: any tile size, long lists, clamped alphas, any number of threads.
 
 BACKGROUND = torch.tensor([0.3, 0.1, 0.2], dtype=torch.float64)
 PIXEL_MAP = torch.rand(HEIGHT, WIDTH, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
@@ -405,7 +405,7 @@ def test_sensitivities_take_any_number_of_channels(channels: int) -> None:
         passes_native()[1](*of_view[:-1], torch.zeros(channels + 1, dtype=torch.float64))
 
 
-# Covariances, projection and colours of the compiled library beside those of torch; the laws judge whole images.
+# Covariances, projection and colours of the compiled library against those of torch; the laws judge whole images.
 
 
 def projected(stages: ModuleType, profile: Profile, antialiased: bool, n: int = 3000) -> tuple[list[Tensor], ...]:

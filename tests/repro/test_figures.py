@@ -252,7 +252,7 @@ def test_the_marked_shares_are_those_of_the_histogram():
     said = texts(made)
     for text in ("10.0 % under 0.1", "25.0 % over 0.9", "paper: 33.7 %", "paper: 19.9 %"):
         assert text in said
-    # beside another capture stands no number of the paper's
+    # with another capture stands no number of the paper's
     other = drawn("2", [result("3dgs", n=1000, opacity_histogram=counts, schedule=STEPS)])
     assert "paper:" not in texts(other)
     assert "The paper's figure is of another capture, kitchen." in texts(other).replace("\n", " ")
@@ -427,7 +427,7 @@ def test_the_list_of_figures_is_read_without_drawing():
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2])
 
 
-# Names beside markers: each at its own, none over another, inside the frame where that is possible.
+# Names next to markers: each at its own, none over another, inside the frame where that is possible.
 
 FRAME = (30.0, 70.0, 230.0, 210.0)
 # three that stand close together, two that nearly coincide, two that overlap, and two alone

@@ -56,7 +56,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "without SSIM": {"lambda_ssim": 0.0},
     "without the prior": {"lambda_pop": 0.0},
     "entropy in the place of the prior": {"lambda_pop": 0.0, "lambda_entropy": 0.05},
-    "entropy beside the prior": {"lambda_entropy": 0.05},
+    "entropy with the prior": {"lambda_entropy": 0.05},
     "the prior over what is seen": {"pop_over": "visible"},
     "the prior over the window": {"pop_views": "window"},
     "blur of any view": {"blur_window": "any_view"},

@@ -1,4 +1,4 @@
-"""What a widget says beside its picture is what the oracle computes, at the values that its prompt suggests.
+"""What a widget says with its picture is what the oracle computes, at the values that its prompt suggests.
 
 The widgets' own scripts run in node, on as much of a page as they need.
 """

@@ -21,7 +21,7 @@ _LONGEST_PATH: Final = 500
 
 
 class Panel:
-    """Controls beside the picture.
+    """Controls next to the picture.
 
     Args:
         client: viser's handle of the browser.

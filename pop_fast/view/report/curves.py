@@ -211,7 +211,7 @@ def draw_histogram(title: str, shares: Sequence[float], top: float, color: str, 
         title: the heading.
         shares: share of Gaussians in each bin, in [0, 1].
         top: the share at the top of the axis, the same in charts that stand side by side; a taller bar is cut off
-            there and its share written beside it.
+            there and its share written next to it.
         color: CSS colour of the bars.
         notes: short remarks under the title.
     """

@@ -139,7 +139,7 @@ def test_passes_are_launched_on_the_tensors_device(guarded):
     assert bool((made.dominant_points(params, 0, 3)[1] >= 0).any())
 
 
-# What the blend does beside blending: tiles ordered by their lists' lengths, maps that are told when asked.
+# What the blend does besides blending: tiles ordered by their lists' lengths, maps that are told when asked.
 
 BLEND_EXTRAS_WIDTH, BLEND_EXTRAS_HEIGHT = 90, 50
 BIN_WIDTH = 8  # lists whose lengths differ by less may stand in any order

@@ -1,4 +1,4 @@
-"""`pop train --backend cuda` beside `--backend fast` on a tiny capture, and beside itself, interrupted."""
+"""`pop train --backend cuda` against `--backend fast` on a tiny capture, and against itself, interrupted."""
 
 from __future__ import annotations
 
@@ -46,6 +46,20 @@ CASES = {
     "visible": ({"strategy": {"pop_over": "visible"}}, lambda capture: capture),
     "window": (
         {"strategy": {"pop_views": "window", "refine_start_iter": 8, "refine_stop_iter": 7}},
+        lambda capture: capture,
+    ),
+    "entropy": ({"strategy": {"lambda_pop": 0.0, "lambda_entropy": 0.05}}, lambda capture: capture),
+    "regularizers": (
+        {"opacity_reg": 0.1, "scale_reg": 0.05, "strategy": {"lambda_entropy": 0.05}},
+        lambda capture: capture,
+    ),
+    "batch, regularizers": (
+        {
+            "batch_size": 2,
+            "opacity_reg": 0.1,
+            "scale_reg": 0.05,
+            "strategy": {"lambda_pop": 0.0, "lambda_entropy": 0.05},
+        },
         lambda capture: capture,
     ),
     "any view": ({"strategy": {"blur_window": "any_view"}}, masked),

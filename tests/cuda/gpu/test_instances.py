@@ -122,7 +122,7 @@ def test_room_shrinks_after_a_phase_of_fat_splats_and_the_steps_stay_the_same(gp
     assert trainer.grown == grown
 
 
-# Ten steps on the GPU beside the CPU's under other readings of what the paper leaves open (A1, A2, A12).
+# Ten steps on the GPU against the CPU's under other readings of what the paper leaves open (A1, A2, A12).
 
 READINGS = (
     {"pop_over": "visible"},

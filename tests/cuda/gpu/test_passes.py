@@ -1,4 +1,4 @@
-"""Passes over views on the GPU beside the CPU's in float64, and their bits from run to run."""
+"""Passes over views on the GPU against the CPU's in float64, and their bits from run to run."""
 
 from __future__ import annotations
 

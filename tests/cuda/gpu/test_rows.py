@@ -204,7 +204,7 @@ def test_a_field_that_the_kernels_do_not_have_is_refused(gpu):
         fill(kernels.View(), width=torch.zeros(1, device=gpu))
 
 
-# The loss kernels beside float64: sizes around a block's 32 pixels, both borders, masks, both pixelwise terms.
+# The loss kernels against float64: sizes around a block's 32 pixels, both borders, masks, both pixelwise terms.
 
 SIZES = [(11, 12), (32, 32), (33, 31), (21, 70), (70, 43)]
 

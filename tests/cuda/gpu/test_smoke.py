@@ -1,4 +1,4 @@
-"""The first half minute on a card: an image beside the oracle's, and fused steps of which no graph is made."""
+"""The first half minute on a card: an image against the oracle's, and fused steps of which no graph is made."""
 
 from __future__ import annotations
 

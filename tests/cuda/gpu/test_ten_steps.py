@@ -1,4 +1,4 @@
-"""Ten steps of training on the GPU beside the same ten on the CPU, and the same bits twice."""
+"""Ten steps of training on the GPU against the same ten on the CPU, and the same bits twice."""
 
 from __future__ import annotations
 
