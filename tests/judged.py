@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import os
 import pkgutil
 from collections.abc import Iterable
 from typing import Any
@@ -15,6 +16,8 @@ from pop_ref.conformance.backends import SHIPPED, Absent, shipped, shipped_or_ab
 from pop_ref.conformance.law import missing
 from pop_ref.conformance.plugin import parametrize_backends
 
+# what is dear is judged in one precision, every night in both (.github/workflows/nightly.yml)
+EVERY_PRECISION = os.environ.get("POP_EVERY_PRECISION") == "1"
 # test_alpha is written alpha
 LAW_MODULES = tuple(sorted(m.name.removeprefix("test_") for m in pkgutil.iter_modules(laws.__path__)))
 
@@ -39,8 +42,12 @@ def judge_own_backends(metafunc: pytest.Metafunc) -> None:
     """
     stated = getattr(metafunc.function, "law", None)
     everywhere, compiled = own_backends()
-    if metafunc.cls is not None and metafunc.cls.__name__ == "TestAgreement":
-        everywhere = [backend for backend in everywhere if backend.name != "oracle"]
+    name = "" if metafunc.cls is None else metafunc.cls.__name__
+    left_out = {"oracle"} if name in ("TestAgreement", "TestSignaturePairs") else set[str]()
+    if name == "TestSignaturePairs" and not EVERY_PRECISION:
+        # most of the time is the oracle's, once for each precision
+        left_out |= {"fast64", "compiled32"}
+    everywhere, compiled = ([b for b in of if b.name not in left_out] for of in (everywhere, compiled))
     concerned = [b for b in compiled if isinstance(b, Absent) or not (stated and missing(b, stated.needs))]
     parametrize_backends(metafunc, [*everywhere, *concerned])
 

@@ -172,6 +172,7 @@ def program(name: str, package: str, backend: str, dtype: str) -> Any:
     """
     from pop_ref.conformance.torch_adapter import TorchAdapter
     from pop_ref.conformance.torch_training import training_stages
+    from pop_ref.conformance.torch_watched import watching_stages
 
     rasterization = partial(function_named(f"{package}.api.rasterize:rasterization"), backend=backend)
     stages = f"{package}.stages" if backend == "fast" else f"{package}.{backend}"
@@ -180,7 +181,7 @@ def program(name: str, package: str, backend: str, dtype: str) -> Any:
         # what trains in this precision is the native step, which has an Adam of its own
         native = importlib.import_module(f"{package}.compiled.native_step")
         own_adam = {name: getattr(native, name) for name in ("adam_step", "adam_steps")}
-    trains = training_stages(package, own_adam.get("adam_step")) | own_adam
+    trains = training_stages(package, own_adam.get("adam_step")) | own_adam | watching_stages(package, backend, dtype)
     if backend == "compiled":
         # one module of its own holds the passes over views
         scores = importlib.import_module(f"{package}.compiled.scores")

@@ -54,8 +54,10 @@ packed and not, with signed and absolute gradients. `pop_ref.methods` says what 
 Taming-3DGS, Speedy-Splat and PUP-3DGS do at every step. `torch_training.training_stages` makes stage functions of a
 trainer's strategies, row operations, schedules and optimizers, and `TorchAdapter(stages=...)` takes any such functions.
 `--strategy gsplat.strategy:DefaultStrategy` judges somebody's strategy by the laws of training that are about no
-method. An engine with an Adam of its own moves the rows by it (`training_stages(package, adam)`). Pictures take no
-part: that the step of an engine makes its statistics of renders rightly is not judged here.
+method. An engine with an Adam of its own moves the rows by it (`training_stages(package, adam)`). An
+engine's own steps are watched, too (`watched.py`): with rates of 0 they draw photographs, go back, collect and move
+nothing, and after each step gradient sums, views, blur flags, dominated pixels, extents and gradients that wait are
+the oracle's; so are the sums of passes over photographs.
 
 What training adds where photographs are few or unlike, depth at sparse points, means of opacities and sizes,
 exposures, other backgrounds, corrections of cameras, is judged as stage functions of these names, with gradients.

@@ -14,6 +14,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+import numpy as np
+
 from pop_ref.conformance.calls import Call
 from pop_ref.conformance.meta import assert_dominance, assert_rows, assert_tiles_where_told
 from pop_ref.conformance.narrowing import RasterizerError, breaks, broken_by, raised
@@ -46,7 +48,7 @@ FACTORS: Final[dict[str, tuple[Level, ...]]] = {
         ("1", {}), ("2", {"count": 2}), ("3", {"count": 3}), ("2, the first sees nothing", {"count": 2, "blind": 0}),
         ("2, the last sees nothing", {"count": 2, "blind": 1}),
     ),
-    "batch": _levels(("none", {}), ("[2]", {"batch": (2,)}), ("[1, 2]", {"batch": (1, 2)})),
+    "batch": _levels(("none", {}), ("[1]", {"batch": (1,)}), ("[2]", {"batch": (2,)}), ("[1, 2]", {"batch": (1, 2)})),
     "packed": _levels(("False", {}), ("True", {"packed": True})),
     "colors": _levels(
         ("harmonics of degree 1", {}), ("harmonics of degree 0", {"degree": 0}),
@@ -208,7 +210,16 @@ def call_of(backend: Any, row: Mapping[str, str], number: int) -> Call:
     asks: dict[str, Any] = {}
     for factor, name in row.items():
         asks |= level(factor, name).asks
-    return clear_call(backend, first_seed=16 * number, **asks)
+    # what a scene is, as a backend reads it, follows from these
+    key = (tuple(row.items()), number, np.dtype(backend.dtype).name, backend.profile, type(backend).sees)
+    side = getattr(backend, "own_tile_size", None) if not backend.takes("tile_size") else None
+    if (*key, side) not in _calls:
+        _calls[*key, side] = clear_call(backend, first_seed=16 * number, **asks)
+    return _calls[*key, side]
+
+
+# by row and reader: two mutants are asked the same
+_calls: dict[tuple[Any, ...], Call] = {}
 
 
 # by what a law compares of a call

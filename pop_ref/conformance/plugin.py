@@ -11,6 +11,7 @@ import json
 import os
 import re
 import time
+import traceback
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any
@@ -218,6 +219,58 @@ def pytest_collection_finish(session: pytest.Session) -> None:
         FAILURE_REPORTS.append(failure_saver(Path(folder)))
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Generator[None, Any, Any]:
+    """Tell of a broken law what its report says, and where its error was raised, unless --tb is given."""
+    report = yield
+    usual = item.config.getoption("tbstyle") == "auto" and _chosen(item.config)
+    if report.failed and call.excinfo is not None and "law" in dict(item.user_properties) and usual:
+        report.longrepr = "\n".join(f"E   {line}" for line in _told(call.excinfo.value))
+    return report
+
+
+def _told(error: BaseException) -> list[str]:
+    """Return the lines that tell of an error: its words, its notes, and the last lines of code outside the kit."""
+    first, *rest = str(error).splitlines() or [""]
+    lines = [f"{type(error).__name__}: {first}", *rest]
+    cause = error.__cause__ or error
+    inside = re.compile(re.escape(str(Path(__file__).parent)) + r"|[/\\](_pytest|pluggy|hypothesis)[/\\]")
+    outside = [at for at in traceback.extract_tb(cause.__traceback__) if not inside.search(at.filename)]
+    lines += [f"raised at {at.filename}:{at.lineno}: {at.line}" for at in outside[-2:]]
+    return [*lines, *(line for note in getattr(error, "__notes__", ()) for line in note.splitlines())]
+
+
+def _cause(text: str) -> str:
+    """Return what a failure's report names as its cause, or what differs first."""
+    told = dict(line.split(": ", 1) for line in DIFFERENCES.findall(text) if line.startswith("first "))
+    if "first cause" in told:
+        return f"{told['first cause']}: {told['first difference']}"
+    first = next(iter(told.items()), None)
+    return text.splitlines()[0].removeprefix("E").strip() if first is None else ": ".join(first)
+
+
+def _law_of(report: Any) -> str:
+    return dict(report.user_properties)["law"][2].replace("_", " ")
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    """Say how many laws hold, and what breaks, each cause once with the laws that it breaks."""
+    if not _chosen(config):
+        return
+    of = {kind: [r for r in terminalreporter.stats.get(kind, ()) if "law" in dict(r.user_properties)]
+          for kind in ("passed", "failed", "skipped")}  # fmt: skip
+    causes: dict[str, list[str]] = {}
+    for report in of["failed"]:
+        causes.setdefault(_cause(report.longreprtext), []).append(_law_of(report))
+    terminalreporter.section("conformance")
+    counts = f"{len(of['passed'])} laws hold, broken {len(of['failed'])}, not judged {len(of['skipped'])}"
+    terminalreporter.write_line(f"{_chosen(config)}: {counts}")
+    for cause, laws in sorted(causes.items(), key=lambda pair: -len(pair[1])):
+        terminalreporter.write_line(f"  {cause}")
+        for name in laws:
+            terminalreporter.write_line(f"      breaks: {name}")
+
+
 def pytest_sessionfinish(session: pytest.Session) -> None:
     """Write what the tolerances needed."""
     path = session.config.getoption("--record-worst")
@@ -254,7 +307,7 @@ class _Recorder:
             detail = str(report.longrepr[2]).removeprefix("Skipped: ")
         elif report.failed:
             crash = getattr(report.longrepr, "reprcrash", None)
-            detail = str(crash.message if crash else report.longrepr).splitlines()[0]
+            detail = str(crash.message if crash else report.longrepr).splitlines()[0].removeprefix("E   ")
             differences = tuple(DIFFERENCES.findall(report.longreprtext))
         more: dict[str, Any] = dict(report.user_properties)
         backend, stage, law = named

@@ -317,18 +317,18 @@ class TorchAdapter(Adapter):
         """
         if self._rasterization is None:
             raise LookupError(f"{self.name} has no rasterization function")
-        scene, pulls = call.first.scene, v_images is not None
+        pulls, (B, C, _), camera = v_images is not None, call.shape, call.first.scene.camera
         leaves = {name: self._tensor(value).requires_grad_(pulls) for name, value in call.tensors().items()}
         images, alphas, meta = self._rasterization(
             **{"quats": None, "scales": None} | leaves,
             Ks=self._tensor(call.intrinsics()),
-            width=scene.camera.width,
-            height=scene.camera.height,
+            width=(W := camera.width),
+            height=(H := camera.height),
             sh_degree=call.sh_degree,
             **self._taken(packed=call.packed, tile_size=call.tile_size, **self._asked_by(call)),
             **(self._absgrad if pulls and call.absgrad else {}),
         )
-        (B, C, _), H, W = call.shape, scene.camera.height, scene.camera.width
+        assert images.shape[:-1] == (*call.batch, C, H, W), f"images have shape {[*images.shape]}"
         images, alphas = images.reshape(B, C, H, W, -1), alphas.reshape(B, C, H, W)
         gradients: dict[str, np.ndarray] = {}
         if pulls:

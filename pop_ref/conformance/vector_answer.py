@@ -39,6 +39,7 @@ from pop_ref.conformance.vector_calls import FORMS, KINDS
 from pop_ref.conformance.vector_methods import Replay, step_sums
 from pop_ref.conformance.vector_stages import made, outputs
 from pop_ref.constants import PAPER, Profile
+from pop_ref.covariance import covars_from_quats_scales_vjp
 from pop_ref.density import DensityConfig, rows_from_params
 from pop_ref.records import Camera, Gaussians
 
@@ -131,13 +132,38 @@ def _call(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
     found |= {name: np.full(entries, called.meta[name]) for name in told if name in called.meta}
     if "dominant_counts" in called.meta:
         found["dominant_counts"] = called.meta["dominant_counts"].reshape(call.shape)
+    if not call.batch:
+        found |= _lists(backend, call, called.meta, arrays)
     for name in ("radii", "means2d", "depths", "conics"):
         rows = unpacked(call, called.meta[name], called.meta) if name in called.meta else None
         found |= {} if rows is None else {name: rows}
     names = {name: name for name in ("means", "quats", "scales", "opacities", "viewmats", "backgrounds")}
     names["colors"] = "colors" if call.sh_degree is None else "sh"
     found |= {f"v_{names[name]}": call.by_entry(v) for name, v in called.gradients.items() if name in names}
+    if "covars" in called.gradients:
+        found |= _through_covariances(call, call.by_entry(called.gradients["covars"]))
     return found if batched else {name: value[0] for name, value in found.items()}
+
+
+def _lists(backend: Any, call: Call, meta: Any, arrays: Arrays) -> Arrays:
+    """Return what meta tells of tiles, each with an axis for the one entry; nothing of tiles of another side."""
+    if not backend.takes("tile_size") or not all(name in meta for name in ("flatten_ids", "isect_ids")):
+        return {}
+    found = {"list_rows": meta["flatten_ids"][None], "list_keys": (meta["isect_ids"] >> 32)[None]}
+    counts = unpacked(call, meta["tiles_per_gauss"], meta) if "tiles_per_gauss" in meta else None
+    found |= {} if counts is None else {"tiles_per_gauss": counts}
+    found = {name: value.astype(np.int64) for name, value in found.items()}
+    # lists of another length are wrong from end to end
+    return {name: value if value[0].shape == arrays[name].shape else np.full((1, *arrays[name].shape), -1)
+            for name, value in found.items()}  # fmt: skip
+
+
+def _through_covariances(call: Call, v_covars: np.ndarray) -> Arrays:
+    symmetric, of_entries = 0.5 * (v_covars + np.swapaxes(v_covars, -1, -2)), [row[0] for row in call.frames]
+    pulled = [covars_from_quats_scales_vjp(frame.scene.gaussians.quats, frame.scene.gaussians.scales, v)
+              for frame, v in zip(of_entries, symmetric, strict=True)]  # fmt: skip
+    v_quats, v_scales = zip(*pulled, strict=True)
+    return {"v_quats": np.stack(v_quats), "v_scales": np.stack(v_scales)}
 
 
 def call_of(arrays: Arrays, options: dict[str, Any]) -> Call:

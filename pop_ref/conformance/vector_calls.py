@@ -11,11 +11,12 @@ from typing import Any, Final
 import numpy as np
 
 from pop_ref.conformance.adapter import Adapter
-from pop_ref.conformance.calls import Call
+from pop_ref.conformance.calls import Call, Frame
 from pop_ref.conformance.signature import Expected, expectations
 from pop_ref.conformance.vector_schema import IMAGES, INPUTS, entry, equal, output
-from pop_ref.conformance.views import clear_call
+from pop_ref.conformance.views import call_for, clear_call
 from pop_ref.depth import RenderMode
+from pop_ref.splatting import project
 
 # options that change the form of what is given, and no image
 FORMS: Final = ("packed", "covars", "no_background")
@@ -73,7 +74,27 @@ def calls() -> dict[str, Call]:
         "without_backgrounds": seen(35, 2, no_background=True),
         "plain_batches": seen(36, 2, batch=(2,), channels=3),
         "small_splats_of_one_camera": seen(37, 1, radius_clip=4.5),
+        "packed_and_the_last_camera_is_blind": seen(38, 3, packed=True, blind=2),
+        "a_tile_for_every_pixel": seen(39, 2, size=(35, 33), tile_size=1),
+        "a_centre_on_the_far_plane": _on_the_far_plane(reader),
     }
+
+
+def _on_the_far_plane(reader: Adapter) -> Call:
+    """Return a call of a camera that does not turn, with a centre on its far plane and one beyond."""
+    frame = call_for(reader, 600).first
+    placed = {"means": np.array([[0.0, 0.0, 3.0], [0.25, 0.0, 5.0]]), "viewmat": np.eye(4)}
+    return Call(((Frame(frame.scene.rows([0, 1]).with_overrides(**placed)),),), planes={"far_plane": 3.0})
+
+
+def _clear_of_the_far_plane(call: Call) -> Call:
+    """Return a call with the plane a little beyond a centre that lies on it: it draws the same, and clearly so."""
+    far = call.planes.get("far_plane")
+    depths = [project(f.scene.gaussians, f.scene.camera, f.scene.sh_degree, f.scene.profile).depths
+              for _, _, f in call.each]  # fmt: skip
+    if far is None or not np.any(np.array(depths) == far):
+        return call
+    return replace(call, planes={**call.planes, "far_plane": far * (1.0 + 2.0**-8)})
 
 
 def kind_of(call: Call) -> str:
@@ -100,7 +121,17 @@ _MASKS: Final = {
     "smooth_rows": ("[N]", "no kink of this Gaussian is within rounding for any camera"),
     "smooth_rows_of_each": ("[C, N]", "smooth_rows, once more for each camera"),
     "all_smooth": ("[]", "smooth_rows holds everywhere"),
+    "all_clear": ("[]", "clear_rows holds everywhere"),
 }
+# gsplat's lists of intersections; of an entry of a batch they are left out
+_LISTS: Final = {
+    "tiles_per_gauss": ("[C, N]", "tiles that each Gaussian's extent overlaps, 'tiles_per_gauss' of meta"),
+    "list_rows": ("[I]", "who lies in each tile of each camera, front to back: row c N + i, or where rows are packed "
+                  "the place among visible ones; 'flatten_ids' of meta"),
+    "list_keys": ("[I]", "camera and tile of each: c 2^b + tile, b the bits of the number of tiles; the upper 32 bits "
+                  "of 'isect_ids' of meta"),
+}  # fmt: skip
+_WHOLE_LISTS: Final = "; leave it out where your lists are tighter than whole extents"
 
 
 def call_kind(kind: str) -> dict[str, Any]:
@@ -129,6 +160,9 @@ def call_kind(kind: str) -> dict[str, Any]:
     arrays["dominant_counts"] = entry("output", "[C, N]", counted, "int64", [equal("counted_rows")])
     extents = "extents along x and y, px, 0 where culled"
     arrays["radii"] = entry("output", "[C, N, 2]", extents, "int64", [equal("clear_rows")])
+    for name, (shape, said) in () if batches else _LISTS.items():
+        where = "clear_rows" if shape == "[C, N]" else "all_clear"
+        arrays[name] = entry("output", shape, said + _WHOLE_LISTS, "int64", [equal(where)])
     for name, about in _OF_ROWS.items():
         arrays |= output(name, *about, "meta.rows", "visible_rows")
     for name in (*_GAUSSIANS, colors):
@@ -148,7 +182,7 @@ def call_kind(kind: str) -> dict[str, Any]:
 
 def call_arrays(call: Call) -> dict[str, np.ndarray]:
     """Return a call's arrays; of batches the entries lie along one axis."""
-    entries = expectations(Adapter(), call)
+    entries = expectations(Adapter(), _clear_of_the_far_plane(call))
     rows = [_entry(call, b, row) for b, row in enumerate(entries)]
     return {name: np.stack([row[name] for row in rows]) for name in rows[0]} if call.batch else rows[0]
 
@@ -178,8 +212,25 @@ def _entry(call: Call, b: int, row: list[Expected]) -> dict[str, np.ndarray]:
     arrays["counted_rows"] = np.stack([_counted(e, n) for e in row])
     smooth = ~np.any([e.error_bounds.screen.kinked for e in row], axis=0)
     arrays |= {"smooth_rows": smooth, "smooth_rows_of_each": np.tile(smooth, (len(row), 1))}
+    arrays |= {} if call.batch else _lists(call, row)
     arrays |= _splats(row) | _gradients(row, colors, call.camera_colors)
-    return arrays | {"all_smooth": np.array(np.all(smooth))}
+    return arrays | {"all_smooth": np.array(np.all(smooth)), "all_clear": np.array(np.all(arrays["clear_rows"]))}
+
+
+def _lists(call: Call, row: list[Expected]) -> dict[str, np.ndarray]:
+    """Return the lists of intersections of all cameras, one after the other."""
+    n, rows, keys = len(row[0].render.splats.visible), list[int](), list[int]()
+    before, counts = 0, np.zeros((len(row), n), dtype=np.int64)
+    for c, e in enumerate(row):
+        visible = e.render.splats.visible
+        place = before + (np.cumsum(visible) - 1 if call.packed else np.arange(n))
+        before += int(np.sum(visible)) if call.packed else n
+        bits = len(e.render.tile_lists).bit_length()
+        for tile, listed in enumerate(e.render.tile_lists):
+            rows += [int(place[i]) for i in listed]
+            keys += [(c << bits) | tile] * len(listed)
+            counts[c, listed] += 1
+    return {"tiles_per_gauss": counts, "list_rows": np.array(rows), "list_keys": np.array(keys)}
 
 
 def _counted(e: Expected, n: int) -> np.ndarray:

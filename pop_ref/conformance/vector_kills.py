@@ -1,7 +1,10 @@
-"""What the portable vectors alone would have noticed: `python -m pop_ref.conformance.vector_kills FILE`.
+"""What the portable vectors alone would have noticed: `python -m pop_ref.conformance.vector_kills FILE [--more]`.
 
 Every mutant answers the vectors as a port would; it is killed where an array fails, or where it raises. The laws see
 more: they draw scenes, compare a rasterizer with itself, and judge stages that no vector is about.
+
+With `--more`, after vectors or mutants were added and none was changed, whom the file says to be killed stays so, and
+the others are tried.
 """
 
 from __future__ import annotations
@@ -54,14 +57,18 @@ def _index(folder: Path) -> dict[str, Any]:
     return read_index(folder)
 
 
-def kills(report: Callable[[str, str | None], None] = lambda name, found: None) -> dict[str, dict[str, str | None]]:
+Kills = dict[str, dict[str, str | None]]
+
+
+def kills(report: Callable[[str, str | None], None] = lambda name, found: None, known: Kills | None = None) -> Kills:
     """Return by family and mutant what fails first, None for who survives; sound backends are a family, too.
 
     Args:
         report: is given every name and result as it comes.
+        known: who is killed in these is not tried.
     """
     families = {"stages of the oracle": MUTANTS, "the program that trains": PROGRAM, "whole rasterizers": BLACK_BOXES}
-    found: dict[str, dict[str, str | None]] = {family: {} for family in (*families, "sound")}
+    found: Kills = {family: {} for family in (*families, "sound")}
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "vectors"
         export(folder)
@@ -69,8 +76,10 @@ def kills(report: Callable[[str, str | None], None] = lambda name, found: None) 
         for family, mutants in families.items():
             trials += [(family, mutant.name, partial(alive, mutant)) for mutant in mutants]
         for family, name, living in trials:
-            with living() as backend:
-                found[family][name] = first_failure(folder, backend)
+            found[family][name] = (known or found).get(family, {}).get(name)
+            if found[family][name] is None:
+                with living() as backend:
+                    found[family][name] = first_failure(folder, backend)
             report(name, found[family][name])
         for name in SHIPPED:
             found["sound"][name] = first_failure(folder, shipped(name))
@@ -79,10 +88,12 @@ def kills(report: Callable[[str, str | None], None] = lambda name, found: None) 
 
 def main(words: list[str]) -> int:
     """Write the results."""
-    if len(words) != 1:
-        print("usage: python -m pop_ref.conformance.vector_kills FILE")
+    more = words[1:] == ["--more"]
+    if len(words) != 1 + more:
+        print("usage: python -m pop_ref.conformance.vector_kills FILE [--more]")
         return 2
-    found = kills(lambda name, first: print(f"{name}: {first or 'survives'}", flush=True))
+    known = json.loads(Path(words[0]).read_text(encoding="utf-8")) if more else None
+    found = kills(lambda name, first: print(f"{name}: {first or 'survives'}", flush=True), known)
     Path(words[0]).write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     return 0
 

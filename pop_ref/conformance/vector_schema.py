@@ -53,6 +53,7 @@ MODEL: Final = (
 )
 AXES: Final = {
     "C": "cameras",
+    "I": "entries of all tiles' lists",
     "E": "entries of a batch, along one axis",
     "D": "channels of plain colours, or of a picture",
     "X": "channels of an image: colours, or depth, or both, depth last",
@@ -79,7 +80,8 @@ OPTIONS: Final = {
     "radius_clip": "px; Gaussians whose extents 'radii' are both at most this are left out of a call; 0: nobody",
     "batch": "dimensions of a call's batch, whose entries lie along E; none without one",
     "packed": "a renderer that has it keeps rows of visible Gaussians only; arrays stay those of all",
-    "covars": "a renderer that takes covariances is given rotation(quat) diag(scales)^2 rotation(quat)^T instead",
+    "covars": "a renderer that takes covariances is given rotation(quat) diag(scales)^2 rotation(quat)^T instead; "
+    "v_quats and v_scales are what the symmetric part of its gradient by these gives",
     "no_background": "a renderer that can be called without a background is, and backgrounds are black",
     "profile.near_plane, near_inclusive": "Gaussians with camera z < near_plane are left out; z = near_plane too if "
     "near_inclusive (D1)",

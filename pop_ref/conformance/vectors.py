@@ -106,6 +106,24 @@ def _stages(splats: Any, error_bounds: PixelErrorBounds) -> dict[str, np.ndarray
     return {**found, "radii": splats.radii}
 
 
+# rows that nobody sees; the next ones need a third byte
+_HIDDEN = 70_000
+
+
+def _behind_rows(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return a vector of one image whose Gaussians are the last ones, after thousands behind the camera."""
+    kinds_of, found = render_kind()["arrays"], dict(arrays)
+    R, t = arrays["viewmat"][:3, :3], arrays["viewmat"][:3, 3]
+    hidden = {"means": R.T @ (np.array([0.0, 0.0, -8.0]) - t), "quats": np.array([1.0, 0.0, 0.0, 0.0]),
+              "scales": np.ones(3), "opacities": 0.5, "clear_rows": True, "smooth_rows": True}  # fmt: skip
+    for name, array in arrays.items():
+        if kinds_of[name]["shape"].startswith("[N"):
+            row = np.broadcast_to(np.asarray(hidden.get(name, 0.0)), array.shape[1:]).astype(np.float32)
+            found[name] = np.concatenate([np.repeat(row[None], _HIDDEN, axis=0).astype(array.dtype), array])
+    ids = arrays["dominant_ids"]
+    return found | {"dominant_ids": np.where(ids >= 0, ids + _HIDDEN, ids)}
+
+
 def export(folder: Path) -> list[str]:
     """Write every vector and the index into a folder; return the vectors' names."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -119,6 +137,9 @@ def export(folder: Path) -> list[str]:
     for name, drawn in vector_scenes().items():
         scene = rounded_to(drawn, np.float32)
         write(name, "render", expected_arrays(scene), _full_options(scene))
+    # one scene once more, behind more rows than two bytes number
+    last = rounded_to(vector_scenes()["a_turned_camera"], np.float32)
+    write("large_rows_beyond_two_bytes", "render", _behind_rows(expected_arrays(last)), _full_options(last))
     for name, call in calls().items():
         options = _full_options(call.first.scene.with_overrides(profile=call.profile))
         options |= {name: getattr(call, name) for name in ("render_mode", "radius_clip", "batch", *FORMS)}

@@ -230,9 +230,9 @@ def refusal(backend: Any, capability: str) -> str | None:
 def refusal_of(backend: Any, call: Call) -> str | None:
     """Make a call that asks for one thing, and return in what words the backend refuses it; None if it does not.
 
-    A refusal is an error that the backend raised on purpose about an argument, with backgrounds and without: whoever
-    takes the argument in one of the two calls takes it. Any other error, an assertion among them, is a defect: the
-    argument counts as taken, so that laws run into the error and report it.
+    A refusal is an error that the backend raised on purpose about an argument, with backgrounds or without: whoever
+    takes the argument in one of the two calls takes it. Where both calls end in other errors, an assertion among them,
+    that is a defect: the argument counts as taken, so that laws run into the error and report it.
 
     Args:
         backend: has a method `call`.
@@ -243,9 +243,8 @@ def refusal_of(backend: Any, call: Call) -> str | None:
         try:
             backend.call(asked)
         except Exception as error:
-            if not refuses_on_purpose(error):
-                return None
-            words = words or f"{type(error).__name__}: {error}"
+            if refuses_on_purpose(error):
+                words = words or f"{type(error).__name__}: {error}"
         else:
             return None
     return words

@@ -285,6 +285,34 @@ def test_a_stranger_with_gsplats_signature_is_judged_by_what_it_offers(
     assert done.returncode == (1 if shift else 0), done.stdout + done.stderr
     if shift:
         assert "a_round_splat_on_the_axis_looks_as_the_formula_says" in done.stdout
+        # no code of the kit, and at the end what breaks
+        assert "def assert_close(" not in done.stdout
+        assert "a round splat on the axis looks as the formula says" in done.stdout.partition(" laws hold, broken ")[2]
+
+
+# as gsplat 1.5.3, whose assertion about backgrounds counts packed rows (gsplat#764), and that refuses sparse_grad
+PACKED = STRANGER.replace("absgrad=False,", "sparse_grad=False, absgrad=False,").replace(
+    "    Ks = Ks.clone()",
+    "    assert backgrounds is None or not packed\n"
+    "    if sparse_grad:\n        raise NotImplementedError('sparse_grad')\n    Ks = Ks.clone()",
+)
+
+
+def test_one_cause_that_breaks_several_laws_is_told_once_with_where_it_was_raised(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "stranger.py").write_text(PACKED.format(shift=0.0))
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{ROOT}")
+    chosen = "packed_rows_are_those or arguments_that_are_taken_alone or sparse_gradients"
+    options = ("--profile", "gsplat_1_5", "-v", "-k", chosen, "--failures", str(tmp_path))
+    done = _kit("--rasterizer", "stranger:rasterization", *options)
+    _, _, told = done.stdout.partition("= conformance =")
+    assert "stranger:rasterization: 0 laws hold, broken 2, not judged 1" in told, done.stdout
+    assert told.count("with packed=True and backgrounds together, and not with fewer: answer: fails an assertion") == 1
+    assert told.count("breaks: ") == 2
+    assert f"raised at {tmp_path / 'stranger.py'}:" in done.stdout
+    # a call that ends in an assertion does not hide that the argument is refused
+    assert "sparse_grad (NotImplementedError: sparse_grad)" in " ".join(done.stdout.split())
 
 
 def test_who_has_gsplat_and_nothing_else_reads_first_what_is_judged_and_what_is_refused(

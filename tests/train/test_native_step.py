@@ -29,6 +29,8 @@ from pop_fast.train.model import KEYS
 from pop_fast.train.schedule import steady_updates
 from pop_fast.train.stepper import Engine
 from pop_fast.train.steps import Phase, StepSettings
+from pop_ref.conformance.backends import shipped
+from pop_ref.conformance.mutants.trial import law_named, obeys
 from pop_ref.constants import PAPER
 from pop_ref.settings import PARAMETERS
 from tests.app.interruptions import interrupted
@@ -468,3 +470,28 @@ def test_counts_are_those_of_a_walk_through_the_lists() -> None:
     # a parabola that errs lets too much through, never too little
     assert found["reached"] <= found["marked"] <= found["pairs"] // TILE
     assert found["walked"] < found["entries"]
+
+
+@needs_compiled
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("grad2d", lambda found: 0.5 * found),
+        ("count", lambda found: found.clamp_min(1.0)),
+        ("blurred", lambda found: found & False),
+    ],
+)
+def test_laws_notice_statistics_that_a_whole_step_hands_on_wrongly(
+    name: str, change: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    law = law_named("test_collected:a_training_collects_the_oracles_gradients_views_and_blur_flags")
+    backend = shipped("compiled32")
+    assert obeys(law, backend) is None
+    taken_over = fused_stepper.FusedStepper._take_statistics
+
+    def wrongly(stepper: Any, *args: Any) -> None:
+        taken_over(stepper, *args)
+        stepper._state[name] = change(stepper._state[name])
+
+    monkeypatch.setattr(fused_stepper.FusedStepper, "_take_statistics", wrongly)
+    assert obeys(law, backend) is not None

@@ -13,6 +13,7 @@ from pop_ref.conformance.capabilities import INRIAS, PROFILES
 from pop_ref.conformance.law import law
 from pop_ref.conformance.strategies import dyadic, opacities, reals
 from pop_ref.constants import INRIA, PAPER
+from pop_ref.footprint import radii_from_covars2d
 
 variance = reals(0.0, 64.0, dull=1.0)
 
@@ -156,3 +157,14 @@ def test_the_square_extent_is_kept_while_it_meets_a_tile(backend, x, reach):
     last = min(max(int((p + reach + 3) / 4), 0), 2)
     kept = backend.stage("on_screen")(np.array([[x, 2.0]]), np.array([[reach, reach]]), 8, 4, profile)
     assert_same_bits("kept", kept, [first < last])
+
+
+@law("footprint", "radii_from_covars2d")
+def test_extents_have_no_upper_bound(backend):
+    deviations = 2.0 ** np.arange(4, 17)
+    covars = deviations[:, None, None] ** 2 * np.eye(2)
+    args = (covars, np.full(len(deviations), 0.875), backend.profile or PAPER)
+    found, expected = backend.stage("radii_from_covars2d")(*args), radii_from_covars2d(*args)
+    assert np.max(expected) > 2**17
+    # a whole number of pixels, up or down as rounding has it
+    assert np.all(np.abs(found - expected) <= 1), f"extents {found.tolist()}, expected {expected.tolist()}"

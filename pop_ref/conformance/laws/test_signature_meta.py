@@ -20,7 +20,7 @@ from pop_ref.conformance.meta import (
     lacks_for_tiles,
 )
 from pop_ref.conformance.signature import made
-from pop_ref.conformance.views import frames
+from pop_ref.conformance.views import call_for, frames
 
 JUDGED = (SIGNATURE,)
 SIZES = ("width", "height", "tile_size", "tile_width", "tile_height", "n_cameras", "n_batches")
@@ -99,3 +99,21 @@ def test_the_keys_of_intersections_hold_image_tile_and_depth(backend):
 def test_the_keys_of_packed_intersections_hold_image_tile_and_depth(backend):
     of = _listed(backend, "isect_ids", "depths", packed=True)
     assert_keys(of.called.meta, len(of.call.frames[0]), len(of.wanted[0][0].render.tile_lists))
+
+
+@law("signature", *JUDGED)
+def test_of_more_tiles_than_sixteen_bits_number_each_lists_who_overlaps_it(backend):
+    # as many as a signed number of two bytes does not count, and as none does
+    for width, height in ((256, 160), (320, 208)):
+        call = call_for(backend, size=(width, height), tile_size=1)
+        meta = backend.call(call).meta
+        lacks = [name for name in ("flatten_ids", "isect_offsets", "radii", "means2d") if name not in meta]
+        if lacks or not backend.takes("tile_size") or call.tile_size != 1:
+            pytest.skip(f"{backend.name} has no lists of tiles of 1 px: {', '.join(lacks) or 'its tiles are others'}")
+        rows = meta["flatten_ids"]
+        lists = np.repeat(np.arange(width * height), np.diff(np.append(meta["isect_offsets"].reshape(-1), len(rows))))
+        assert len(np.unique(lists // 2**15)) > 1, "nothing is drawn in the latter tiles"
+        centres, extents = meta["means2d"].reshape(-1, 2)[rows], meta["radii"].reshape(-1, 2)[rows]
+        away = np.abs(np.stack((lists % width, lists // width), axis=1) + 0.5 - centres)
+        strangers = np.flatnonzero(np.any(away > extents + 1.0, axis=1))
+        assert len(strangers) == 0, f"tile {lists[strangers[0]]} lists Gaussian {rows[strangers[0]]}, far from it"

@@ -3,6 +3,7 @@
 from pop_ref.conformance.mutants.baselines import BASELINES
 from pop_ref.conformance.mutants.black_box import BLACK_BOXES as SINGLE
 from pop_ref.conformance.mutants.black_box import BlackBox
+from pop_ref.conformance.mutants.collected import COLLECTED
 from pop_ref.conformance.mutants.combined import COMBINED
 from pop_ref.conformance.mutants.copies import Mutant, living
 from pop_ref.conformance.mutants.geometry import GEOMETRY
@@ -10,13 +11,14 @@ from pop_ref.conformance.mutants.methods import METHOD_MUTANTS
 from pop_ref.conformance.mutants.pixels import PIXELS
 from pop_ref.conformance.mutants.program import PROGRAM as LINES
 from pop_ref.conformance.mutants.seams import SEAMS
+from pop_ref.conformance.mutants.strangers import STRANGERS, STRANGERS_BOXES
 from pop_ref.conformance.mutants.trainers import TRAINERS, TRAINERS_BOXES
 from pop_ref.conformance.mutants.training import TRAINING
 
 # of the oracle, and of the program that trains
 MUTANTS = (*GEOMETRY, *PIXELS, *TRAINING, *BASELINES, *METHOD_MUTANTS)
-PROGRAM = (*LINES, *TRAINERS)
+PROGRAM = (*LINES, *TRAINERS, *COLLECTED, *STRANGERS)
 # behind gsplat's signature: one argument broken, several together; autograd, memory, size
-BLACK_BOXES = (*SINGLE, *COMBINED, *SEAMS, *TRAINERS_BOXES)
+BLACK_BOXES = (*SINGLE, *COMBINED, *SEAMS, *TRAINERS_BOXES, *STRANGERS_BOXES)
 
 __all__ = ["BLACK_BOXES", "MUTANTS", "PROGRAM", "BlackBox", "Mutant", "living"]
