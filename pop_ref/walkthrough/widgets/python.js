@@ -6,7 +6,7 @@ function python(root) {
   const button = kit.button(buttons, "load Python and run splat.py", () => (worker ? stop("Stopped.") : run()));
   const told = kit.make(buttons, "span", { class: "pw-label", role: "status" });
   const lines = kit.make(body, "pre", { class: "pw-wide pw-lines", hidden: "", tabindex: 0, "aria-label": "what splat.py prints" });
-  const picture = kit.make(kit.make(body, "div", { class: "pw-wide" }), "img", { hidden: "", class: "pw-pixels", alt: "splat.png: a photograph that no step sees, and the render" });
+  const picture = kit.make(body, "img", { hidden: "", class: "pw-wide pw-pixels", alt: "splat.png: a photograph that no step sees, and the render" });
   kit.make(body, "p", { class: "pw-caption pw-wide" }, `The button fetches Pyodide (Python and NumPy for browsers) from ${new URL(PYODIDE).host}, and hands it the file pop_ref/learn/splat.py as it is. Nothing else on these pages needs a network.`);
   let worker = null;
 
