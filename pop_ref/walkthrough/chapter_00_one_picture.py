@@ -165,7 +165,7 @@ picture(
 # {{widget: train}}
 #
 # The page does what `pop_ref/learn/splat.py` does, the whole method in 300 lines of NumPy. Run it on your machine
-# (`python -m pop_ref.learn.splat`), or in this page where the network has a Python for browsers:
+# (`python -m pop_ref.learn.splat`), or in this page, which fetches a Python for browsers if you ask it to.
 #
 # {{widget: python}}
 #
