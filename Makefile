@@ -7,7 +7,7 @@ WORKERS ?= $(shell $(PYTHON) -c "import os; print((os.cpu_count() or 1) + 1)")
 TORCH := $(shell sed -n 's/^\(torch==.*\)/\1/p' constraints.txt)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo walkthrough repro site test test-fast explore lint bench faults wheel cuda sass emulate gpu-check docs-check clean
+.PHONY: help setup demo walkthrough repro site test test-all test-fast explore lint bench faults wheel cuda sass emulate gpu-check docs-check clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
@@ -48,7 +48,10 @@ site: demo walkthrough  ## build docs/, the walk-through and the demo's report a
 # tests wait for browsers and for processes of their own; those are many, and read what the first of them compiled
 TESTS := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-test: setup  ## run every test
+test: setup  ## run the tests; those that rehearse jobs for GPU nodes are left to test-all
+	$(TESTS) -m "not rehearsal"
+
+test-all: setup  ## run every test
 	$(TESTS)
 
 # float64 of the torch path stands for that of the compiled one; what failed last comes first

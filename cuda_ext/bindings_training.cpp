@@ -2,6 +2,19 @@
 
 #include "bindings.h"
 
+// the weights of a struct's own Regularizers, as fields of the struct
+template <class Struct>
+static void regularizers(nb::class_<Struct>& type) {
+    const auto field = [&type](const char* name, float Regularizers::*weight) {
+        type.def_prop_rw(
+            name, [weight](const Struct& s) { return s.own.*weight; },
+            [weight](Struct& s, float value) { s.own.*weight = value; });
+    };
+    field("entropy", &Regularizers::entropy);
+    field("opacity", &Regularizers::opacity);
+    field("scale", &Regularizers::scale);
+}
+
 void bind_training(nb::module_& m) {
     nb::class_<LossSettings> settings(m, "LossSettings", nb::dynamic_attr());
     settings.def(nb::init<>());
@@ -57,6 +70,8 @@ void bind_training(nb::module_& m) {
     POINTER(term, PopTerm, window_counts);
     POINTER(term, PopTerm, radii);
     POINTER(term, PopTerm, logits);
+    POINTER(term, PopTerm, log_scales);
+    regularizers(term);
     POINTER(term, PopTerm, sides);
     POINTER(term, PopTerm, sums);
 
@@ -67,6 +82,7 @@ void bind_training(nb::module_& m) {
     VALUE(update, UpdateArrays, n_views);
     VALUE(update, UpdateArrays, place);
     VALUE(update, UpdateArrays, lambda_pop);
+    regularizers(update);
     VALUE(update, UpdateArrays, blur_own_view);
     POINTER(update, UpdateArrays, constants);
     POINTER(update, UpdateArrays, sh_rest_sum);

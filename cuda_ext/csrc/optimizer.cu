@@ -45,15 +45,16 @@ __global__ void begin_step_kernel(Schedule schedule, StepConstants* constants, D
         adam_step_at<float>(schedule.numbers[at], schedule.rates[at], schedule.beta1, schedule.beta2, schedule.eps);
 }
 
-// two sums over a block in a fixed order; valid in thread 0
-__device__ __forceinline__ float2 block_sums(float2 value) {
-    __shared__ float2 shared[SUM_BLOCK];
+// three sums over a block in a fixed order; valid in thread 0
+__device__ __forceinline__ Vec3<float> block_sums(Vec3<float> value) {
+    __shared__ Vec3<float> shared[SUM_BLOCK];
     shared[threadIdx.x] = value;
     __syncthreads();
     for (int half = SUM_BLOCK / 2; half > 0; half /= 2) {
         if (threadIdx.x < half) {
             shared[threadIdx.x].x += shared[threadIdx.x + half].x;
             shared[threadIdx.x].y += shared[threadIdx.x + half].y;
+            shared[threadIdx.x].z += shared[threadIdx.x + half].z;
         }
         __syncthreads();
     }
@@ -62,12 +63,13 @@ __device__ __forceinline__ float2 block_sums(float2 value) {
 
 __global__ void __launch_bounds__(SUM_BLOCK) end_step_kernel(StepRecord record, DeviceState* state) {
     if (halted(state)) return;
-    float2 sums = {0.0f, 0.0f};
+    Vec3<float> sums = {0.0f, 0.0f, 0.0f};
     if (record.pop_sums != nullptr) {
         const int blocks = (record.n + SUM_BLOCK - 1) / SUM_BLOCK;
         for (int k = threadIdx.x; k < blocks; k += SUM_BLOCK) {
-            sums.x += record.pop_sums[2 * k];
-            sums.y += record.pop_sums[2 * k + 1];
+            sums.x += record.pop_sums[3 * k];
+            sums.y += record.pop_sums[3 * k + 1];
+            sums.z += record.pop_sums[3 * k + 2];
         }
     }
     sums = block_sums(sums);
@@ -76,15 +78,27 @@ __global__ void __launch_bounds__(SUM_BLOCK) end_step_kernel(StepRecord record, 
     record.values[V_POP] =
         record.pop_sums == nullptr
             ? 0.0f
-            : record.lambda_pop * (sums.x / float(max(important, 1)) + sums.y / float(max(others, 1)));
+            : record.lambda_pop * (sums.x / float(max(important, 1)) + sums.y / float(max(others, 1))) + sums.z;
     for (int k = 0; k < N_VALUES; ++k) record.history[size_t(N_VALUES) * state->step + k] = record.values[k];
     ++state->step;
+}
+
+// what a Gaussian adds to the loss by itself
+__device__ __forceinline__ float regularizers_of(const PopTerm& term, int i) {
+    float sum = 0.0f;
+    if (term.own.entropy != 0.0f) sum += term.own.entropy * opacity_entropy_one(term.logits[i]);
+    if (term.own.opacity != 0.0f) sum += term.own.opacity * opacity_from_logit(term.logits[i]);
+    if (term.own.scale != 0.0f) {
+        const Vec3<float> scale = scale_from_log_scale(load3(term.log_scales, i));
+        sum += term.own.scale * (scale.x + scale.y + scale.z);
+    }
+    return sum;
 }
 
 __global__ void __launch_bounds__(SUM_BLOCK) count_important_kernel(PopTerm term, DeviceState* state) {
     const int i = blockIdx.x * blockDim.x + threadIdx.x;
     PopSide side = PopSide::absent;
-    if (i < term.n && (term.radii == nullptr || term.radii[2 * i] > 0)) {
+    if (i < term.n && term.dominant_counts != nullptr && (term.radii == nullptr || term.radii[2 * i] > 0)) {
         const bool before = term.window_counts != nullptr && term.window_counts[i] > 0;
         side = before || term.dominant_counts[i] > 0 ? PopSide::important : PopSide::other;
     }
@@ -96,10 +110,12 @@ __global__ void __launch_bounds__(SUM_BLOCK) count_important_kernel(PopTerm term
     if ((threadIdx.x & (WARP - 1)) == 0 && down) atomicAdd(&state->n_others, __popc(down));
     // 1 - o is the opacity of the negated logit
     const float o = side == PopSide::absent ? 0.0f : opacity_from_logit(important ? -term.logits[i] : term.logits[i]);
-    const float2 sums = block_sums(important ? float2{o, 0.0f} : float2{0.0f, o});
+    const float own = i < term.n ? regularizers_of(term, i) : 0.0f;
+    const Vec3<float> sums = block_sums(important ? Vec3<float>{o, 0.0f, own} : Vec3<float>{0.0f, o, own});
     if (threadIdx.x > 0) return;
-    term.sums[2 * blockIdx.x] = sums.x;
-    term.sums[2 * blockIdx.x + 1] = sums.y;
+    term.sums[3 * blockIdx.x] = sums.x;
+    term.sums[3 * blockIdx.x + 1] = sums.y;
+    term.sums[3 * blockIdx.x + 2] = sums.z;
 }
 
 // What a warp keeps: the coefficients of the bands beyond the first, which give way to their gradients, and the
@@ -246,9 +262,13 @@ __device__ __forceinline__ void make_gradients(const UpdateArrays& a, const View
         v.v_opacity += pop_loss_vjp_one(given.side, n_important, n_others, a.lambda_pop);
     note_statistics(a, i, given, v_mean2d, view, blur_pixels);
     store3(staged.rows(G_MEANS), lane, v.v_mean);
+    if (a.own.scale != 0.0f)
+        v.v_scale = {v.v_scale.x + a.own.scale, v.v_scale.y + a.own.scale, v.v_scale.z + a.own.scale};
     store3(staged.rows(G_SCALES), lane, scale_from_log_scale_vjp(given.raw.scale, v.v_scale));
     reinterpret_cast<float4*>(staged.rows(G_QUATS))[lane] = {v.v_quat.w, v.v_quat.x, v.v_quat.y, v.v_quat.z};
-    staged.rows(G_OPACITIES)[lane] = opacity_from_logit_vjp(given.raw.opacity, v.v_opacity);
+    float v_logit = opacity_from_logit_vjp(given.raw.opacity, v.v_opacity + a.own.opacity);
+    if (a.own.entropy != 0.0f) v_logit += opacity_entropy_vjp_one(given.raw.opacity, a.own.entropy);
+    staged.rows(G_OPACITIES)[lane] = v_logit;
     store3(staged.rows(G_SH0), lane, v_first);
 }
 

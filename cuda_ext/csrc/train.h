@@ -24,7 +24,7 @@ struct Photographs {
 };
 
 // What a step tells: the pixelwise mean, SSIM, the photometric objective, the mean square with the render clamped to
-// [0, 1] (for PSNR), the weighted POP term.
+// [0, 1] (for PSNR), the weighted regularizers.
 enum Value { V_PIXELWISE, V_SSIM, V_OBJECTIVE, V_SQUARE, V_POP, N_VALUES };
 
 struct LossArrays {
@@ -59,6 +59,12 @@ struct Schedule {
     float* K;                // [9]
 };
 
+// What every Gaussian adds to the loss by itself, weighted by one over their number: the entropy of its opacity, its
+// opacity, the sum of its scales; 0 leaves one out.
+struct Regularizers {
+    float entropy, opacity, scale;
+};
+
 struct UpdateArrays {
     AdamGroup groups[N_GROUPS];
     int n, n_rest;               // Gaussians; rows of harmonics beyond the first
@@ -71,6 +77,7 @@ struct UpdateArrays {
     const int* dominant_counts;  // [n] or null
     const uint8_t* pop_sides;    // [n], a PopSide each; read where lambda_pop is not 0
     float lambda_pop;            // 0 leaves the POP term out
+    Regularizers own;
     // density statistics, each may be null
     float* grad_sum;
     int* n_visible;
@@ -80,24 +87,26 @@ struct UpdateArrays {
     bool blur_own_view;          // the flag is this view's alone; else it stays up until the next densification step (A2)
 };
 
-// who takes part in the POP term, on which side, and what their terms come to
+// who takes part in the POP term, on which side, and what their terms and the regularizers come to
 struct PopTerm {
     int n;
-    const int* dominant_counts;  // [n]
+    const int* dominant_counts;  // [n]; null where the POP term is off
     const int* window_counts;    // [n], of the window's views before this one; null where this view alone decides (A1)
     const int* radii;            // [n, 2]; null where all take part, not only those that the view shows (A12)
     const float* logits;         // [n]
+    const float* log_scales;     // [n, 3]
+    Regularizers own;
     uint8_t* sides;              // [n], a PopSide each
-    float* sums;                 // [important_blocks(n), 2], of 1 - o over the important and of o over the others
+    float* sums;                 // [important_blocks(n), 3]: 1 - o over the important, o over the others, regularizers
 };
 
 // what end_step keeps of a step
 struct StepRecord {
     float* values;          // [N_VALUES]
     float* history;         // [steps, N_VALUES]: row `step` is written
-    const float* pop_sums;  // [important_blocks(n), 2], or null where the POP term is off
+    const float* pop_sums;  // [important_blocks(n), 3], or null where no such term is on
     int n;
-    float lambda_pop;
+    float lambda_pop;       // 0 where the POP term is off
 };
 
 int loss_blocks(int width, int height);

@@ -40,7 +40,7 @@ from cuda_ext.render.capacity import Capacity, Size
 from cuda_ext.train_settings import Collected, Phase, Ranks, StepSettings
 from cuda_ext.training.resident import ResidentViews
 from cuda_ext.training.step_buffers import FrameBuffers, RowBuffers, Rows, Shared, SplatBuffers
-from cuda_ext.training.step_program import DrawProgram, gaussians, pop_term, schedule, update, view_of
+from cuda_ext.training.step_program import DrawProgram, gaussians, pop_term, regularizers, schedule, update, view_of
 
 # rows that a stretch is made of: a warp's, whose pieces of 16 bytes lie alike wherever it begins
 STRETCH: Final = 32
@@ -299,7 +299,7 @@ class BatchTrainer:
     def _update(
         self, places: Sequence[_Place], views: Sequence[int], sums: Sequence[Tensor], phase: Phase
     ) -> list[float]:
-        """Move own rows by the mean of the views' gradients; return the POP term of every view."""
+        """Move own rows by the mean of the views' gradients; return the weighted regularizers of every view."""
         # who is important is settled for all views before the first one adds to the window
         own = torch.stack([self._sides(place, of, sums[place], phase) for place, of in enumerate(places)])
         totals = torch.stack(self._ranks.gather([own])).sum(0)
@@ -309,31 +309,46 @@ class BatchTrainer:
             state[N_IMPORTANT], state[N_OTHERS] = totals[place, 0], totals[place, 1]
             self._take_counts(of, sums[place])
             of.rows.drawn.sums[of.seen, :_SUMS] = sums[place][:, :_SUMS]
-            given = update(self._shared, of.rows, self._counts if phase.dominance else None, phase, self._gradients)
+            counts = self._counts if phase.dominance else None
+            given = update(self._shared, of.rows, counts, phase, self._gradients, self._bounds[-1])
             given.n_views, given.place = self.n_views, place
             size = self.views.sizes[views[place]]
             camera, how = view_of(self._shared, size), self._shared.render(size, phase.sh_degree).project_settings()
             pointers = pointer("state", state, "int32"), stream_of(self.device)
             load().update(given, camera, how, of.rows.drawn.struct(), *pointers)
         weight = self.settings.lambda_pop / _POP_UNIT if phase.pop else 0.0
-        return [weight * (a / max(n_a, 1) + b / max(n_b, 1)) for n_a, n_b, a, b in totals.tolist()]
+        return [weight * (a / max(n_a, 1) + b / max(n_b, 1)) + c / _POP_UNIT for n_a, n_b, a, b, c in totals.tolist()]
 
     def _take_counts(self, of: _Place, back: Tensor) -> None:
         self._counts.zero_()
         self._counts[of.seen] = back[:, _SUMS].contiguous().view(torch.int32)
 
     def _sides(self, place: int, of: _Place, back: Tensor, phase: Phase) -> Tensor:
-        """Settle who of own rows is important in a view: how many are, how many are not, and the terms of both. [4]"""
+        """Settle who of own rows is important in a view.
+
+        Returns:
+            How many are, how many are not, the terms of both, and the weighted regularizers. [5]
+        """
+        own = self._regularized(of.rows, phase).mul(_POP_UNIT).round().long()
         if not phase.pop:
-            return torch.zeros(4, dtype=torch.int64, device=self.device)
+            return torch.cat((torch.zeros(4, dtype=torch.int64, device=self.device), own))
         self._begin(place)
         self._take_counts(of, back)
         state = self._shared.state
-        term = pop_term(self._shared, of.rows, self._counts)
+        term = pop_term(self._shared, of.rows, self._counts, phase)
         load().count_important(term, pointer("state", state, "int32"), stream_of(self.device))
         opacities, sides = torch.sigmoid(of.rows.params["opacities"].double()), of.rows.pop_sides[: len(of.rows)]
         terms = torch.stack(
             (torch.where(sides == _IMPORTANT, 1.0 - opacities, 0.0), torch.where(sides == _OTHER, opacities, 0.0))
         )
         whole = terms.mul(_POP_UNIT).round().long().sum(1)
-        return torch.cat((state[[N_IMPORTANT, N_OTHERS]].long(), whole))
+        return torch.cat((state[[N_IMPORTANT, N_OTHERS]].long(), whole, own))
+
+    def _regularized(self, rows: RowBuffers, phase: Phase) -> Tensor:
+        """Sum what own Gaussians add to the loss by themselves. float64 [1]"""
+        weights = regularizers(self.settings, phase, self._bounds[-1])
+        logits = rows.params["opacities"].double()
+        opacities, softplus = torch.sigmoid(logits), torch.nn.functional.softplus
+        entropies = opacities * softplus(-logits) + (1.0 - opacities) * softplus(logits)
+        terms = {"entropy": entropies, "opacity": opacities, "scale": rows.params["scales"].double().exp()}
+        return torch.stack([weight * terms[name].sum() for name, weight in weights.items()]).sum(0, keepdim=True)

@@ -125,7 +125,7 @@ class RowBuffers:
         statistics: what density control reads.
         drawn: their splats.
         pop_sides: where each stands in the POP term.
-        pop_sums: sums of the POP term.
+        pop_sums: sums of the POP term's two sides and of the regularizers, for each block of the kernel.
     """
 
     params: Rows
@@ -147,7 +147,7 @@ class RowBuffers:
             statistics,
             SplatBuffers.make(n, device),
             torch.zeros(max(n, 1), dtype=torch.uint8, device=device),
-            torch.zeros((max(kernels.important_blocks(n), 1), 2), device=device),
+            torch.zeros((max(kernels.important_blocks(n), 1), 3), device=device),
         )
 
     def __len__(self) -> int:

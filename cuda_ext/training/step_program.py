@@ -9,7 +9,7 @@ from torch import Tensor
 from cuda_ext import load
 from cuda_ext.arrays import fill, pointer, stream_of
 from cuda_ext.render.capacity import Size
-from cuda_ext.train_settings import Phase
+from cuda_ext.train_settings import Phase, StepSettings
 from cuda_ext.training.resident import MARGIN
 from cuda_ext.training.step_buffers import FrameBuffers, RowBuffers, Rows, Shared, SplatBuffers
 from pop_ref.settings import PARAMETERS
@@ -65,8 +65,10 @@ class StepProgram:
         self._project = shared.render(frame.size, phase.sh_degree).project_settings()
         self._view, self._splats = view_of(shared, frame.size), rows.drawn.struct()
         self._schedule, self._gaussians = schedule(shared), gaussians(rows)
-        self._term = pop_term(shared, rows, self._draw.counts) if phase.pop else None
-        self._update, self._record = update(shared, rows, self._draw.counts, phase), _record(shared, rows, phase)
+        regularized = any(regularizers(shared.settings, phase, len(rows)).values())
+        self._term = pop_term(shared, rows, self._draw.counts, phase) if phase.pop or regularized else None
+        self._update = update(shared, rows, self._draw.counts, phase)
+        self._record = _record(shared, rows, phase, self._term)
 
     def launch(self) -> None:
         """Ask the device's current stream for one step."""
@@ -132,22 +134,44 @@ def _blends(shared: Shared, drawn: SplatBuffers, frame: FrameBuffers, phase: Pha
     return forward, backward
 
 
-def pop_term(shared: Shared, rows: RowBuffers, counts: Tensor | None) -> Any:
-    """Return the POP term of the kernels.
+def regularizers(settings: StepSettings, phase: Phase, n: int) -> dict[str, float]:
+    """Return the weights of a Gaussian's own terms, by the kernels' names: those of the loss over their number.
+
+    Args:
+        settings: of the run.
+        phase: what the steps do.
+        n: Gaussians altogether, those of other processes too.
+    """
+    entropy = settings.lambda_entropy if phase.entropy else 0.0
+    own = {"entropy": entropy, "opacity": settings.opacity_reg, "scale": settings.scale_reg / 3.0}
+    return {name: weight / max(n, 1) for name, weight in own.items()}
+
+
+def pop_term(shared: Shared, rows: RowBuffers, counts: Tensor | None, phase: Phase) -> Any:
+    """Return the POP term and the regularizers of the kernels.
 
     Args:
         shared: what all steps share.
         rows: the Gaussians.
-        counts: pixels that each dominates in this view. [n]
+        counts: pixels that each dominates in this view; read where the POP term is on. [n]
+        phase: what the steps do.
     """
     s = shared.settings
     before: Tensor | None = rows.statistics.dominant_sum if s.pop_views == "window" else None
     shown: Tensor | None = rows.drawn.splats["radii"] if s.pop_over == "visible" else None
-    made = fill(load().PopTerm(), n=len(rows), dominant_counts=counts, window_counts=before)
-    return fill(made, radii=shown, logits=rows.params["opacities"], sides=rows.pop_sides, sums=rows.pop_sums)
+    made = fill(load().PopTerm(), n=len(rows), dominant_counts=counts if phase.pop else None, window_counts=before)
+    fill(made, radii=shown, logits=rows.params["opacities"], log_scales=rows.params["scales"])
+    return fill(made, sides=rows.pop_sides, sums=rows.pop_sums, **regularizers(s, phase, len(rows)))
 
 
-def update(shared: Shared, rows: RowBuffers, counts: Tensor | None, phase: Phase, gradients: Rows | None = None) -> Any:
+def update(
+    shared: Shared,
+    rows: RowBuffers,
+    counts: Tensor | None,
+    phase: Phase,
+    gradients: Rows | None = None,
+    n: int | None = None,
+) -> Any:
     """Return what the kernels' update takes.
 
     Args:
@@ -156,12 +180,14 @@ def update(shared: Shared, rows: RowBuffers, counts: Tensor | None, phase: Phase
         counts: pixels that each dominates in this view, where the phase tells. [n]
         phase: what the steps do.
         gradients: where those of several views are added up, by parameter; None where a step has one view.
+        n: Gaussians altogether, where these are one process's share of them.
     """
     s, found = shared.settings, rows.statistics
     made = fill(load().UpdateArrays(), n=len(rows), n_rest=rows.params["shN"].shape[1], sums=rows.drawn.sums)
     fill(made, constants=shared.constants, dominant_counts=counts, pop_sides=rows.pop_sides)
     fill(made, sh_rest_sum=found.sh_rest_sum)
     made.lambda_pop = s.lambda_pop if phase.pop else 0.0
+    fill(made, **regularizers(s, phase, len(rows) if n is None else n))
     made.blur_own_view = s.blur_window == "own_view"
     if phase.statistics:
         fill(made, grad_sum=found.grad_sum, n_visible=found.n_visible)
@@ -175,7 +201,7 @@ def update(shared: Shared, rows: RowBuffers, counts: Tensor | None, phase: Phase
     return made
 
 
-def _record(shared: Shared, rows: RowBuffers, phase: Phase) -> Any:
-    sums = rows.pop_sums if phase.pop else None
+def _record(shared: Shared, rows: RowBuffers, phase: Phase, term: Any) -> Any:
+    sums = None if term is None else rows.pop_sums
     made = fill(load().StepRecord(), values=shared.values, history=shared.history, pop_sums=sums)
-    return fill(made, n=len(rows), lambda_pop=shared.settings.lambda_pop)
+    return fill(made, n=len(rows), lambda_pop=shared.settings.lambda_pop if phase.pop else 0.0)

@@ -88,11 +88,12 @@ def look_over(root: Path, images: str | None = None) -> list[Finding]:
     findings += check_dataset.about_cameras(shots)
     paths = {id(shot): check_dataset.file_of(root, shot) for shot in shots}
     photos, damage = _each(
-        shots, lambda shot: check_dataset.read_photo(shot, paths[id(shot)]), lambda shot: paths[id(shot)]
+        shots, lambda shot: check_dataset.read_photo(shot, paths[id(shot)], cloud), lambda shot: paths[id(shot)]
     )
     findings += check_dataset.about_photos(photos, root)
     findings += [Finding("bad", "photographs", problem) for problem in damage]
     findings += about_quality([photo.shown for photo in photos if photo.shown is not None])
+    findings += check_dataset.about_drift(photos)
     findings += check_dataset.about_masks(photos, root)
     findings += check_dataset.about_points(shots, cloud)
     findings += check_dataset.about_reprojection(root)

@@ -53,9 +53,8 @@ class CudaBackend(BaseBackend):
 
     def whole_step(self) -> WholeStep:
         """Return the fused step, which takes all steps on a GPU: a setting that it does not know is refused."""
-        known = WholeStep("cuda", _make_fused, most=500)
-        only = {name: value for name, value in known.only.items() if name != "batch_size"}
-        return replace(known, only={**only, "strategy.lambda_entropy": 0.0})
+        known, own = WholeStep("cuda", _make_fused, most=500), ("batch_size", "opacity_reg", "scale_reg")
+        return replace(known, only={name: value for name, value in known.only.items() if name not in own})
 
 
 def _make_fused(task: Task) -> MakeFused:

@@ -12,6 +12,7 @@ import numpy as np
 
 from pop_fast.data.capture import Listing, PosedImage, SparsePoints
 from pop_fast.data.colmap import find_model
+from pop_fast.data.exposure_drift import UNEVEN, exposures, levels_at
 from pop_fast.data.load import find_listing
 from pop_fast.data.photo_quality import (
     Finding,
@@ -42,6 +43,8 @@ class Photo:
     rotated: bool = False
     problem: str = ""
     shown: Shown | None = None
+    # brightness at the points that the shot sees, stops; None where that is not known
+    levels: np.ndarray | None = None
 
 
 def read_listing(root: Path, images: str | None = None) -> Listing | None:
@@ -62,8 +65,8 @@ def file_of(root: Path, shot: PosedImage) -> Path | None:
     return find_image(root / shot.folder, shot.file)
 
 
-def read_photo(shot: PosedImage, path: Path | None) -> Photo:
-    """Decode and measure the photograph of a shot, found at `path`."""
+def read_photo(shot: PosedImage, path: Path | None, cloud: SparsePoints | None = None) -> Photo:
+    """Decode and measure the photograph of a shot, found at `path`, and its brightness at the points that it sees."""
     if path is None:
         return Photo(shot, None, problem="absent")
     try:
@@ -71,7 +74,15 @@ def read_photo(shot: PosedImage, path: Path | None) -> Photo:
     except CaptureError as error:
         return Photo(shot, path, problem=str(error))
     size, alpha = (image.shape[1], image.shape[0]), image.shape[2] == 4
-    return Photo(shot, path, size, alpha, _is_rotated(path), shown=measure(path, image, shot.name))
+    levels = None
+    if cloud is not None and shot.seen is not None and shot.camera is not None and shot.camera.width > 0:
+        points = cloud.xyz[shot.seen] @ shot.viewmat[:3, :3].T + shot.viewmat[:3, 3]
+        places = np.full((len(points), 2), np.nan)
+        front = points[:, 2] > 0.0
+        places[front] = shot.camera.img_from_cam(points[front]) if front.any() else 0.0
+        levels = levels_at(image, places * (np.array(size) / (shot.camera.width, shot.camera.height)))
+    shown = measure(path, image, shot.name)
+    return Photo(shot, path, size, alpha, _is_rotated(path), shown=shown, levels=levels)
 
 
 def _is_rotated(path: Path) -> bool:
@@ -217,6 +228,23 @@ def about_reprojection(root: Path) -> Iterator[Finding]:
         return
     state: State = "ok" if error < 2.0 else "warn"
     yield Finding(state, "reprojection", f"mean error {error:.2f} px over {observations:,} observations")
+
+
+def about_drift(photos: Sequence[Photo]) -> Iterator[Finding]:
+    """Tell how much the photographs differ in brightness where they see the same points."""
+    known = [photo for photo in photos if photo.levels is not None and photo.shot.seen is not None]
+    seen = [photo.shot.seen for photo in known if photo.shot.seen is not None]
+    found = exposures([photo.levels for photo in known if photo.levels is not None], seen)
+    width, uneven = found.drift, found.unevenness(np.array([photo.shot.viewmat for photo in known]))
+    if width is None:
+        return
+    extremes = (int(np.nanargmin(found.stops)), int(np.nanargmax(found.stops)))
+    ends = [f"{found.stops[i]:+.2f} ({known[i].shot.name})" for i in extremes]
+    text = f"the same points differ by {width:.2f} stops from photograph to photograph, {ends[0]} to {ends[1]}"
+    text += "" if uneven is None else f"; from those taken next to it one differs by {uneven:.2f}"
+    bad = uneven is not None and uneven > UNEVEN
+    fix = "; lock the exposure, or train with --exposure" if bad else ""
+    yield Finding("warn" if bad else "ok", "exposure", text + fix)
 
 
 def about_memory(photos: Sequence[Photo], cloud: SparsePoints | None, free: int) -> Iterator[Finding]:

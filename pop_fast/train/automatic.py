@@ -183,6 +183,8 @@ class Terms:
 def choose_terms(capture: Capture, config: TrainConfig, stops: float | None) -> Terms:
     """Choose terms of the loss by the count and the spread of the photographs, and by the drift of their exposures.
 
+    The drift is what the points that several photographs see tell, and what the cameras noted.
+
     Args:
         capture: with the points that its photographs see, where that is known.
         config: whose backend must know a term, and whose words win.
@@ -190,6 +192,7 @@ def choose_terms(capture: Capture, config: TrainConfig, stops: float | None) -> 
     """
     import numpy as np
 
+    from pop_fast.data.exposure_drift import UNEVEN, exposures_of
     from pop_fast.data.normalize import neighbour_degrees
     from pop_fast.data.photo_quality import DRIFT_STOPS
 
@@ -206,8 +209,14 @@ def choose_terms(capture: Capture, config: TrainConfig, stops: float | None) -> 
             wanted.append(("depth_lambda", weight, text))
         elif "depth_lambda" not in _said(config):
             why.append(f"{few}, and depth is not held to sparse points: the capture has no tracks of them")
-    if stops is not None and stops > DRIFT_STOPS and config.batch_size == 1:
-        text = f"each photograph's exposure is learned (--exposure), as their exposures are {stops:.1f} stops apart"
+    found = exposures_of(capture).unevenness(np.stack([view.viewmat for view in capture.views]))
+    drifts = []
+    if found is not None and found > UNEVEN:
+        drifts.append(f"the same points differ by {found:.2f} stops from those of photographs taken next to them")
+    if stops is not None and stops > DRIFT_STOPS:
+        drifts.append(f"their exposures are {stops:.1f} stops apart")
+    if drifts and config.batch_size == 1:
+        text = f"each photograph's exposure is learned (--exposure), as {' and '.join(drifts)}"
         wanted.append(("exposure", True, text))
     settings: dict[str, Any] = {}
     for name, value, text in wanted:

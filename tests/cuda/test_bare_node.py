@@ -31,6 +31,7 @@ ROOT = Path(__file__).resolve().parents[2]
 WHEELS = ("plyfile", "tyro", "typeguard", "docstring_parser", "typing_extensions")
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.rehearsal,
     pytest.mark.skipif(not (ROOT / ".git").exists(), reason="no git checkout to copy"),
     pytest.mark.skipif(emulate.why_not() is not None, reason=str(emulate.why_not())),
 ]

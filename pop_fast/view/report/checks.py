@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.data.capture import Capture, View
+from pop_fast.data.exposure_drift import GAMMA
 from pop_fast.data.normalize import neighbour_degrees
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
@@ -47,8 +48,6 @@ _ORBIT_FPS: Final = 15.0
 _DARK: Final = 0.08
 _MOST_PSNR: Final = 100.0  # dB, of equal images
 _FIX: Final = "write it again with 'pop report --check', or remove the file"
-# of display values to light: those of photographs are about a square root of it
-_GAMMA: Final = 2.2
 
 
 @dataclass(frozen=True)
@@ -221,7 +220,7 @@ def stops_between(photo: np.ndarray, render: np.ndarray) -> float:
     """
     theirs, ours = photo.mean(axis=1), render.mean(axis=1)
     telling = (np.minimum(ours, theirs) > _DARK) & (np.maximum(ours, theirs) < 1.0 - _DARK)
-    return float(_GAMMA * np.median(np.log2(theirs[telling] / ours[telling]))) if telling.any() else 0.0
+    return float(GAMMA * np.median(np.log2(theirs[telling] / ours[telling]))) if telling.any() else 0.0
 
 
 def _floaters(capture: Capture, views: Sequence[View], params: Mapping[str, Tensor], looked: Any) -> dict[str, float]:

@@ -53,6 +53,7 @@ def numbers(tree):
             yield value
 
 
+@pytest.mark.rehearsal
 def test_every_number_of_the_benchmark_is_measured(bench, gpu, monkeypatch, tmp_path):
     from gpu_steps import KERNELS
 

@@ -31,11 +31,15 @@ from tests.cuda.conftest import FOLDER, emulated_engine
 from tests.cuda.gpu.test_device_training import masked, mixed_sizes, records
 
 SIZE = 4
-# all of density control, with resets; dominance by the window, its blur by the last view, masks and sizes
+# all of density control, with resets; dominance by the window, its blur by the last view, regularizers, masks and sizes
 RUNS = {
     "pop": ({}, lambda capture: capture),
     "window": (
-        {"strategy": {"pop_views": "window", "blur_window": "own_view"}},
+        {
+            "opacity_reg": 0.05,
+            "scale_reg": 0.02,
+            "strategy": {"pop_views": "window", "blur_window": "own_view", "lambda_entropy": 0.02},
+        },
         lambda capture: masked(mixed_sizes(capture)),
     ),
     "gsplat": ({}, lambda capture: capture),
@@ -47,9 +51,9 @@ def train(
 ) -> TrainingRun:
     changes, edit = RUNS[name]
     method = "gsplat" if name == "gsplat" else "pop"
-    config = tiny_config(folder / name, method, batch_size=SIZE)
-    strategy = type(config.strategy)(**{**vars(config.strategy), **changes.get("strategy", {})})
-    config = tiny_config(folder / name, method, batch_size=SIZE, strategy=strategy)
+    own = tiny_config(folder / name, method).strategy
+    changes = {"batch_size": SIZE, **changes, "strategy": type(own)(**{**vars(own), **changes.get("strategy", {})})}
+    config = tiny_config(folder / name, method, **changes)
     run = TrainingRun(config, edit(tiny_capture()), engine=emulated_engine(), ranks=ranks, resume=resume, watch=watch)
     run.run()
     return run

@@ -48,6 +48,20 @@ CASES = {
         {"strategy": {"pop_views": "window", "refine_start_iter": 8, "refine_stop_iter": 7}},
         lambda capture: capture,
     ),
+    "entropy": ({"strategy": {"lambda_pop": 0.0, "lambda_entropy": 0.05}}, lambda capture: capture),
+    "regularizers": (
+        {"opacity_reg": 0.1, "scale_reg": 0.05, "strategy": {"lambda_entropy": 0.05}},
+        lambda capture: capture,
+    ),
+    "batch, regularizers": (
+        {
+            "batch_size": 2,
+            "opacity_reg": 0.1,
+            "scale_reg": 0.05,
+            "strategy": {"lambda_pop": 0.0, "lambda_entropy": 0.05},
+        },
+        lambda capture: capture,
+    ),
     "any view": ({"strategy": {"blur_window": "any_view"}}, masked),
     "batch": ({"batch_size": 3}, lambda capture: masked(mixed_sizes(capture))),
     "batch, window": (
