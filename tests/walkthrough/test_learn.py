@@ -435,7 +435,9 @@ def test_a_capture_of_ones_own_ends_above_20_db_and_not_by_what_came_last(
     told_ = capsys.readouterr().out
     psnrs = [float(text) for text in re.findall(r"([\d.]+) dB  ", told_)]
     assert psnrs[-1] > max(20.0, max(psnrs) - 1.0)
-    n, mean, low, high = re.findall(r"(\d+) views that no step saw: ([\d.]+) dB on average, ([\d.]+) to ([\d.]+)", told_)[0]
+    n, mean, low, high = re.findall(
+        r"(\d+) views that no step saw: ([\d.]+) dB on average, ([\d.]+) to ([\d.]+)", told_
+    )[0]
     assert int(n) == 2
     assert 20.0 < float(low) <= float(mean) <= float(high)
     sizes = re.findall(r"(\d+) Gaussians", told_)

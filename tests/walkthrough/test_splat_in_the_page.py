@@ -86,7 +86,9 @@ def _opened(page: Page, place: Path, address: str, width: int = 900) -> None:
     markup = html("python")
     assert markup.count(json.dumps(PYODIDE)) == 1
     text = markup.replace(json.dumps(PYODIDE), json.dumps(address))
-    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><style>{asset("page.css")}</style>'
+    head = (
+        f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><style>{asset("page.css")}</style>'
+    )
     place.write_text(f"<!doctype html><html><head>{head}</head><body><main>{text}</main></body></html>")
     page.open(place, width=width)
 

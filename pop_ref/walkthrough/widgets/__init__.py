@@ -63,7 +63,7 @@ WIDGETS: Final = {
     ),
     "python": Widget(
         "splat.py, in this page",
-        "run it, and find the printed numbers again in its last function: what does a line say, and which view is it of?",
+        "run it, and find in its last function where a line is printed: what does it say, and of which view?",
     ),
 }
 
