@@ -68,7 +68,7 @@ class Train:
     picture: Path | None = None
     """A picture to fit instead of the toy; its middle square is taken."""
     scene: Path | None = None
-    """A capture to fit instead of the toy: a folder with photographs and cameras, as `pop train` takes it."""
+    """A capture to fit instead of the toy, as `pop train` takes it; one view in eight is put aside and judged by."""
     steps: int = 120
     """How many; the usual number takes some minutes in plain NumPy."""
     out: Path | None = None

@@ -149,6 +149,9 @@ def train_work(folder: Path, subject: Subject, steps: int, out: Path | None) -> 
         print(f"step {told.step:3d}   loss {told.loss:.5f}   {told.psnr:.2f} dB   {told.n} Gaussians", flush=True)
         frames.append(told.picture.repeat(4, axis=0).repeat(4, axis=1))
         _write(out, told.picture)
+        if len(told.psnrs) > 1:
+            low, mean, high = min(told.psnrs), sum(told.psnrs) / len(told.psnrs), max(told.psnrs)
+            print(f"{len(told.psnrs)} views that no step saw: {mean:.2f} dB on average, {low:.2f} to {high:.2f}")
     film = out.with_name(f"{out.stem}_film.png")
     write_film(film, frames)
     print(f"photograph and render -> {out}; the film, for a browser -> {film}")

@@ -17,6 +17,8 @@ from pop_ref.learn.student import Borrowed, Work, borrowing, said, where
 SIZE: Final = 64
 # Gaussians of a capture's far sphere
 _FAR: Final = 80
+# one view in so many of a capture is put aside, as benchmarks do
+_HELD_OUT: Final = 8
 # a camera as `records.Camera` takes it, and what it sees, [H, W, 3] in [0, 1]
 View = tuple[tuple[np.ndarray, np.ndarray, int, int], np.ndarray]
 
@@ -27,26 +29,36 @@ class Subject:
 
     Attributes:
         views: cameras and photographs; training takes one a step, all in a random order, then all again.
-        shown: the view that the film shows.
+        aside: the views that a training is judged by; no step sees them, and the film shows the first.
         params: raw parameters of the Gaussians to start from.
         scene_scale: world units.
     """
 
     views: Sequence[View]
-    shown: View
+    aside: Sequence[View]
     params: dict[str, np.ndarray]
     scene_scale: float = 1.0
 
 
 @dataclass(frozen=True)
 class Told:
-    """A training on its way: the step, its loss, the Gaussians, a photograph and its render side by side."""
+    """A training on its way.
+
+    Attributes:
+        step: number of steps taken.
+        loss: of the last of them.
+        psnr: dB, of the view that is shown.
+        n: Gaussians.
+        picture: photograph and render side by side, [H, 2 W, 3].
+        psnrs: dB, of all views that are put aside, at the last step; empty before.
+    """
 
     step: int
     loss: float
     psnr: float
     n: int
     picture: np.ndarray
+    psnrs: tuple[float, ...] = ()
 
 
 def the_toy(size: int = SIZE, n_views: int = 8, seed: int = 0) -> Subject:
@@ -69,11 +81,13 @@ def the_toy(size: int = SIZE, n_views: int = 8, seed: int = 0) -> Subject:
         "sh0": ((colors - 0.5) / SH_C0)[:, None],
     }
     views = [(camera, photograph(camera)) for camera in cameras]
-    return Subject(views, (unseen, photograph(unseen)), params)
+    return Subject(views, [(unseen, photograph(unseen))], params)
 
 
 def a_picture(image: np.ndarray, size: int = SIZE, cells: int = 16) -> Subject:
     """Stand before a picture and start from a grid of Gaussians, each of the colour of its cell.
+
+    There is one view: the training is judged by what it was trained on.
 
     Args:
         image: [H, W, 3] in [0, 1]; its middle square is taken.
@@ -94,13 +108,13 @@ def a_picture(image: np.ndarray, size: int = SIZE, cells: int = 16) -> Subject:
     colors = shrunk(target, cells, cells).reshape(-1, 3)
     K = np.array([[f, 0.0, size / 2], [0.0, f, size / 2], [0.0, 0.0, 1.0]])
     view = (np.eye(4), K, size, size), target
-    return Subject([view], view, _started(means, colors, 0.6 * size / cells * depth / f), 4.0)
+    return Subject([view], [view], _started(means, colors, 0.6 * size / cells * depth / f), 4.0)
 
 
 def a_capture(
-    views: Sequence[View], points: np.ndarray, colors: np.ndarray, scene_scale: float, n: int = 1000
+    views: Sequence[View], points: np.ndarray, colors: np.ndarray, scene_scale: float, n: int = 2000
 ) -> Subject:
-    """Start from some of a capture's points, and from a far sphere; the first view is put aside and shown.
+    """Start from some of a capture's points, and from a far sphere; every eighth view is put aside, the first too.
 
     Sky and bare walls have no points, and what no Gaussian covers has no gradient: the sphere covers it.
 
@@ -130,8 +144,9 @@ def a_capture(
     widths = np.concatenate([near, np.full(_FAR, radius * np.sqrt(4.0 * np.pi / _FAR))])
     mean_color = np.mean([photo.mean(axis=(0, 1)) for _, photo in views], axis=0)
     tints = np.concatenate([colors[picked], np.tile(mean_color, (_FAR, 1))])
-    params = _started(np.concatenate([means, sphere]), tints, 0.6 * widths)
-    return Subject(views[1:], views[0], params, scene_scale)
+    params = _started(np.concatenate([means, sphere]), tints, 0.4 * widths)
+    seen = [view for k, view in enumerate(views) if k % _HELD_OUT]
+    return Subject(seen, views[::_HELD_OUT], params, scene_scale)
 
 
 def shrunk(image: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -189,17 +204,22 @@ def _steps(borrowed: Borrowed, subject: Subject, steps: int, every: int, rng: np
     density = replace(recipe.density, refine_start_iter=0, refine_every=max(2, steps // 4), refine_stop_iter=steps // 2)
     density = replace(density, grow_grad2d=1e-3)
     recipe = replace(recipe, max_steps=steps, lr=rates, density=density, pop_stop_iter=steps // 2)
-    camera, target = types.Camera(*subject.shown[0]), subject.shown[1]
     state, loss, waiting = training.start(subject.params), float("nan"), list[int]()
     for step in range(steps + 1):
         if step % every == 0 or step == steps:
             gaussians = training.gaussians_from_params(state.rows.params)
-            image = borrowed.module("render").render(gaussians, camera).image
-            psnr = -10.0 * np.log10(l2(np.clip(image, 0.0, 1.0), target)[0])
-            yield Told(step, loss, float(psnr), len(gaussians), np.concatenate([target, image], axis=1))
+            judged = subject.aside if step == steps else subject.aside[:1]
+            images = [borrowed.module("render").render(gaussians, types.Camera(*camera)).image for camera, _ in judged]
+            psnrs = tuple(_psnr(image, photo) for image, (_, photo) in zip(images, judged, strict=True))
+            beside = np.concatenate([judged[0][1], images[0]], axis=1)
+            yield Told(step, loss, psnrs[0], len(gaussians), beside, psnrs if step == steps else ())
         if step < steps:
             # every view once before any comes again
             waiting = waiting or rng.permutation(len(subject.views)).tolist()
             seen, photo = subject.views[waiting.pop()]
             normals = lambda n: rng.standard_normal((2, n, 3))  # noqa: E731
             state, loss = training.train_step(state, types.Camera(*seen), photo, scale, normals, recipe)
+
+
+def _psnr(image: np.ndarray, photo: np.ndarray) -> float:
+    return float(-10.0 * np.log10(l2(np.clip(image, 0.0, 1.0), photo)[0]))

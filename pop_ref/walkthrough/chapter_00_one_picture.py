@@ -164,8 +164,12 @@ picture(
 #
 # {{widget: train}}
 #
-# The page does what `pop_ref/learn/splat.py` does, the whole method in 300 lines of NumPy. With its functions the loop
-# is short. Here it takes seventy turns on our still life:
+# The page does what `pop_ref/learn/splat.py` does, the whole method in 300 lines of NumPy. Run it on your machine
+# (`python -m pop_ref.learn.splat`), or in this page, which fetches a Python for browsers if you ask it to.
+#
+# {{widget: python}}
+#
+# With its functions the loop is short. Here it takes seventy turns on our still life:
 
 # %%
 STEPS = 70

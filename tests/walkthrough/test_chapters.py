@@ -89,6 +89,12 @@ OTHER_DRAWS = {"2": 100, "3": 100, "4": 100, "4b": 100, "5": 300, "5b": 100, "6"
 OTHER_DRAWS |= {"0": 100, "8": 100, "9": 300, "9b": 100, "10": 100, "12": 100}
 # of those that train or draw a scene: what else is written otherwise, a size, a start or the seed of a run
 OTHERWISE = {
+    "1, another splat": (
+        "1",
+        0,
+        ("opacity = 0.8\n", "opacity = 0.6\n"),
+        ("np.array([17.5, 10.5])", "np.array([15.5, 9.5])"),
+    ),
     "8, larger": ("8", 300, ("POP_STEPS, WEIGHT = 28, 40,", "POP_STEPS, WEIGHT = 32, 48,")),
     "8, other places": ("8", 7, ("(-0.3, 0.0, 0.3)]", "(-0.25, 0.05, 0.35)]")),
     "9, other starts": ("9", 0, ("rng = np.random.default_rng(seed)", "rng = np.random.default_rng(seed + 200)")),

@@ -413,7 +413,10 @@ def test_a_capture_is_trained_on_from_its_points(mine: Path) -> None:
     capture = load_capture(mine / "demo")
     views = [((view.viewmat, view.K, 64, 48), view.image / 255.0) for view in capture.views]
     subject = a_capture(views, capture.points, capture.points_rgb / 255.0, capture.scene_scale(), n=60)
-    assert len(subject.views) == 5
+    assert (len(subject.views), len(subject.aside)) == (5, 1)
+    # one view in eight is judged by and never trained on
+    many = a_capture(views * 3, capture.points, capture.points_rgb / 255.0, capture.scene_scale(), n=60)
+    assert (len(many.views), len(many.aside)) == (15, 3)
     *_, last = train(read_work(mine), subject, 4, every=4)
     assert np.isfinite(last.psnr)
     with pytest.raises(ValueError, match="two views and a point are needed"):
@@ -430,8 +433,13 @@ def test_a_capture_of_ones_own_ends_above_20_db_and_not_by_what_came_last(
     make_demo(mine / "demo", views=16, width=64, height=48)
     assert main(["learn", "train", str(mine), "--steps", "60", "--scene", str(mine / "demo")]) == 0
     told_ = capsys.readouterr().out
-    psnrs = [float(text) for text in re.findall(r"([\d.]+) dB", told_)]
+    psnrs = [float(text) for text in re.findall(r"([\d.]+) dB  ", told_)]
     assert psnrs[-1] > max(20.0, max(psnrs) - 1.0)
+    n, mean, low, high = re.findall(
+        r"(\d+) views that no step saw: ([\d.]+) dB on average, ([\d.]+) to ([\d.]+)", told_
+    )[0]
+    assert int(n) == 2
+    assert 20.0 < float(low) <= float(mean) <= float(high)
     sizes = re.findall(r"(\d+) Gaussians", told_)
     assert len(set(sizes[3:])) == 1 < len(set(sizes)), "the number of Gaussians changes after half time"
 

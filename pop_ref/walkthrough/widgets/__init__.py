@@ -1,4 +1,6 @@
-"""Widgets for the pages: pictures that answer to a finger, a mouse or the arrow keys, with no network and no framework.
+"""Widgets for the pages: pictures that answer to a finger, a mouse or the arrow keys, with no framework.
+
+None needs a network but "python", which runs `splat.py` in Pyodide, and asks for that when its button is pressed.
 
 Each is one plain script beside this file. Its mathematics stands apart in `math/`, its functions named as the
 oracle's; a test runs those against the oracle. The constants are those of the profile `paper`.
@@ -16,6 +18,8 @@ from typing import Final
 from pop_ref.constants import PAPER
 
 FOLDER: Final = Path(__file__).resolve().parent
+# where Pyodide is fetched from, when a reader asks for it
+PYODIDE: Final = "https://cdn.jsdelivr.net/pyodide/v0.27.7/full/"
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,10 @@ WIDGETS: Final = {
         "train, and watch the histograms. Then make the prior ten times as heavy and start again: which opacities go, "
         "and what does the picture lose?",
         worker=("training",),
+    ),
+    "python": Widget(
+        "splat.py, in this page",
+        "run it, and find in its last function where a line is printed: what does it say, and of which view?",
     ),
 }
 
@@ -101,8 +109,15 @@ def mathematics(*files: str) -> str:
 
 def _script(name: str, widget: Widget) -> str:
     # a worker begins from text, since a page that lies in a file may load nothing
-    text = mathematics(*widget.worker) + _text(f"{name}_worker.js") if widget.worker else ""
-    worker = f"const WORKER = {json.dumps(text)};" if text else ""
+    text = mathematics(*widget.worker) if widget.worker else ""
+    file = f"{name}_worker.js"
+    worker = f"const WORKER = {json.dumps(text + _text(file))};" if (FOLDER / file).exists() else ""
+    if name == "python":
+        splat = (FOLDER.parents[1] / "learn" / "splat.py").read_text(encoding="utf-8")
+        worker += (
+            f"const SPLAT = {json.dumps(splat)}, PYODIDE = {json.dumps(PYODIDE)}, "
+            'COMMAND = "python -m pop_ref.learn.splat";'
+        )
     # whatever a page holds more than once is started once
     start = (
         f"for (const root of document.querySelectorAll('.pop-widget[data-widget=\"{name}\"][hidden]')) "
