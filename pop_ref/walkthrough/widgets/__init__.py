@@ -111,7 +111,11 @@ def _script(name: str, widget: Widget) -> str:
     # a worker begins from text, since a page that lies in a file may load nothing
     text = mathematics(*widget.worker) if widget.worker else ""
     file = f"{name}_worker.js"
-    worker = f"const WORKER = {json.dumps(text + _text(file))};" if (FOLDER / file).exists() else ""
+    worker = (
+        f"const WORKER = {json.dumps(text + _text(file))};"
+        if (FOLDER / file).exists()
+        else ""
+    )
     if name == "python":
         splat = (FOLDER.parents[1] / "learn" / "splat.py").read_text(encoding="utf-8")
         worker += (
