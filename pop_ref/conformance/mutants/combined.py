@@ -271,7 +271,7 @@ BOXES: Final[tuple[tuple[str, str, Breaks, str], ...]] = (
     ("backgrounds_of_the_first_camera", "all cameras have the first one's background",
      _if(_both(_several, _behind), backgrounds=_of_first("backgrounds", 1)), IMAGES),
     ("harmonics_seen_from_the_first_camera", "directions of harmonics begin at the first camera",
-     _seen_from_the_first, IMAGES),
+     _seen_from_the_first, "test_signature_cameras:several_cameras_in_one_call_see_what_each_sees_alone"),
     ("cameras_backwards_from_three_on", "from three cameras on, images come out in reverse order",
      _then(lambda g: g["viewmats"].shape[-3] > 2, lambda g, i, a, m: (i.flip(-4), a.flip(-4), m)), IMAGES),
     ("alphas_of_the_first_camera", "every camera has the first one's alphas",
