@@ -334,7 +334,8 @@ class BatchTrainer:
         Returns:
             How many are, how many are not, the terms of both, and the sums of the regularizers. [7]
         """
-        own = _regularized(of.rows)
+        weights = regularizers(self.settings, phase, self._bounds[-1]).values()
+        own = _regularized(of.rows) if any(weights) else torch.zeros(3, dtype=torch.int64, device=self.device)
         if not phase.pop:
             return torch.cat((torch.zeros(4, dtype=torch.int64, device=self.device), own))
         self._begin(place)

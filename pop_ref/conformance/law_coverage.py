@@ -230,7 +230,7 @@ def reason(file: str, function: str) -> str | None:
 
 def main(words: list[str]) -> int:
     """Write what a run reaches."""
-    if len(words) != 1:
+    if len(words) != 1 or words[0].startswith("-"):
         print("usage: python -m pop_ref.conformance.law_coverage FILE")
         return 2
     Path(words[0]).write_text(json.dumps(run(), indent=1) + "\n", encoding="utf-8")

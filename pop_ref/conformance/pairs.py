@@ -211,7 +211,9 @@ def call_of(backend: Any, row: Mapping[str, str], number: int) -> Call:
     for factor, name in row.items():
         asks |= level(factor, name).asks
     # what a scene is, as a backend reads it, follows from these
-    key = (tuple(row.items()), number, np.dtype(backend.dtype).name, backend.profile, type(backend).sees)
+    # a bound method is another at every look; of a wrapper it is that of whom it wraps
+    reader = getattr(backend.sees, "__func__", backend.sees)
+    key = (tuple(row.items()), number, np.dtype(backend.dtype).name, backend.profile, reader)
     side = getattr(backend, "own_tile_size", None) if not backend.takes("tile_size") else None
     if (*key, side) not in _calls:
         _calls[*key, side] = clear_call(backend, first_seed=16 * number, **asks)

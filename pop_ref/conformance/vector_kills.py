@@ -89,7 +89,7 @@ def kills(report: Callable[[str, str | None], None] = lambda name, found: None, 
 def main(words: list[str]) -> int:
     """Write the results."""
     more = words[1:] == ["--more"]
-    if len(words) != 1 + more:
+    if len(words) != 1 + more or words[0].startswith("-"):
         print("usage: python -m pop_ref.conformance.vector_kills FILE [--more]")
         return 2
     known = json.loads(Path(words[0]).read_text(encoding="utf-8")) if more else None

@@ -230,24 +230,25 @@ def refusal(backend: Any, capability: str) -> str | None:
 def refusal_of(backend: Any, call: Call) -> str | None:
     """Make a call that asks for one thing, and return in what words the backend refuses it; None if it does not.
 
-    A refusal is an error that the backend raised on purpose about an argument, with backgrounds or without: whoever
-    takes the argument in one of the two calls takes it. Where both calls end in other errors, an assertion among them,
-    that is a defect: the argument counts as taken, so that laws run into the error and report it.
+    A refusal is an error that the backend raised on purpose about an argument where it is asked for without
+    backgrounds; who takes it with backgrounds takes it. Where the call without backgrounds ends in any other error, an
+    assertion among them, that is a defect: the argument counts as taken, so that laws run into the error and report it.
+    What goes wrong with backgrounds alone, as packed rows in gsplat 1.5.3 (gsplat#764), is for laws of packed rows.
 
     Args:
         backend: has a method `call`.
         call: with backgrounds, or without.
     """
-    words = None
+    words: list[str | None] = []
     for asked in (call, without_backgrounds(call)):
         try:
             backend.call(asked)
         except Exception as error:
-            if refuses_on_purpose(error):
-                words = words or f"{type(error).__name__}: {error}"
+            words.append(f"{type(error).__name__}: {error}" if refuses_on_purpose(error) else None)
         else:
             return None
-    return words
+    with_backgrounds, alone = words
+    return alone and (with_backgrounds or alone)
 
 
 def refuses_on_purpose(error: Exception) -> bool:

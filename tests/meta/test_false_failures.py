@@ -97,6 +97,19 @@ def _asserts() -> None:
     assert allowed, "packed rows come later"
 
 
+def _refuses_packed_by(alone: Callable[[], Any], with_backgrounds: Callable[[], Any]) -> Callable[..., Any]:
+    def rasterization(*args: Any, packed: bool = True, backgrounds: Any = None, **options: Any) -> Any:
+        if packed:
+            return alone() if backgrounds is None else with_backgrounds()
+        return sound(*args, packed=False, backgrounds=backgrounds, **options)
+
+    return rasterization
+
+
+def _states() -> Any:
+    return _raises(NotImplementedError("packed"))
+
+
 def without_packed(means: Any, quats: Any, scales: Any, opacities: Any, colors: Any, viewmats: Any, Ks: Any,
                    width: int, height: int, sh_degree: int | None = None, backgrounds: Any = None) -> Any:  # fmt: skip
     return sound(means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree=sh_degree,
@@ -108,6 +121,7 @@ REFUSALS: dict[str, Callable[..., Any]] = {
     "a ValueError by a statement": _refuses_packed(lambda: _raises(ValueError("packed=True is not for me"))),
     "words of compiled code": _refuses_packed(lambda: _raises(RuntimeError("packed mode is not supported"))),
     "no such argument": without_packed,
+    "a statement, and an assertion with backgrounds": _refuses_packed_by(_states, _asserts),
 }
 DEFECTS: dict[str, Callable[..., Any]] = {
     "an assertion": _refuses_packed(_asserts),
@@ -115,6 +129,7 @@ DEFECTS: dict[str, Callable[..., Any]] = {
     "arrays that do not fit": _refuses_packed(lambda: np.zeros(2) + np.zeros(3)),
     "a key that is not there": _refuses_packed(lambda: {}["packed"]),
     "an argument of something inside": _refuses_packed(lambda: dict.fromkeys(values=())),  # type: ignore[call-arg]
+    "an assertion, and a statement with backgrounds": _refuses_packed_by(_asserts, _states),
     "a kernel that fails": _refuses_packed(lambda: _raises(RuntimeError("illegal memory access"))),
 }
 PACKED_LAW = "test_signature_cameras:packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same"

@@ -9,6 +9,7 @@ import numpy as np
 
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.law_coverage import LIMITS, MODULES, PACKAGE, Log, Logged, code_lines, reason
+from pop_ref.conformance.pairs import accepted, call_of, covering_rows
 from pop_ref.conformance.scenes import golden_scene
 from pop_ref.losses import l2
 
@@ -32,6 +33,16 @@ def test_arguments_of_what_is_drawn_are_logged() -> None:
     assert log.ranges["width, px"] == (scene.camera.width,) * 2
     assert log.ranges["opacity"] == (scene.gaussians.opacities.min(), scene.gaussians.opacities.max())
     assert log.choices["antialiased"] == {str(scene.antialiased)}
+
+
+def test_what_is_asked_by_pairs_of_arguments_is_logged() -> None:
+    log, backend = Log(), OracleAdapter()
+    row = covering_rows(accepted(backend).levels)[0]
+    call = call_of(Logged(backend, log), row, 0)
+    Logged(backend, log).call(call)
+    assert log.ranges["cameras"] == (len(call.frames[0]),) * 2
+    # whom nobody wraps is asked the same
+    assert call_of(backend, row, 0) == call
 
 
 def test_every_line_that_no_law_reaches_refuses_arguments_or_has_a_reason() -> None:
