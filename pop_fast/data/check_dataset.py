@@ -241,7 +241,7 @@ def about_drift(photos: Sequence[Photo]) -> Iterator[Finding]:
     extremes = (int(np.nanargmin(found.stops)), int(np.nanargmax(found.stops)))
     ends = [f"{found.stops[i]:+.2f} ({known[i].shot.name})" for i in extremes]
     text = f"the same points differ by {width:.2f} stops from photograph to photograph, {ends[0]} to {ends[1]}"
-    text += "" if uneven is None else f"; from those taken next to it one differs by {uneven:.2f}"
+    text += "" if uneven is None else f"; a photograph differs by {uneven:.2f} from those taken next to it"
     bad = uneven is not None and uneven > UNEVEN
     fix = "; lock the exposure, or train with --exposure" if bad else ""
     yield Finding("warn" if bad else "ok", "exposure", text + fix)

@@ -212,7 +212,7 @@ def choose_terms(capture: Capture, config: TrainConfig, stops: float | None) -> 
     found = exposures_of(capture).unevenness(np.stack([view.viewmat for view in capture.views]))
     drifts = []
     if found is not None and found > UNEVEN:
-        drifts.append(f"the same points differ by {found:.2f} stops from those of photographs taken next to them")
+        drifts.append(f"by their common points they differ by {found:.2f} stops from those taken next to them")
     if stops is not None and stops > DRIFT_STOPS:
         drifts.append(f"their exposures are {stops:.1f} stops apart")
     if drifts and config.batch_size == 1:

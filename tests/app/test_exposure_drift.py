@@ -123,7 +123,7 @@ def test_training_learns_exposures_where_the_points_say_that_they_differ(
     config = TrainConfig.of(preset="auto", backend="fast")
     terms = choose_terms(changed, config, None)
     assert terms.settings.get("exposure", False) is learned
-    assert any("the same points differ by" in why for why in terms.why) is learned
+    assert any("by their common points they differ by" in why for why in terms.why) is learned
     blind = replace(changed, views=tuple(replace(view, seen=None) for view in changed.views))
     assert exposures_of(blind).drift is None
     assert "exposure" not in choose_terms(blind, config, None).settings
@@ -142,7 +142,7 @@ def test_data_check_says_what_training_will_do(pop: Pop, folder: Path, tmp_path:
     assert line.startswith("LOOK")
     told = float(line.partition("differ by ")[2].split()[0])
     assert told == pytest.approx(stops.std(), abs=0.1)
-    assert float(line.partition("one differs by ")[2].split(";")[0]) > UNEVEN
+    assert float(line.partition("a photograph differs by ")[2].split()[0]) > UNEVEN
     darkest, brightest = paths[int(stops.argmin())].name, paths[int(stops.argmax())].name
-    assert re.search(rf"photograph, -0\.\d+ \({darkest}\) to \+0\.\d+ \({brightest}\); from ", line)
+    assert re.search(rf"photograph, -0\.\d+ \({darkest}\) to \+0\.\d+ \({brightest}\); a ", line)
     assert line.endswith("; lock the exposure, or train with --exposure")
