@@ -31,6 +31,7 @@ MODULES: Final = tuple(sorted({*STAGE_MODULES, "render", "splatting", "depth", "
 # by function: why no law reaches lines of it; a statement that refuses arguments needs none
 REASONS: Final[dict[str, str]] = {
     "training.py": "the oracle's own trainer: laws drive strategies by `scripted_steps`, tests hold trainers to this",
+    "harmonics.py: lower_degree": "fits trained harmonics to a budget: no rasterizer is asked; a test holds ours to it",
     "taming.py: taming_scores": "sums what laws of single views judge",
     "chord.py: _ray_direction": "a principal point in the middle, which profile `inria` has",
     "margins.py: nearest": "read by reports of failures",
