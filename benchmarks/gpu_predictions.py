@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from gpu_floors import SASS, Card, Loads, floors
+from record import with_table
 
 from cuda_ext.training.batch_step import step_bytes
 
@@ -123,9 +124,7 @@ def with_tables(text: str) -> str:
     """Put the tables between their marks."""
     tables = {"machine code": machine_code(SASS), "predictions": predictions(), "ranks": exchanged()}
     for name, table in tables.items():
-        begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
-        head, rest = text.split(begin)
-        text = head + begin + table + "\n" + end + rest.split(end)[1]
+        text = with_table(text, name, table)
     return text
 
 

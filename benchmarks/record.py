@@ -55,3 +55,10 @@ def text_of(result: dict[str, Any]) -> str:
     """Write results as JSON with one line for each entry, so that a difference shows which entry has changed."""
     lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(value)}" for name, value in result.items())
     return f"{{\n{lines}\n}}\n"
+
+
+def with_table(text: str, name: str, table: str) -> str:
+    """Put a table between its marks, `<!-- NAME -->` and `<!-- end of NAME -->`."""
+    begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
+    head, rest = text.split(begin)
+    return head + begin + table + "\n" + end + rest.split(end)[1]

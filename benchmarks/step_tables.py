@@ -15,6 +15,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+if __package__ in (None, ""):
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.record import with_table
+
 NOTES = Path(__file__).resolve().parent / "NOTES.md"
 RESULTS = Path(__file__).resolve().parent / "results" / "cpu.json"
 NOT_YET = "Not measured yet: run `python benchmarks/run.py`."
@@ -167,11 +172,9 @@ TABLES: dict[str, tuple[str, Callable[[Mapping[str, Any]], str]]] = {
 
 
 def with_tables(text: str, timed: Mapping[str, Any]) -> str:
-    """Put every table between its marks, `<!-- NAME -->` and `<!-- end of NAME -->`."""
+    """Put every table between its marks."""
     for name, (part, make) in TABLES.items():
-        begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
-        head, rest = text.split(begin)
-        text = head + begin + (make(timed) if part in timed else NOT_YET) + "\n" + end + rest.split(end)[1]
+        text = with_table(text, name, make(timed) if part in timed else NOT_YET)
     return text
 
 
