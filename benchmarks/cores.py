@@ -1,6 +1,6 @@
 """What a native step would take on a machine of more cores than this one: a simulation from the work of its parts.
 
-A step is a row of works, each cut into parts that do not depend on who does them (`pop_fast/compiled/pool.h`). One
+A step is a row of works, each cut into parts that no thread changes (`pop_fast/compiled/pool.h`). One
 thread takes steps of which every part is timed, cut as for the threads of the machine in question. Then, work by work:
 
     time of a work = what one thread has for itself before it + HANDOVER

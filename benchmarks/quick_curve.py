@@ -16,7 +16,6 @@ import argparse
 import itertools
 import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -45,9 +44,11 @@ SHARES: Final = (0.1, 0.2, 0.3, 0.4, 0.5, 0.75, 1.0)
 def curve(kind: str, capture: Capture, data: Path, seed: int) -> list[dict[str, float]]:
     """Train, and give what was measured on the way: step, seconds, psnr, ssim, gaussians."""
     with TemporaryDirectory() as folder:
-        given = TrainConfig.of(**KINDS[kind], seed=seed, data=str(data), result_dir=f"{folder}/run", progress=False)
-        steps = tuple(round(given.max_steps * k / POINTS) for k in range(1, POINTS + 1))
-        config = replace(choose_backend(given)[0], checkpoint_every=0, eval_steps=steps, save_steps=())
+        places: dict[str, Any] = {"data": str(data), "result_dir": f"{folder}/run", "progress": False}
+        last = TrainConfig.of(**KINDS[kind]).max_steps
+        steps = tuple(round(last * k / POINTS) for k in range(1, POINTS + 1))
+        often = {"eval_steps": steps, "save_steps": (last,), "checkpoint_every": 0}
+        config = choose_backend(TrainConfig.of(**KINDS[kind], **places, **often, seed=seed))[0]
         TrainingRun(config, capture).run()
         found = [read_stats(Path(folder) / "run" / "stats" / f"val_step{step - 1:04d}.json") for step in steps]
     return [

@@ -326,7 +326,7 @@ def teeth() -> str:
 
 
 def mutants() -> str:
-    """Make the list of mutants: what happened to whom, and the law that notices."""
+    """Make the list of mutants: what was broken in which file, and the law that notices."""
     laws = every_law()
     rows = [
         [

@@ -39,7 +39,7 @@ BESIDE: Final = "row.json"
 # what `ProbedRun` leaves there
 PROBE: Final = "probe.json"
 _AGAIN: Final = "train the row again in an empty folder"
-# where things lie, who takes the steps and how often something is written: no part of what was trained
+# where things lie, which engine takes the steps and how often something is written: no part of what was trained
 _APART: Final = frozenset(
     {
         *("data", "result_dir", "eval_steps", "save_steps", "checkpoint_every", "keep_checkpoints", "max_renders"),

@@ -176,7 +176,7 @@ def _answer(reading: Reading, results: Sequence[Result]) -> Answer:
                 default, other = _found(column, rows, {}), _found(column, rows, trained)
                 if default is None or other is None:
                     continue
-                # over the default's: who is nearer, or both within the range
+                # over the default's: which is nearer, or both within the range
                 ahead = column.apart(other) - column.apart(default)
                 votes.append((column.rows, (ahead > 0.0) - (ahead < 0.0)))
                 lines.append((scale, scene, *_shown(column, default, other), _NEARER[votes[-1][1]]))

@@ -43,8 +43,8 @@ AMBIGUITIES: Final = (
     Ambiguity(
         "A1",
         "H",
-        "Who is important: in one view, or over several?",
-        "who dominates a pixel of the current view",
+        "Which Gaussians are important: by one view, or over several?",
+        "what dominates a pixel of the current view",
         _TERM,
         ("Recipe.pop_views = window",),
     ),
@@ -66,7 +66,7 @@ AMBIGUITIES: Final = (
     Ambiguity(
         "A4",
         "M",
-        "Who wins a pixel when two weights are equal?",
+        "Which Gaussian wins a pixel when two weights are equal?",
         "the splat in front",
         "pop_ref.dominance:dominant_id",
         mark="D8",
@@ -74,7 +74,7 @@ AMBIGUITIES: Final = (
     Ambiguity(
         "A5",
         "L",
-        "Who wins a pixel that nothing covers?",
+        "Which Gaussian wins a pixel that nothing covers?",
         "nobody: its dominant id is -1",
         "pop_ref.dominance:dominant_id",
         mark="none",
@@ -139,7 +139,7 @@ AMBIGUITIES: Final = (
     Ambiguity(
         "A14",
         "H",
-        "Who of the blur set is cloned, who is split?",
+        "What of the blur set is cloned, and what is split?",
         "the gradient rule's size test decides",
         _CONFIG,
         ("DensityConfig.blur_rule = split",),

@@ -1,4 +1,4 @@
-"""Adaptive density control: what is counted, who is selected, and the densification step that edits the Gaussians.
+"""Adaptive density control: what is counted, what is selected, and the densification step that edits the Gaussians.
 
 Between two densification steps each view adds to the window's statistics. At a densification step
 
@@ -188,7 +188,7 @@ def grow_masks(
     step: int,
     config: DensityConfig = POP,
 ) -> tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
-    """Decide who is cloned and who is split.
+    """Decide which Gaussians are cloned and which are split.
 
     A Gaussian is small if its largest scale is at most `grow_scale3d * scene_scale`. The grad set, joined inside the
     blur window by the blur set (A8), is cloned where small and split where not (A14). Under "split" blurred

@@ -260,7 +260,7 @@ class _Driven:
         return {**done, "pruned": done.get("pruned", 0) + int(np.sum(gone))}
 
     def _refine(self, step: int) -> dict[str, int]:
-        """Clone, split, prune, forget: who is drawn, for Taming-3DGS."""
+        """Clone, split, prune, forget: what is drawn, for Taming-3DGS."""
         config, scale = self.recipe.density, self.script.scene_scale
         scales = np.exp(self.rows.params["scales"])
         clone, split = density.grow_masks(self.window, scales, scale, step, config)

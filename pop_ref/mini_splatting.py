@@ -1,7 +1,7 @@
 """Mini-Splatting's importance, and the numbers from which it sets a cloud of points anew.
 
 The importance of a Gaussian is its weight in the views; outdoors its mean weight a pixel, so that what is near and
-covers many pixels does not outweigh what is far. Who never dominates a pixel has none.
+covers many pixels does not outweigh what is far. What never dominates a pixel has none.
 """
 
 from __future__ import annotations

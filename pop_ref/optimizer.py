@@ -1,4 +1,4 @@
-"""Adam on rows, and what training needs to know of a step: learning rates, who is moved, the harmonics' degree.
+"""Adam on rows, and what training needs to know of a step: learning rates, what is moved, the harmonics' degree.
 
 Adam, with t counting updates from 1:
 
@@ -247,7 +247,7 @@ def update_numbers(names: Iterable[str], step: int, recipe: Recipe) -> dict[str,
         recipe: as in `is_updated`.
 
     Returns:
-        t from 1 by name; who is not moved is not in it.
+        t from 1 by name; parameters that are not moved are not in it.
 
     Example:
         >>> recipe = Recipe(updates=UpdateRules(sh_rest_every=2), adam_restarts=(1,))

@@ -1,4 +1,4 @@
-"""The polarized opacity prior: who is important in a view, and the pull of opacities to 1 or to 0.
+"""The polarized opacity prior: what is important in a view, and the pull of opacities to 1 or to 0.
 
 With M the importance mask and N_imp = Σ M,
 

@@ -1,4 +1,4 @@
-"""Who is kept, by a score: a share of the rows, a share of the mass, or a draw without replacement."""
+"""What is kept, by a score: a share of the rows, a share of the mass, or a draw without replacement."""
 
 from __future__ import annotations
 

@@ -121,7 +121,7 @@ class PopTerm:
         pop_views: "current" takes importance from the current view, "window" from all since densification (A1).
         pop_over: "all" averages over all Gaussians, "visible" over those the view shows (A12).
         lambda_entropy: weight of the mean binary entropy of all opacities, a rival of the POP term that does not ask
-            who is important; on at the same steps.
+            what is important; on at the same steps.
     """
 
     lambda_pop: float = 1e-3

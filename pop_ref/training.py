@@ -139,7 +139,7 @@ def train_step(
     mode = "RGB+ED" if deep else "RGB"
     options: dict[str, Any] = {"sh_degree": degree, "profile": recipe.profile, "render_mode": mode}
     view = render(gaussians, camera, **options)
-    # the dominant counts of this very forward pass say who is important (A27)
+    # the dominant counts of this very forward pass say what is important (A27)
     colored = replace(view, image=view.image[..., :3])
     loss, v_image, v_opacities = objective(colored, gaussians, target, state, recipe)
     if points is not None and deep:

@@ -196,7 +196,7 @@ def ended_with(folder: Path) -> dict[str, Any]:
     """Return what a finished run's last checkpoint holds, but for the clock and the number of threads."""
     path = ckpt.checkpoint_path(folder, STEPS - 1)
     if (folder / "blocks").is_dir():
-        # merged blocks are not gone on with: they have Gaussians alone
+        # merged blocks cannot be resumed: they have Gaussians alone
         return {"splats": ckpt.load_splats(path)[0]}
     content = ckpt.load_checkpoint(path)
     free = ("seconds", "metrics_bytes", "threads", "config")
@@ -222,7 +222,7 @@ def kill_loop(of: Scene, kills: int, minutes: float, seed: int) -> dict[str, Any
         of: what is trained.
         kills: at least.
         minutes: at least.
-        seed: decides when, and whom.
+        seed: decides when, and which processes.
     """
     rng, end = random.Random(seed), time.monotonic() + 60.0 * minutes
     begun = time.monotonic()

@@ -35,7 +35,7 @@ LEAST_SHARE: Final = 0.5
 
 @dataclass(frozen=True)
 class Check:
-    """A library under sanitizers, and who uses it.
+    """A library under sanitizers, and the tests that use it.
 
     Attributes:
         units: what it is made of.

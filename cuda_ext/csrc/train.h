@@ -87,7 +87,7 @@ struct UpdateArrays {
     bool blur_own_view;          // the flag is this view's alone; else it stays up until the next densification step (A2)
 };
 
-// who takes part in the POP term, on which side, and what their terms and the regularizers come to
+// which Gaussians take part in the POP term, on which side, and what their terms and the regularizers come to
 struct PopTerm {
     int n;
     const int* dominant_counts;  // [n]; null where the POP term is off

@@ -198,7 +198,7 @@ class Check:
         packed: what was brought along (`--pack`), if anything.
         captures: folders to train on, besides those that were packed.
         steps_scaler: of the paper's 30,000 steps.
-        commit: names trainings that may be gone on with.
+        commit: names trainings that may be resumed.
         rehearsal: the emulator takes the GPU's place, with tiny cases.
         note: keeps what a stage has found so far.
         beside: commands that run along with the stages, by name.

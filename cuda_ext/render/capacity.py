@@ -47,7 +47,7 @@ class Capacity:
 
     def settle(self, n: int) -> None:
         """Bring rooms back to what is needed; the number of Gaussians is `n` from now on."""
-        # clones and children of splits add to the need, in proportion at most; who is pruned was hardly there
+        # clones and children of splits add to the need, in proportion at most; pruned Gaussians were hardly there
         more = max(n / self._n, 1.0) if self._n else 1.0
         self._seen = [min(round(more * seen), MOST) for seen in self._seen]
         self._n = n

@@ -301,7 +301,7 @@ class BatchTrainer:
         self, places: Sequence[_Place], views: Sequence[int], sums: Sequence[Tensor], phase: Phase
     ) -> list[float]:
         """Move own rows by the mean of the views' gradients; return the weighted regularizers of every view."""
-        # who is important is settled for all views before the first one adds to the window
+        # importance is settled for all views before the first one adds to the window
         own = torch.stack([self._sides(place, of, sums[place], phase) for place, of in enumerate(places)])
         totals = torch.stack(self._ranks.gather([own])).sum(0)
         state = self._shared.state
@@ -329,7 +329,7 @@ class BatchTrainer:
         self._counts[of.seen] = back[:, _SUMS].contiguous().view(torch.int32)
 
     def _sides(self, place: int, of: _Place, back: Tensor, phase: Phase) -> Tensor:
-        """Settle who of own rows is important in a view.
+        """Settle which of own rows are important in a view.
 
         Returns:
             How many are, how many are not, the terms of both, and the sums of the regularizers. [7]

@@ -23,7 +23,7 @@ class DrawProgram:
 
     Args:
         shared: what all steps share.
-        drawn: the splats, projected and packed by who launches it.
+        drawn: the splats, projected and packed by the caller.
         frame: buffers of the image size.
         phase: what the steps do.
     """

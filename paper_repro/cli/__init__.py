@@ -43,7 +43,7 @@ commands:
 start here:
   pop-repro run pop demo --scale toy                    one row in seconds, without data
   pop-repro data check --data DATA                      what of the paper's scenes is there
-  pop-repro queue --scale small --data DATA --nice 10     days of training, stopped and gone on with at any time
+  pop-repro queue --scale small --data DATA --nice 10     days of training, stopped and resumed at any time
   pop-repro table 1 --scale small                         the paper's first table from the results
   snakemake -s {snakefile} -n        the same as a workflow, for a cluster or a cloud
 

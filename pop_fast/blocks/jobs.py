@@ -239,7 +239,7 @@ def workflow_words(
     each = threads or os.cpu_count() or 1
     gpus = gpus_for(backend)
     many = min(gpus or jobs, len(job.names))
-    # the folder is locked by who calls this
+    # the caller holds the lock of the folder
     here = ["--cores", str(each * many), "--resources", f"gpu={max(gpus, 1)}", "--nolock"]
     where = here if profile is None else ["--profile", str(profile), "--nolock"]
     command = module_command("snakemake", "-s", str(SNAKEFILE), "--directory", str(place / FOLDER))

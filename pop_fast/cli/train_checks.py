@@ -101,7 +101,7 @@ def check_output(folder: Path, options: Any) -> None:
 
 
 def as_begun(folder: Path, options: Any) -> Any:
-    """Read the capture of a run that is gone on with as it was read before, where the command does not say.
+    """Read the capture of a resumed run as it was read before, where the command does not say.
 
     Args:
         folder: the result folder.
@@ -145,7 +145,7 @@ def record_of(capture: Capture, options: Any, chosen: Sequence[str] = ()) -> Cap
 
 
 def resumption(folder: Path) -> str:
-    """Say what a run that is gone on with begins from."""
+    """Say what a resumed run begins from."""
     from pop_fast.train.checkpoint import list_checkpoints
 
     found = list_checkpoints(folder)
@@ -184,7 +184,7 @@ def chooses_for_itself(words: Sequence[str]) -> bool:
 def with_size(config: TrainConfig, options: Any) -> TrainConfig:
     """Choose the factor of a run that chooses for itself, by the headers of its photographs, where none was said.
 
-    A run that is gone on with keeps its own, and its schedule.
+    A resumed run keeps its own, and its schedule.
     """
     given = config.given
     if given is None:
@@ -219,7 +219,7 @@ def with_length(config: TrainConfig, capture: Capture, options: Any) -> tuple[Tr
     """Choose terms and schedule of a run that chooses for itself, by the photographs and the speed of this machine.
 
     Returns:
-        The settings, and lines that say what is to come, and why; none where the run is gone on with as it was begun.
+        The settings, and lines that say what is to come, and why; none where the run is resumed as it was begun.
     """
     from pop_fast.data.photo_quality import exposure_stops
     from pop_fast.io.heartbeat import Heartbeat

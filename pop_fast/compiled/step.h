@@ -3,7 +3,7 @@
 // The step in order, every line shared out to the threads (`step_*.cpp`), `list` in two goes:
 //     project         a Gaussian's splat, colour, and the tiles it reaches
 //     list            depth order; each tile's list, front to back
-//     blend           the picture tile by tile, who dominates it, its difference from the photograph
+//     blend           the picture tile by tile, its dominant Gaussians, its difference from the photograph
 //     loss            SSIM and its derivatives by the windows' moments
 //     image_gradient  the gradient of the loss with respect to the picture, and to its exposure and depth
 //     transpose       tile by tile back to the entries of the lists

@@ -84,7 +84,7 @@ def unpack(path: Path, target: Path) -> None:
                     with archive.open(member) as source, place.open("wb") as file:
                         shutil.copyfileobj(source, file)
     except OSError as error:
-        # a full disk is said as such by who catches it; a name that no folder can hold is the archive's
+        # a full disk is reported as such by the caller; a name that no folder can hold is the archive's
         if error.errno not in _NAMES:
             raise
         raise CaptureError(f"{path}: cannot be unpacked: {error.strerror}; {_FIX}") from error

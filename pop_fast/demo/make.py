@@ -133,7 +133,7 @@ class _Survey:
 def _survey(
     scene: Scene, viewmats: np.ndarray, K: np.ndarray, photographs: list[np.ndarray], generator: np.random.Generator
 ) -> _Survey:
-    """Pick points of visible surfaces, find who sees them, and add a matcher's noise."""
+    """Pick points of visible surfaces, find the cameras that see them, and add a matcher's noise."""
     points = np.concatenate(
         [_candidates(scene, viewmats[i], K, photograph, generator) for i, photograph in enumerate(photographs)]
     )

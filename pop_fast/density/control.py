@@ -149,7 +149,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
             opacities: activated opacities, in the graph. [N]
             state: the strategy's state.
             step: counts from 0.
-            info: what `rasterization()` returned last; its `dominant_counts` decide who is important.
+            info: what `rasterization()` returned last; its `dominant_counts` decide which Gaussians are important.
         """
         if not self.regularizes(step):
             return None
@@ -327,9 +327,9 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
 
         Args:
             context: the Gaussians, and what a step may ask for.
-            clones: who is cloned. [N] bool
-            splits: who is split. [N] bool
-            prunes: asked of the grown set of Gaussians who of it is pruned. -> bool
+            clones: which Gaussians are cloned. [N] bool
+            splits: which are split. [N] bool
+            prunes: given the grown set of Gaussians, tells which are pruned. -> bool
         """
         import torch
 
@@ -356,7 +356,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         return done
 
     def planned_growth(self, context: DensificationContext) -> tuple[Tensor, Tensor]:
-        """Return who is cloned and who is split; see `pop_ref.density.grow_masks`. [N] bool each"""
+        """Return which Gaussians are cloned and which are split; see `pop_ref.density.grow_masks`. [N] bool each"""
         from pop_fast.density.rows import window
         from pop_fast.stages.density import grow_masks
 
@@ -367,7 +367,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         return masks
 
     def planned_prune(self, context: DensificationContext) -> Tensor:
-        """Return who is too faint or too big; see `pop_ref.density.prune_mask`. [N] bool"""
+        """Return which Gaussians are too faint or too big; see `pop_ref.density.prune_mask`. [N] bool"""
         from pop_fast.stages.density import prune_mask
 
         opacities, state = context.params["opacities"].flatten().sigmoid(), context.state

@@ -1,6 +1,6 @@
 """Mini-Splatting: blur split, points set anew from depth, then importance-weighted sampling and pruning.
 
-Source: Fang and Wang 2024 and its code. 3DGS grows by gradient here too; who dominates more than HW / 5000 pixels of
+Source: Fang and Wang 2024 and its code. 3DGS grows by gradient here too; what dominates more than HW / 5000 pixels of
 any view since the last densification step is split whatever its size. At steps 5,000 and 10,000 all Gaussians are
 replaced by points on the rays of pixels drawn from every training view, where the Gaussian that the pixel belongs to is
 densest (`pop_ref.chord`). At 15,000 half of them, drawn by importance, keep place and colour and begin anew; at 20,000

@@ -1,4 +1,4 @@
-"""Fewer Gaussians in a file: whom to leave out, by opacity, by place, by what they contribute, or down to a size."""
+"""Fewer Gaussians in a file: which to leave out, by opacity, by place, by what they contribute, or down to a size."""
 
 from __future__ import annotations
 

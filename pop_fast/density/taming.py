@@ -3,7 +3,7 @@
 Source: Mallick et al. 2024 and its code. Every 500 steps the Gaussians may grow in number, along a parabola from the
 first number to the budget (`pop_ref.taming`). Ten training views score each Gaussian by the view's loss times nine
 terms; of those that 3DGS would clone or split, as many as the parabola has room for are drawn by score. Of those that
-3DGS would prune, only who is drawn too goes, half as many as there are, by the inverse of the score; the last
+3DGS would prune, only those also drawn go, half as many as there are, by the inverse of the score; the last
 densification step prunes nothing. The draw takes the scores in the order from before the split, where they belong to
 other Gaussians: a slip of the released code, with which the published numbers were made. The bands beyond the first
 move each 16 steps by the sum of their gradients, opacities not at all after step 15,000, where the code hands Adam a
@@ -35,7 +35,7 @@ class TamingStrategy(InriaStrategy):
         final_count: the budget itself; 0 takes the multiplier.
         score_views: training views that a densification step scores by.
         sampled_prunes: densification steps, from the first, that prune; the last one of all prunes nothing.
-        misaligned_prune_weights: draw who is pruned with the scores in the order from before the split, as the released
+        misaligned_prune_weights: prune by the scores in the order from before the split, as the released
             code does, where they belong to other Gaussians; False draws with those of the Gaussians themselves.
     """
 
@@ -62,7 +62,7 @@ class TamingStrategy(InriaStrategy):
         return (step - self.refine_start_iter) // self.refine_every
 
     def refine(self, context: DensificationContext) -> DensificationStep:
-        """Clone, split and prune who is drawn."""
+        """Clone, split and prune the Gaussians that are drawn."""
         import torch
 
         from pop_fast.stages.taming import budget_at, quotas

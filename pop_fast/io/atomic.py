@@ -382,7 +382,7 @@ class FolderLock:
             return
         try:
             handle = os.open(self.path, os.O_RDONLY)
-        except OSError:  # what is wrong with the folder is said by who writes to it
+        except OSError:  # writing to the folder tells what is wrong with it
             return
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

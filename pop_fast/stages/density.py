@@ -1,4 +1,4 @@
-"""Who is blurred, cloned, split and pruned, and what a split makes. Meaning and every switch: `pop_ref.density`.
+"""Which Gaussians blur, clone, split or go, and what a split makes. Meaning and every switch: `pop_ref.density`.
 
 The strategies collect what these functions read, and edit the Gaussians as they say (`strategies.densify`,
 `strategies.ops`). `config` is anything with the attributes of `pop_ref.settings.DensityConfig` that a function

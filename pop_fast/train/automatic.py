@@ -5,7 +5,7 @@ the paper's schedule, or as much of it as the minutes allow. The minutes are for
 it is used: steps of the run's own engine, on the capture, with as many Gaussians as the run begins with, and with as
 many as it is expected to have; in between the time of a step is taken to be linear in their number.
 
-What is chosen goes into cfg.json with the run's settings, and is taken from there by a run that is gone on with.
+What is chosen goes into cfg.json with the run's settings, and is taken from there by a resumed run.
 """
 
 from __future__ import annotations

@@ -161,13 +161,13 @@ class TrainConfig:
         name = self._departs_from(promised, self.given)
         if name is not None:
             raise PopError(
-                f"{name} is {getattr(self, name)}, but preset {self.given.preset!r} and what was said make it "
+                f"{name} is {getattr(self, name)}, but preset {self.given.preset!r} and its explicit settings make it "
                 f"{getattr(promised, name)}; say it with config.with_overrides({name}=...), or replace given=None too"
             )
 
     @classmethod
     def of(cls, *, method: str = "pop", preset: str = "paper", **overrides: Any) -> Self:
-        """Make the settings of a method and a preset, except for what is said besides.
+        """Make the settings of a method and a preset, except for explicit ones.
 
         Args:
             method: "pop", "gsplat" ("adc" is another name of it) or "3dgs".

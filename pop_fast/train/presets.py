@@ -109,7 +109,7 @@ _LARGEST_SCALER: Final = 1e6
 
 @dataclass(frozen=True, kw_only=True)
 class Given:
-    """What a run was asked for: what gives its defaults, and what was said besides.
+    """What a run was asked for: what gives its defaults, and its explicit settings.
 
     Attributes:
         method: "pop", "gsplat" for gsplat's default strategy, "3dgs" for Inria's constants, learning rates, SSIM and
@@ -118,7 +118,7 @@ class Given:
         preset: "paper" is the paper's 30,000 steps, for a GPU or a night; "quick" 1,500 steps at higher rates that
             fall, from coarse photographs to fine ones, with thresholds for small images; "auto" has these thresholds
             and as much of the schedule as the time allows, which `pop train` chooses; where that is no more than
-            "quick" has, it is as "quick" is. It gives defaults: what is said besides wins.
+            "quick" has, it is as "quick" is. It gives defaults: explicit settings win.
         steps_scaler: multiplies the default of every step number; None takes the preset's.
         scale_lambda_pop: divide the default of lambda_pop by the scaler, so that the push of the prior adds up to the
             same over a short schedule; it then weighs more against the photographs than in the paper.

@@ -217,7 +217,7 @@ def join() -> Ranks:
         raise PopError("this torch was built without torch.distributed; start one process, or install another build")
     by_gpu = torch.cuda.is_available() and group.is_nccl_available()
     if local_rank() < torch.cuda.device_count():
-        # before anything is put on a GPU; who has none of its own is refused where it needs one
+        # before anything is put on a GPU; a rank without one of its own is refused where it needs one
         torch.cuda.set_device(local_rank())
     try:
         group.init_process_group("cpu:gloo,cuda:nccl" if by_gpu else "gloo", timeout=_PATIENCE)

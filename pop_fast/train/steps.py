@@ -51,7 +51,7 @@ class StepSettings:
         padding: SSIM's border, by which photographs are prepared; that of every phase's objective.
         lambda_pop: weight of the POP term where it is on.
         lambda_entropy: weight of the mean entropy of the opacities where it is on.
-        pop_views: who dominates a pixel of the "current" view is important, or of any view of the "window".
+        pop_views: important is what dominates a pixel of the "current" view, or of any view of the "window".
         pop_over: the POP term averages over "all" Gaussians, or over those "visible" in the view.
         blur_window: under "any_view" a blur flag stays up, under "own_view" it is the last view's alone, under "sum"
             the caller makes it of the summed counts.

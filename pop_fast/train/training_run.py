@@ -159,7 +159,7 @@ class TrainingRun:
         Raises:
             PopError: the folder is in use, a checkpoint does not fit, or a number is no longer finite.
             KeyboardInterrupt: after Ctrl-C or SIGTERM, when a checkpoint has been written; or at once after the second.
-                A step that was being taken is left, and changes nothing; a measurement is made by who resumes.
+                A step that was being taken is left, and changes nothing; a measurement is made when the run is resumed.
         """
         if self._ranks.writes and not isinstance(self.strategy, ForeignStrategy):
             for warning in find_warnings(self.config, self._train):

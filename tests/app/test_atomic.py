@@ -431,5 +431,5 @@ def test_nothing_is_left_in_the_folder_for_it(tmp_path: Path) -> None:
     lock.take()
     assert list(tmp_path.iterdir()) == []
     lock.release()
-    # what is wrong with a folder is said by who writes to it
+    # writing to a folder tells what is wrong with it
     FolderLock(tmp_path / "absent").take()

@@ -207,7 +207,7 @@ def test_what_was_chosen_for_few_photographs_is_said_kept_reported_and_gone_on_w
     assert resolved["depth_lambda"] == weight
     data = read_result(tmp_path / "r")
     assert "as 7 photographs are few" in data.config["chosen by the run"]
-    # who says how many are held out is not told again
+    # an explicit number of held-out views is not reported again
     said = pop(*words, "--overwrite", "--test-every", "4", "--depth-lambda", "0")
     assert "held out to measure by" not in said.out
     assert "--depth-lambda" not in said.out

@@ -196,7 +196,7 @@ def test_the_same_word_wins_on_the_command_line():
 
 def test_a_label_cannot_be_carried_by_settings_that_do_not_follow_it():
     quick = TrainConfig.of(preset="quick")
-    with pytest.raises(PopError, match=r"max_steps is 5, but preset 'quick' and what was said make it 1500"):
+    with pytest.raises(PopError, match=r"max_steps is 5, but preset 'quick' and its explicit settings make it 1500"):
         replace(quick, max_steps=5)
     with pytest.raises(PopError, match="max_steps is 30000, but preset 'quick'"):
         TrainConfig(given=quick.given)

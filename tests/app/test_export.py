@@ -330,7 +330,7 @@ def test_sog_in_a_folder_and_ksplat_are_converted_and_drawn(
             assert abs(psnr(pop, tmp_path, file, "--capture", shared_capture) - of_sog) < 0.01, file
 
 
-# Fewer Gaussians in a file: who goes, and how far down a size is met.
+# Fewer Gaussians in a file: which go, and how far down a size is met.
 
 
 def test_opacity_is_compared_activated() -> None:

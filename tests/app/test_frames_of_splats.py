@@ -73,7 +73,7 @@ def test_a_ply_that_says_nothing_is_taken_to_be_in_the_capture_s_frame_with_a_no
     assert json.loads((tmp_path / "e.json").read_text())["psnr"] == pytest.approx(trained, abs=1e-2)
     assert "s.ply: says nothing of its world, and is taken to be in the capture's own" in outcome.err
     assert "--training-frame" in outcome.err
-    # who says it is told nothing
+    # an explicit frame brings no note
     psnr(pop, tmp_path, tmp_path / "s.ply", "--capture", shared_capture, "--own-frame")
     # what is not known is not made up
     assert pop("export", tmp_path / "s.ply", "--out", tmp_path / "t.ply").status == 0

@@ -444,7 +444,7 @@ def test_gradient_by_raw_parameters_matches_differences(name: str) -> None:
     _, v_image, v_opacities = objective(render(gaussians, CAMERA), gaussians, PHOTO, start(PARAMS), recipe)
     analytic = params_vjp(PARAMS, render_vjp(gaussians, CAMERA, v_image), v_opacities)
     for key, array in PARAMS.items():
-        # a small step keeps every decision of the render (who is skipped, who wins) as it is
+        # a small step keeps every decision of the render (what is skipped, what wins) as it is
         numeric = central_gradient(lambda x, key=key: loss_of({**PARAMS, key: x}, recipe), array, step=2e-6)
         scale = np.linalg.norm(numeric)
         assert scale > 0.0

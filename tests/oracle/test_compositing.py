@@ -51,7 +51,7 @@ def blend(stack: list[tuple[float, float]], background: float, profile: Profile)
 
 
 class Exact:
-    """The same pixel from the definition, in rationals: who takes part, prefix products, first stop, sums."""
+    """The same pixel from the definition, in rationals: which splats take part, prefix products, first stop, sums."""
 
     def __init__(self, stack: list[tuple[float, float]], background: float, profile: Profile) -> None:
         floor, ceiling, stop = map(Fraction, (profile.alpha_floor, profile.alpha_ceiling, profile.transmittance_stop))

@@ -1,4 +1,4 @@
-"""Density control: the statistic's units, who is selected under every reading, the schedule, one whole step."""
+"""Density control: the statistic's units, what is selected under every reading, the schedule, one whole step."""
 
 from __future__ import annotations
 
@@ -422,7 +422,7 @@ TestOracleRows = RowMachine.TestCase
 TestTrainedRows = TrainedRowMachine.TestCase
 
 
-# Whom Adam moves at which step: numbers of updates and rates of every method's schedule, against counts by hand.
+# What Adam moves at which step: numbers of updates and rates of every method's schedule, against counts by hand.
 
 NAMES = ("means", "opacities", "shN")
 

@@ -375,7 +375,7 @@ def test_the_outcome_is_five_lines_each_with_an_interval_or_the_run_that_decides
 
 
 def a12(results: list[Result]) -> Answer:
-    """Answer one question by runs of both readings: `pop` and, where who is seen is polarised alone, `pop_visible`."""
+    """Answer one question by runs of both readings: `pop` and, where only what is seen is polarised, `pop_visible`."""
     return next(answer for answer in answers(results) if answer.id == "A12")
 
 

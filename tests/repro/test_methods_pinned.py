@@ -24,7 +24,7 @@ from pop_fast.train.presets import METHODS
 from tests.app.test_methods import engine_or_skip, tiny_method
 from tests.app.tiny import tiny_capture
 
-# what a run is asked for besides: where things lie, who takes the steps, how often something is written
+# the other settings of a run: where things lie, which engine takes the steps, how often something is written
 OF_THE_RUN = {
     *("method", "data", "result_dir", "seed", "backend", "threads", "eval_steps", "save_steps", "checkpoint_every"),
     *("keep_checkpoints", "log_every", "max_renders", "lpips_vgg", "lpips_alex", "target_cache_mb", "progress"),
@@ -128,7 +128,7 @@ FAINT = -6.0
 
 
 def traced(run: TrainingRun, patch: pytest.MonkeyPatch) -> list[str]:
-    """Record who edits the Gaussians, in the functions that every edit goes through, and whether Adam has moved any."""
+    """Record what edits the Gaussians, in the functions that all edits go through, and whether Adam has moved any."""
     events: list[str] = []
 
     def noted(name: str, call: Callable[..., Any]) -> Callable[..., Any]:

@@ -277,7 +277,7 @@ def reasons(moved: Training, scene_scale: float, density: DensityConfig) -> set[
 def near_threshold(
     moved: Training, work: Bounds, step: int, scene_scale: float, normals: Any, density: DensityConfig
 ) -> bool:
-    """Tell whether thresholds moved by rounding change who is grown or pruned."""
+    """Tell whether thresholds moved by rounding change what is grown or pruned."""
     off = REACH * work.eps
     share = float(np.max(work.gradients2d)) / density.grow_grad2d
     tagged = {**moved.rows.params, "row": np.arange(float(len(moved.rows)))}

@@ -171,7 +171,7 @@ def test_gaussians_of_one_depth_are_blended_row_by_row_however_many_there_are(tm
     assert one.objective == many.objective
     assert all(torch.equal(params[key], others[key]) for key in KEYS)
     assert one.objective == pytest.approx(torchs.objective, rel=1e-5)
-    # who is in front wins pixels
+    # the Gaussians in front win pixels
     assert torch.equal(dominant.long(), wanted.long())
     assert int((wanted > 0).sum()) > 50
 

@@ -30,7 +30,7 @@ class Flip:
 
     Attributes:
         decision: its label.
-        gaussian: whom it is about.
+        gaussian: which it is about.
         depth: of that Gaussian.
         first: what the one does, with operand and threshold.
         second: what the other does.

@@ -1,4 +1,4 @@
-"""A view as maps: who dominates, how many are blended and visited, where rays end, and where POP pulls."""
+"""A view as maps: what dominates, how many are blended and visited, where rays end, and where POP pulls."""
 
 from __future__ import annotations
 
