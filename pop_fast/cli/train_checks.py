@@ -234,10 +234,11 @@ def with_length(config: TrainConfig, capture: Capture, options: Any) -> tuple[Tr
     minutes = automatic.MINUTES if options.minutes is None else options.minutes
     with Heartbeat(config.progress) as beat:
         beat.say("timing a few steps of this capture on this machine")
-        speed = automatic.measure_speed(config, capture, 1.0)
-    pixels = sum(view.width * view.height for view in capture.views) / len(capture.views)
+        speed = automatic.measure_speed(config, capture)
     held_out = len(capture.test_views(config.test_every))
-    choice = automatic.choose_length(config, speed, minutes, pixels, len(capture.views), held_out)
+    choice = automatic.choose_length(
+        config, speed, minutes, automatic.mean_pixels(capture), len(capture.views), held_out
+    )
     largest = max(capture.views, key=lambda view: view.width * view.height)
     config = automatic.with_choice(config, choice.scaler, {"factor": config.factor, **terms.settings})
     return config, (automatic.line_of(choice, config, (largest.width, largest.height)), *terms.why)

@@ -20,7 +20,7 @@ What the user sets is taken literally: neither a preset nor the scaler changes i
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self
 
@@ -279,10 +279,24 @@ def _options(recipe: Recipe, method: str) -> list[str]:
     return chosen
 
 
+def words_of(given: Given, without: Collection[str] = ()) -> list[str]:
+    """Return the options of `pop train` that ask for a run as it was asked for, without some settings."""
+    words = [] if given.method == Given.method else ["--method", given.method]
+    words += ["--preset", given.preset] if given.preset != Given.preset else []
+    words += [] if given.steps_scaler is None else ["--steps-scaler", f"{given.steps_scaler:g}"]
+    words += ["--scale-lambda-pop"] if given.scale_lambda_pop else []
+    for name, value in given.settings.items():
+        if name not in without and value is not None:
+            words += _words(name, value)
+    return words
+
+
 def _words(name: str, value: Any) -> list[str]:
     group, dot, rest = name.replace("_", "-").rpartition(".")
     if isinstance(value, bool):
         return [f"--{group}{dot}{'' if value else 'no-'}{rest}"]
+    if isinstance(value, list | tuple):
+        return [f"--{group}{dot}{rest}", *map(str, value)]
     return [f"--{group}{dot}{rest}", f"{value:g}" if isinstance(value, float) else str(value)]
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,6 +23,7 @@ from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.pictures import fit
 from pop_fast.io.read_back import read_json
+from pop_fast.stages.appearance import expose
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.evaluate import measure, psnr
 from pop_fast.train.results import ResultFolder
@@ -67,6 +68,8 @@ class Checks:
             tenth or more which are nearer than half the distance of the nearest points; empty without points.
         orbit_floaters: the same of the views of the orbit, which stand between the photographs, by their number.
         steps: that were taken; None where an older version has measured.
+        exposures_learned: whether the run learned each training photograph's exposure, with which those views are
+            measured; `stops` are without.
     """
 
     photographs: int
@@ -79,6 +82,7 @@ class Checks:
     floaters: Mapping[str, float] = field(default_factory=dict)
     orbit_floaters: Mapping[str, float] = field(default_factory=dict)
     steps: int | None = None
+    exposures_learned: bool = False
 
 
 def write_checks(
@@ -108,7 +112,8 @@ def write_checks(
 
     train, test = capture.train_views(config.test_every), capture.test_views(config.test_every)
     some = [train[i] for i in np.unique(np.linspace(0, len(train) - 1, min(len(train), _MOST_TRAIN)).astype(int))]
-    seen = {view.name: looked(view) for view in (*some, *test)}
+    learned = results.read_stats("appearance", step) or {}
+    seen = {view.name: looked(_from_learned(view, learned)) for view in (*some, *test)}
     held_out = {view.name: _psnr(view, seen[view.name].image) for view in test}
     worst = sorted(held_out, key=lambda name: held_out[name])[: min(_WORST, config.max_renders)]
     for i, view in enumerate(test):
@@ -125,7 +130,7 @@ def write_checks(
     turn = orbit_views(train)
     checks = Checks(
         photographs=len(train),
-        train_psnr=float(np.mean([_psnr(view, seen[view.name].image) for view in some])),
+        train_psnr=float(np.mean([_psnr(view, _exposed(seen[view.name].image, view, learned)) for view in some])),
         train_measured=len(some),
         held_out_psnr=_mean(list(held_out.values())),
         matched_psnr=_mean([_psnr(view, _matched(view, seen[view.name].image)) for view in test]),
@@ -134,6 +139,7 @@ def write_checks(
         floaters=_floaters(capture, test or some, params, looked) if known else {},
         orbit_floaters=_floaters(capture, turn, params, looked) if known else {},
         steps=step + 1,
+        exposures_learned=any("exposure" in found for found in learned.values()),
     )
     text = json.dumps(asdict(checks), indent=2) + "\n"
     target = folder / "report_data" / f"checks_step{step}.json"
@@ -234,6 +240,18 @@ def _floaters(capture: Capture, views: Sequence[View], params: Mapping[str, Tens
     return shares
 
 
+def _from_learned(view: View, learned: Mapping[str, Any]) -> View:
+    """Return a view with the camera that the run corrected, where it did."""
+    viewmat = learned.get(view.name, {}).get("viewmat")
+    return view if viewmat is None else replace(view, viewmat=np.array(viewmat))
+
+
+def _exposed(image: np.ndarray, view: View, learned: Mapping[str, Any]) -> np.ndarray:
+    """Return the render of a view in the colours of its photograph, where the run learned its exposure."""
+    exposure = learned.get(view.name, {}).get("exposure")
+    return image if exposure is None else expose(torch.from_numpy(image), torch.tensor(exposure)).numpy()
+
+
 def _psnr(view: View, image: np.ndarray) -> float:
     tensors = ViewTensors.of(view)
     return min(psnr(torch.from_numpy(image), tensors.target(), tensors.mask), _MOST_PSNR)
@@ -282,6 +300,8 @@ def read_checks(path: Path) -> Checks:
     for name, value in entry.items():
         if name in shares:
             right = isinstance(value, dict) and all(_is_number(number) for number in value.values())
+        elif name == "exposures_learned":
+            right = isinstance(value, bool)
         else:
             right = _is_number(value) or (value is None and name not in ("photographs", "train_psnr", "train_measured"))
         if not right:

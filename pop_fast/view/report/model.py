@@ -73,11 +73,12 @@ def verdict(
     # what was measured last: of a run that was stopped, statistics are of an earlier step
     psnr = stats.get("psnr") if checks is None else checks.held_out_psnr
     found = list(_quality(psnr))
-    found += _course(held_out)
+    fewer = _fewer_steps(held_out)
+    found += _course(held_out, fewer)
     if checks is not None:
         found += [
             *_unfitting(checks),
-            *_overfitting(checks),
+            *_overfitting(checks, fewer),
             *_photographs(checks),
             *_exposure(checks),
             *_floating(checks),
@@ -93,20 +94,26 @@ def _quality(psnr: float | None) -> Iterator[Finding]:
     yield Finding(kind, "Quality", text, () if kind == "good" else ("data", "check", "DATA"))
 
 
-def _course(held_out: tuple[Sequence[float], Sequence[float]] | None) -> Iterator[Finding]:
+def _fewer_steps(held_out: tuple[Sequence[float], Sequence[float]] | None) -> float | None:
+    """Give the share of the paper's schedule after which held-out views were best, if they fell since; else None."""
     if held_out is None or len(held_out[1]) < 2:
+        return None
+    steps, values = held_out
+    best = int(np.argmax(values))
+    return None if values[best] - values[-1] < _FELL else max(steps[best] / Recipe.max_steps, 1e-3)
+
+
+def _course(held_out: tuple[Sequence[float], Sequence[float]] | None, fewer: float | None) -> Iterator[Finding]:
+    if held_out is None or fewer is None:
         return
     steps, values = held_out
     best = int(np.argmax(values))
-    if values[best] - values[-1] < _FELL:
-        return
     text = (
         f"Held-out PSNR fell from {values[best]:.2f} dB after {steps[best]:,.0f} steps to {values[-1]:.2f} dB after "
         f"{steps[-1]:,.0f}: what was learned since fits the training photographs alone. Fewer steps, or more "
         "photographs."
     )
-    scaler = max(steps[best] / Recipe.max_steps, 1e-3)
-    yield Finding("bad", "Course", text, ("train", "DATA", "--steps-scaler", f"{scaler:.2g}"))
+    yield Finding("bad", "Course", text, ("train", "DATA", "--steps-scaler", f"{fewer:.2g}"))
 
 
 def _unfitting(checks: Checks) -> Iterator[Finding]:
@@ -133,7 +140,7 @@ def _gap(checks: Checks) -> float:
     return 0.0 if checks.held_out_psnr is None else checks.train_psnr - checks.held_out_psnr
 
 
-def _overfitting(checks: Checks) -> Iterator[Finding]:
+def _overfitting(checks: Checks, fewer: float | None) -> Iterator[Finding]:
     if checks.held_out_psnr is None:
         text = "No view was held out, so that nothing says how views between the photographs look."
         yield Finding("look", "Overfitting", text, ("train", "DATA", "--test-every", "8"))
@@ -151,9 +158,9 @@ def _overfitting(checks: Checks) -> Iterator[Finding]:
     some = gap < _OVERFITTED
     text = f"{'Some' if some else 'Much'}: {numbers}, {gap:.1f} dB apart."
     text += "" if some else " The splat knows its photographs by heart and little in between."
-    half = (checks.steps or Recipe.max_steps) / Recipe.max_steps / 2.0
-    fewer = ("train", "DATA", "--steps-scaler", f"{half:.2g}")
-    yield Finding("look" if some else "bad", "Overfitting", text, fewer)
+    # no two findings send to schedules of two lengths
+    scaler = fewer or (checks.steps or Recipe.max_steps) / Recipe.max_steps / 2.0
+    yield Finding("look" if some else "bad", "Overfitting", text, ("train", "DATA", "--steps-scaler", f"{scaler:.2g}"))
 
 
 def _photographs(checks: Checks) -> Iterator[Finding]:
@@ -185,12 +192,18 @@ def _exposure(checks: Checks) -> Iterator[Finding]:
         text = f"Even: photographs differ from the splat by {ends}, standard deviation {spread:.2f}."
         yield Finding("good", "Exposure", text)
         return
+    differ = f"photographs differ from the splat by {ends}, standard deviation {spread:.2f}."
     gain = ""
     if matched is not None and measured is not None:
         gain = f" Scaling each held-out render to its photograph's brightness gives {matched:.2f} dB instead "
         gain += f"of {measured:.2f}."
+    if checks.exposures_learned:
+        text = f"Learned for each training photograph: {differ}"
+        text += f" Held-out views have none of their own.{gain}" if won >= _WON else ""
+        yield Finding("good", "Exposure", text)
+        return
     what = "It drifts" if spread >= _DRIFT or won >= _WON else "Even, but for some"
-    text = f"{what}: photographs differ from the splat by {ends}, standard deviation {spread:.2f}.{gain}"
+    text = f"{what}: {differ}{gain}"
     text += " Lock exposure and white balance next time; for these photographs, learn each one's."
     yield Finding("bad" if spread > 2.0 * _DRIFT else "look", "Exposure", text, ("train", "DATA", "--exposure"))
 

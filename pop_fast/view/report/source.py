@@ -16,7 +16,7 @@ from pop_fast.io.read_back import check_record, parse_json, read_arrays, read_js
 from pop_fast.train.commands import read_commands, shell_line
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import read_record
-from pop_fast.train.presets import METHODS
+from pop_fast.train.presets import METHODS, Given, words_of
 from pop_fast.train.results import read_config
 from pop_fast.view.report.checks import Checks, read_checks
 from pop_fast.view.report.compare import threads_of
@@ -72,7 +72,7 @@ def read_result(folder: Path) -> ReportData:
         changes=[{key: change.get(key) for key in _CHANGE_COLUMNS} for change in changes],
         files=_files(stats, str(folder)),
         viewer=_viewer(folder),
-        verdict=[_typed(found, config, folder) for found in verdict(stats, checks, curves.get("psnr_val"))],
+        verdict=[typed(found, config, folder) for found in verdict(stats, checks, curves.get("psnr_val"))],
         checked=checks is not None,
         orbit=_orbit(folder),
         commands=[(shell_line(entry["words"]), entry["folder"]) for entry in read_commands(folder)],
@@ -80,17 +80,37 @@ def read_result(folder: Path) -> ReportData:
     )
 
 
-def _typed(finding: Finding, config: TrainConfig, folder: Path) -> Finding:
-    """Put capture and folder into the command that a finding ends in; another training is as large, and has its own."""
+def typed(finding: Finding, config: TrainConfig, folder: Path) -> Finding:
+    """Put capture and folder into the command that a finding ends in; another training is asked for as this one was."""
     if not finding.next:
         return finding
     places = {"DATA": config.data, "RESULT": str(folder)}
     words = [places.get(word, word) for word in finding.next]
     if words[0] == "train":
-        words += [] if config.method == "pop" else ["--method", config.method]
-        words += ["--factor", str(config.factor)] if config.factor > 1 else []
-        words += ["--out", f"{folder}_next"]
+        words += [*_asked_again(config, finding.next), "--out", f"{folder}_next"]
     return replace(finding, next=tuple(words))
+
+
+def _asked_again(config: TrainConfig, words: Sequence[str]) -> list[str]:
+    """Return the options of a run that a command leaves as they were, where it has these words itself."""
+    given = config.given
+    if given is None:
+        method = [] if config.method == "pop" else ["--method", config.method]
+        return method + (["--factor", str(config.factor)] if config.factor > 1 else [])
+    names = {word.removeprefix("--").replace("-", "_") for word in words if word.startswith("--")}
+    if names & {"steps_scaler", "minutes"}:
+        given, names = replace(given, steps_scaler=None), names | _STEP_COUNTS
+    # minutes are for a run that chooses its length; that is what no preset means
+    again = words_of(given, {*names, *_PLACES})
+    if "minutes" in names and given.preset != Given.preset:
+        at = again.index("--preset")
+        del again[at : at + 2]
+    return again
+
+
+# settings of the folder and the machine, and numbers of steps, which a shorter schedule would not follow
+_PLACES: Final = frozenset({"data", "result_dir", "progress", "threads"})
+_STEP_COUNTS: Final = frozenset({"max_steps", "eval_steps", "save_steps", "checkpoint_every"})
 
 
 _CHANGE_COLUMNS: Final = ("step", "cloned", "split", "pruned", "reset", "num_gaussians")

@@ -1,0 +1,189 @@
+"""The report's verdict: its numbers, no contradictions, and commands that ask for the run that was judged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pop_fast.cli.arguments import parse
+from pop_fast.cli.data_check import Args as DataCheck
+from pop_fast.cli.export import Args as Export
+from pop_fast.cli.train import arguments as train_arguments
+from pop_fast.train import TrainConfig
+from pop_fast.view.report.checks import Checks
+from pop_fast.view.report.model import Finding, verdict
+from pop_fast.view.report.source import typed
+
+GOOD = Checks(
+    photographs=60,
+    train_psnr=31.0,
+    train_measured=12,
+    held_out_psnr=29.5,
+    matched_psnr=29.6,
+    neighbour_degrees=4.0,
+    stops={"a": -0.02, "b": 0.03},
+    floaters={"a": 0.0, "b": 0.002},
+)
+
+
+@pytest.mark.parametrize(
+    ("about", "changes", "kind", "words"),
+    [
+        ("Overfitting", {}, "good", "training views 31.00 dB, held-out views 29.50 dB, 1.5 dB apart"),
+        ("Overfitting", {"train_psnr": 34.0}, "look", "4.5 dB apart"),
+        ("Overfitting", {"train_psnr": 39.5}, "bad", "10.0 dB apart"),
+        ("Overfitting", {"held_out_psnr": None, "matched_psnr": None}, "look", "No view was held out"),
+        ("Photographs", {}, "good", "60 trained on, neighbours 4.0 degrees apart"),
+        ("Photographs", {"photographs": 11}, "look", "11 trained on"),
+        ("Photographs", {"photographs": 11, "train_psnr": 36.0}, "bad", "too few"),
+        ("Photographs", {"neighbour_degrees": 25.0}, "look", "far apart"),
+        ("Exposure", {}, "good", "-0.02 (a) to +0.03 stops (b)"),
+        ("Exposure", {"stops": {"a": -0.2, "b": 0.2}}, "look", "standard deviation 0.20"),
+        ("Exposure", {"stops": {**{f"v{i}": 0.0 for i in range(40)}, "b": -0.4}}, "look", "-0.40 (b)"),
+        ("Exposure", {"stops": {"a": -0.5, "b": 0.5}}, "bad", "29.60 dB instead of 29.50"),
+        ("Floaters", {}, "good", "at most 0.20 % of a view"),
+        ("Floaters", {"floaters": {"a": 0.0, "b": 0.015}}, "look", "worst b, 1.5 %"),
+        ("Floaters", {"floaters": {"a": 0.1, "b": 0.3}}, "bad", "20.0 % of the pixels"),
+        # frames of the orbit vanish, and no photograph's view shows anything
+        (
+            "Floaters",
+            {"orbit_floaters": {f"frame {i}": 0.8 * (i > 52) for i in range(60)}},
+            "bad",
+            "hides much of 7 views",
+        ),
+        (
+            "Floaters",
+            {"orbit_floaters": {f"frame {i}": 0.001 for i in range(60)}},
+            "good",
+            "2 photographs' views and 60",
+        ),
+        ("Fit", {}, "good", "reach 31.00 dB"),
+        ("Fit", {"train_psnr": 21.0, "held_out_psnr": 19.0}, "look", "cameras that are wrong"),
+        ("Fit", {"train_psnr": 18.09, "held_out_psnr": 17.0}, "bad", "contradict one another"),
+        ("Fit", {"train_psnr": 18.09, "held_out_psnr": 17.0, "steps": 90}, "bad", "few steps"),
+        ("Overfitting", {"train_psnr": 18.09, "held_out_psnr": 17.0}, "look", "both low"),
+        # as close as these are, 6.2 dB say that they are not close enough
+        (
+            "Photographs",
+            {"train_psnr": 24.8, "held_out_psnr": 18.6},
+            "bad",
+            "not enough for this subject, as the 6.2 dB",
+        ),
+        # hardly a drift, but 1.1 dB
+        ("Exposure", {"matched_psnr": 30.6}, "look", "30.60 dB instead of 29.50"),
+    ],
+)
+def test_the_verdict_gives_its_numbers(about: str, changes: dict, kind: str, words: str) -> None:
+    found = [f for f in verdict({"psnr": 29.5}, replace(GOOD, **changes), None) if f.about == about]
+    assert [f.kind for f in found] == [kind]
+    assert words in found[0].text
+
+
+@pytest.mark.parametrize("gap", [1.5, 10.0, None])
+@pytest.mark.parametrize("train", [31.0, 24.0, 18.0])
+@pytest.mark.parametrize("apart", [4.0, 30.0])
+def test_no_verdict_contradicts_another_and_each_fault_ends_in_a_command(
+    gap: float | None, train: float, apart: float
+) -> None:
+    held_out = None if gap is None else train - gap
+    measured = {"train_psnr": train, "held_out_psnr": held_out, "matched_psnr": held_out}
+    faults = {"neighbour_degrees": apart, "stops": {"a": -0.5, "b": 0.5}, "floaters": {"a": 0.5}, "steps": 3_000}
+    found = verdict({}, replace(GOOD, **measured, **faults), None)
+    found += verdict({}, None, ([700.0, 3000.0], [20.2, 16.7]))
+    kinds = {one.about: one.kind for one in found}
+    assert all(bool(one.next) == (one.kind != "good") for one in found)
+    if kinds["Fit"] == "bad" or kinds["Overfitting"] == "bad":
+        assert "good" not in (kinds["Overfitting"], kinds.get("Quality"))
+    if kinds["Overfitting"] == "bad":
+        assert kinds["Photographs"] == "bad"
+    for one in found:
+        words = [{"DATA": "scene", "RESULT": "out/scene"}.get(word, word) for word in one.next]
+        if words[:1] == ["train"]:
+            train_arguments(words[1:])
+        elif words:
+            parse({"data": DataCheck, "export": Export}[words[0]], words[1 + (words[0] == "data") :], words[0])
+
+
+@pytest.mark.parametrize(
+    ("psnr", "kind", "words"),
+    [(31.0, "good", "very close"), (26.0, "good", "close"), (22.0, "look", "recognisable"), (12.0, "bad", "far from")],
+)
+def test_the_verdict_says_how_close_the_renders_are(psnr: float, kind: str, words: str) -> None:
+    quality = verdict({"psnr": psnr}, None, None)
+    assert [(f.about, f.kind) for f in quality] == [("Quality", kind)]
+    assert words in quality[0].text
+
+
+def test_a_run_whose_held_out_views_got_worse_is_told_when_that_began() -> None:
+    fell = verdict({}, None, ([700.0, 3000.0], [20.2, 16.7]))
+    assert [f.kind for f in fell] == ["bad"]
+    assert "fell from 20.20 dB after 700 steps to 16.70 dB after 3,000" in fell[0].text
+    assert verdict({}, None, ([700.0, 3000.0], [16.7, 20.2])) == []
+
+
+def test_exposures_that_were_learned_are_no_fault_and_ask_for_nothing() -> None:
+    drifting = {"stops": {"a": -0.5, "b": 0.5}, "matched_psnr": 30.6}
+    for learned, kind in ((False, "bad"), (True, "good")):
+        found = verdict({}, replace(GOOD, **drifting, exposures_learned=learned), None)
+        (about,) = (one for one in found if one.about == "Exposure")
+        assert (about.kind, bool(about.next)) == (kind, not learned)
+        assert "-0.50 (a) to +0.50 stops (b)" in about.text
+        assert "30.60 dB instead of 29.50" in about.text
+    even = verdict({}, replace(GOOD, exposures_learned=True), None)
+    assert not any("Held-out views have none" in one.text for one in even)
+
+
+def test_no_two_findings_send_to_schedules_of_two_lengths() -> None:
+    overfitted = replace(GOOD, train_psnr=39.5, steps=15_570)
+    found = verdict({}, overfitted, ([3_633.0, 15_570.0], [30.0, 29.5]))
+    sent = [one.next[3] for one in found if "--steps-scaler" in one.next]
+    assert sent == ["0.12", "0.12"]
+    (alone,) = (one for one in verdict({}, overfitted, None) if "--steps-scaler" in one.next)
+    assert alone.next[3] == "0.26"
+
+
+ASKED = {
+    "auto": {
+        "preset": "auto",
+        "steps_scaler": 0.5,
+        "factor": 6,
+        "depth_lambda": 0.1,
+        "exposure": True,
+        "test_every": 0,
+    },
+    "quick": {"preset": "quick", "max_steps": 900, "seed": 7, "pop.lambda_pop": 2e-3},
+    "paper": {"method": "gsplat", "gsplat.refine_every": 50, "background": (1.0, 0.5, 0.0), "normalize": False},
+}
+
+
+@pytest.mark.parametrize("name", ASKED)
+@pytest.mark.parametrize(
+    ("words", "changes"),
+    [
+        (("--exposure",), {"exposure"}),
+        (("--test-every", "8"), {"test_every"}),
+        (("--steps-scaler", "0.12"), {"steps"}),
+        (("--minutes", "240"), {"steps"}),
+    ],
+)
+def test_another_training_is_asked_for_as_the_judged_one_was(name: str, words: tuple, changes: set) -> None:
+    run = TrainConfig.of(**ASKED[name], data="my scene", result_dir="out/a")
+    line = typed(Finding("bad", "it", "is", ("train", "DATA", *words)), run, Path("out/a")).next
+    assert line[:2] == ("train", "my scene")
+    again, options = train_arguments(line[1:])
+    assert (again.data, again.result_dir) == ("my scene", "out/a_next")
+    assert options.minutes == (240.0 if "--minutes" in words else None)
+    assert (again.method, again.seed, again.factor, again.background) == (
+        *(run.method, run.seed, run.factor),
+        run.background,
+    )
+    kept = {"exposure", "depth_lambda", "test_every", "normalize"} - changes
+    assert {key: getattr(again, key) for key in kept} == {key: getattr(run, key) for key in kept}
+    if "steps" not in changes:
+        assert (again.max_steps, again.strategy, again.lr) == (run.max_steps, run.strategy, run.lr)
+    elif "--steps-scaler" in words:
+        assert again.max_steps == 3_600
+        assert again.strategy.lambda_pop == run.strategy.lambda_pop
+    assert "--preset" not in line or "--minutes" not in words
