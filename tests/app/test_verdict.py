@@ -116,6 +116,15 @@ def test_the_verdict_says_how_close_the_renders_are(psnr: float, kind: str, word
     assert words in quality[0].text
 
 
+def test_a_view_that_spoils_the_mean_is_named() -> None:
+    views = {"edge": 8.05, "a": 19.8, "b": 20.0}
+    (quality, *_) = verdict({}, replace(GOOD, held_out=views, held_out_psnr=15.95), None)
+    assert "edge is the worst, 8.05 dB; the mean without it is 19.90 dB." in quality.text
+    even = {"edge": 19.5, "a": 19.8, "b": 20.0}
+    (quality, *_) = verdict({}, replace(GOOD, held_out=even, held_out_psnr=19.77), None)
+    assert "worst" not in quality.text
+
+
 def test_a_run_whose_held_out_views_got_worse_is_told_when_that_began() -> None:
     fell = verdict({}, None, ([700.0, 3000.0], [20.2, 16.7]))
     assert [f.kind for f in fell] == ["bad"]

@@ -60,7 +60,8 @@ class Checks:
         train_psnr: mean over the training views that were rendered, dB.
         train_measured: how many these are.
         held_out_psnr: mean over the held-out views, dB; None where there are none.
-        matched_psnr: the same after each channel of each render was scaled to its photograph's brightness, dB.
+        held_out: of each of these views, dB.
+        matched_psnr: the mean after each channel of each render was scaled to its photograph's brightness, dB.
         neighbour_degrees: median over the training cameras of the angle to the nearest other one, seen from the point
             that they look at.
         stops: how much brighter each photograph is than its render, in stops of exposure, by view.
@@ -76,6 +77,7 @@ class Checks:
     train_psnr: float
     train_measured: int
     held_out_psnr: float | None = None
+    held_out: Mapping[str, float] = field(default_factory=dict)
     matched_psnr: float | None = None
     neighbour_degrees: float | None = None
     stops: Mapping[str, float] = field(default_factory=dict)
@@ -133,6 +135,7 @@ def write_checks(
         train_psnr=float(np.mean([_psnr(view, _exposed(seen[view.name].image, view, learned)) for view in some])),
         train_measured=len(some),
         held_out_psnr=_mean(list(held_out.values())),
+        held_out=held_out,
         matched_psnr=_mean([_psnr(view, _matched(view, seen[view.name].image)) for view in test]),
         neighbour_degrees=neighbour_degrees(np.stack([view.viewmat for view in train])),
         stops={view.name: stops_between(*_kept(view, seen[view.name].image)) for view in (*some, *test)},
@@ -296,9 +299,9 @@ def read_checks(path: Path) -> Checks:
         PopError: it is damaged; names the entry.
     """
     entry = read_json(path, _FIX)
-    shares = {"stops", "floaters", "orbit_floaters"}
+    by_view = {"held_out", "stops", "floaters", "orbit_floaters"}
     for name, value in entry.items():
-        if name in shares:
+        if name in by_view:
             right = isinstance(value, dict) and all(_is_number(number) for number in value.values())
         elif name == "exposures_learned":
             right = isinstance(value, bool)

@@ -18,6 +18,7 @@ from pop_ref.settings import Recipe
 # training views are always matched better, dB
 _SOME_OVERFITTING: Final = 3.0
 _OVERFITTED: Final = 6.0
+_ONE_VIEW: Final = 1.0  # dB that a single held-out view takes off the mean
 _FELL: Final = 0.3  # dB between the best held-out measurement and the last
 _FEW: Final = 20
 _FAR_APART: Final = 15.0  # degrees between neighbouring cameras
@@ -72,7 +73,7 @@ def verdict(
     """
     # what was measured last: of a run that was stopped, statistics are of an earlier step
     psnr = stats.get("psnr") if checks is None else checks.held_out_psnr
-    found = list(_quality(psnr))
+    found = list(_quality(psnr, {} if checks is None else checks.held_out))
     fewer = _fewer_steps(held_out)
     found += _course(held_out, fewer)
     if checks is not None:
@@ -86,11 +87,17 @@ def verdict(
     return found
 
 
-def _quality(psnr: float | None) -> Iterator[Finding]:
+def _quality(psnr: float | None, by_view: Mapping[str, float]) -> Iterator[Finding]:
     if psnr is None:
         return
+    odd = ""
+    if len(by_view) > 1:
+        worst = min(by_view, key=lambda name: by_view[name])
+        rest = float(np.mean([value for name, value in by_view.items() if name != worst]))
+        if rest - psnr >= _ONE_VIEW:
+            odd = f" {worst} is the worst, {by_view[worst]:.2f} dB; the mean without it is {rest:.2f} dB."
     _, kind, words = next(grade for grade in _GRADES if psnr >= grade[0])
-    text = f"Views that training never saw are {words}: {psnr:.2f} dB on average."
+    text = f"Views that training never saw are {words}: {psnr:.2f} dB on average.{odd}"
     yield Finding(kind, "Quality", text, () if kind == "good" else ("data", "check", "DATA"))
 
 
