@@ -99,7 +99,7 @@ class Ranks(Protocol):
 
 
 @dataclass
-class Collected:
+class KernelStatistics:
     """What the kernels collect, one entry a Gaussian, until new rows come.
 
     `sh_rest_sum` is Adam's, of the same life: gradients that wait for their update; None where none do. [N, n_rest, 3]
@@ -112,14 +112,16 @@ class Collected:
     sh_rest_sum: Tensor | None = None
 
     @classmethod
-    def zeros(cls, n: int, device: torch.device, n_rest: int | None = None) -> Collected:
+    def zeros(cls, n: int, device: torch.device, n_rest: int | None = None) -> KernelStatistics:
         """Start from nothing; `n_rest` bands' gradients wait, None for none."""
         visible, dominant = (torch.zeros(n, dtype=torch.int32, device=device) for _ in range(2))
         flags = torch.zeros(n, dtype=torch.uint8, device=device)
         waiting = None if n_rest is None else torch.zeros((n, n_rest, 3), device=device)
         return cls(torch.zeros(n, device=device), visible, dominant, flags, waiting)
 
-    def rows(self, own: slice) -> Collected:
+    def rows(self, own: slice) -> KernelStatistics:
         """Return some rows, in the same memory."""
         waiting = None if self.sh_rest_sum is None else self.sh_rest_sum[own]
-        return Collected(self.grad_sum[own], self.n_visible[own], self.dominant_sum[own], self.blurred[own], waiting)
+        return KernelStatistics(
+            self.grad_sum[own], self.n_visible[own], self.dominant_sum[own], self.blurred[own], waiting
+        )

@@ -12,7 +12,7 @@ from typing import Final
 
 from paper_repro.paper import Metric, Paper, PaperTable
 
-__all__ = ["CKPT_TOLERANCE", "Check", "checkpoint_mib", "checks", "places"]
+__all__ = ["CKPT_TOLERANCE", "Statement", "checkpoint_mib", "checks", "places"]
 
 # MiB between a printed size and bytes times the printed count, both rounded; 3DGS on Mip-NeRF 360 has 1.59
 CKPT_TOLERANCE: Final = 1.6
@@ -20,7 +20,7 @@ M360, TT, DB = "Mip-NeRF 360", "Tanks & Temples", "Deep Blending"
 
 
 @dataclass(frozen=True)
-class Check:
+class Statement:
     """One statement about the paper's own numbers.
 
     Attributes:
@@ -36,7 +36,7 @@ class Check:
     known: str = ""
 
 
-def checks(paper: Paper) -> tuple[Check, ...]:
+def checks(paper: Paper) -> tuple[Statement, ...]:
     """Make every check."""
     return (
         *_checkpoints(paper),
@@ -65,7 +65,7 @@ def places(values: Mapping[str, float], metric: Metric, upto: int) -> dict[str, 
     return {row: at if at <= upto else 0 for row, at in place.items()}
 
 
-def _checkpoints(paper: Paper) -> Iterator[Check]:
+def _checkpoints(paper: Paper) -> Iterator[Statement]:
     exact = total = 0
     for table, dataset, row, values in _lines(paper):
         if "ckpt_mb" not in values:
@@ -75,12 +75,14 @@ def _checkpoints(paper: Paper) -> Iterator[Check]:
         # Num is rounded to thousands and Ckpt to whole MiB
         slack = 0.5 + checkpoint_mib(500, paper.bytes_per_gaussian[row])
         total, exact = total + 1, exact + (abs(off) <= slack)
-        yield Check(
+        yield Statement(
             f"table {table.number}, {dataset}, {row}: Ckpt is Num x {paper.bytes_per_gaussian[row]} bytes",
             f"{values['ckpt_mb']:.0f} printed, {size:.2f} MiB computed, {off:+.2f}",
             abs(off) <= CKPT_TOLERANCE,
         )
-    yield Check("21 of 23 sizes agree within the rounding of both", f"{exact} of {total}", (exact, total) == (21, 23))
+    yield Statement(
+        "21 of 23 sizes agree within the rounding of both", f"{exact} of {total}", (exact, total) == (21, 23)
+    )
 
 
 def _lines(paper: Paper) -> Iterator[tuple[PaperTable, str, str, Mapping[str, float]]]:
@@ -90,7 +92,7 @@ def _lines(paper: Paper) -> Iterator[tuple[PaperTable, str, str, Mapping[str, fl
                 yield table, dataset, line.row, line.values[dataset]
 
 
-def _across_tables(paper: Paper) -> Iterator[Check]:
+def _across_tables(paper: Paper) -> Iterator[Statement]:
     printed: dict[tuple[str, str, str], list[tuple[PaperTable, float]]] = {}
     for table, dataset, row, values in _lines(paper):
         for metric, value in values.items():
@@ -103,7 +105,7 @@ def _across_tables(paper: Paper) -> Iterator[Check]:
         off = max(value for _, value in cells) - min(value for _, value in cells)
         finest = max(table.decimals[metric] for table, _ in cells)
         agree = off <= (0.5 * 10.0**-decimals + 1e-9 if finest > decimals else 1e-9)
-        yield Check(
+        yield Statement(
             f"{row}, {dataset}: {metric} is the same in tables {', '.join(str(t.number) for t, _ in cells)}",
             ", ".join(f"{value:.{table.decimals[metric]}f}" for table, value in cells),
             agree,
@@ -111,25 +113,25 @@ def _across_tables(paper: Paper) -> Iterator[Check]:
         )
 
 
-def _colours(paper: Paper) -> Iterator[Check]:
+def _colours(paper: Paper) -> Iterator[Statement]:
     for table in paper.tables:
         for dataset in table.datasets:
             for metric in table.metrics:
                 marks = {line.row: line.marks[dataset][metric] for line in table.rows}
                 values = {line.row: line.values[dataset][metric] for line in table.rows}
                 right = places(values, paper.metrics[metric], table.marked)
-                yield Check(
+                yield Statement(
                     f"table {table.number}, {dataset}, {metric}: the best {table.marked} are marked",
                     ", ".join(f"{row} {mark}" for row, mark in marks.items() if mark) or "none",
                     marks == right,
                 )
 
 
-def _text(paper: Paper) -> Iterator[Check]:
+def _text(paper: Paper) -> Iterator[Statement]:
     main, tanks = paper.table(1), paper.table(2)
     saved = 1.0 - tanks.value("pop", TT, "time_s") / tanks.value("taming", TT, "time_s")
     least = paper.number("speedup_vs_taming_TT")
-    yield Check(f"POP saves at least {least:.0%} of Taming-3DGS's time on {TT}", f"{saved:.1%}", saved >= least)
+    yield Statement(f"POP saves at least {least:.0%} of Taming-3DGS's time on {TT}", f"{saved:.1%}", saved >= least)
     for table, dataset in ((main, M360), (main, DB), (tanks, TT)):
         yield _is_least(table, dataset, "time_s")
         if table is main:
@@ -137,52 +139,54 @@ def _text(paper: Paper) -> Iterator[Check]:
     pop = main.value("pop", M360, "psnr")
     for row in ("pup", "speedy_splat"):
         other = main.value(row, M360, "psnr")
-        yield Check(f"POP surpasses {row} in PSNR on {M360}", f"{pop:.3f} and {other:.3f} dB", pop > other)
+        yield Statement(f"POP surpasses {row} in PSNR on {M360}", f"{pop:.3f} and {other:.3f} dB", pop > other)
     psnr = {line.row: line.values[TT]["psnr"] for line in tanks.rows}
     place = places(psnr, paper.metrics["psnr"], len(psnr))["pop"]
-    yield Check(f"POP has the third-best PSNR on {TT}", f"place {place}", place == paper.number("pop_psnr_rank_TT"))
+    yield Statement(f"POP has the third-best PSNR on {TT}", f"place {place}", place == paper.number("pop_psnr_rank_TT"))
     yield from _counts_in_the_text(paper, main, tanks)
     low, high = _pair(paper, "blur_3k15k_budget")
     for dataset, short in ((M360, "M360"), (TT, "TT"), (DB, "DB")):
         counts = [paper.ablation(row, dataset, "num_gaussians_k") for row in ("blur_3k_15k", "pop")]
         ratio = counts[0] / counts[1]
-        yield Check(
+        yield Statement(
             f"the window 3k-15k takes {low:.0f} to {high:.0f} times the Gaussians of 3k-7k on {dataset}",
             f"{counts[0]:.0f}k / {counts[1]:.0f}k = {ratio:.2f}",
             low <= ratio <= high,
         )
         change = paper.ablation("blur_3k_15k", dataset, "psnr") - paper.ablation("pop", dataset, "psnr")
         published = paper.number(f"blur_3k15k_psnr_change_{short}")
-        yield Check(
+        yield Statement(
             f"the window 3k-15k changes PSNR by {published:+.2f} dB on {dataset}",
             f"{change:+.2f} dB",
             round(change, 2) == published,
         )
         reset = paper.ablation("pop", dataset, "psnr") - paper.ablation("reset", dataset, "psnr")
-        yield Check(f"POP is no worse than opacity reset in PSNR on {dataset}", f"{reset:+.2f} dB", reset >= 0.0)
+        yield Statement(f"POP is no worse than opacity reset in PSNR on {dataset}", f"{reset:+.2f} dB", reset >= 0.0)
 
 
-def _is_least(table: PaperTable, dataset: str, metric: str) -> Check:
+def _is_least(table: PaperTable, dataset: str, metric: str) -> Statement:
     values = {line.row: line.values[dataset][metric] for line in table.rows}
     best = min(values, key=lambda row: values[row])
-    return Check(
+    return Statement(
         f"POP has the least {metric} on {dataset}", f"{best} with {values[best]:.0f}, POP {values['pop']:.0f}",
         best == "pop" and list(values.values()).count(values[best]) == 1,
     )  # fmt: skip
 
 
-def _counts_in_the_text(paper: Paper, main: PaperTable, tanks: PaperTable) -> Iterator[Check]:
+def _counts_in_the_text(paper: Paper, main: PaperTable, tanks: PaperTable) -> Iterator[Statement]:
     for id, row in (("pop_num_M360_k", "pop"), ("pup_num_M360_k", "pup"), ("speedy_num_M360_k", "speedy_splat")):
         published, printed = paper.number(id), main.value(row, M360, "num_gaussians_k")
-        yield Check(f"the text's {published:.0f}k of {row} are the table's", f"{printed:.0f}k", published == printed)
+        yield Statement(
+            f"the text's {published:.0f}k of {row} are the table's", f"{printed:.0f}k", published == printed
+        )
     published, printed = paper.number("pop_num_TT_k"), tanks.value("pop", TT, "num_gaussians_k")
-    yield Check(
+    yield Statement(
         f"the text's about {published:.0f}k on {TT} are the table's", f"{printed:.0f}k", published == round(printed, -1)
     )
     published = paper.number("pup_compression")
     for table, dataset in ((main, M360), (main, DB), (tanks, TT)):
         share = table.value("pup", dataset, "num_gaussians_k") / table.value("3dgs", dataset, "num_gaussians_k")
-        yield Check(
+        yield Statement(
             f"PUP-3DGS has {published:.0%} of 3DGS's Gaussians on {dataset}",
             f"{share:.1%}",
             abs(share - published) < 0.005,
@@ -190,17 +194,17 @@ def _counts_in_the_text(paper: Paper, main: PaperTable, tanks: PaperTable) -> It
         )  # fmt: skip
 
 
-def _order_of_times(paper: Paper) -> Iterator[Check]:
+def _order_of_times(paper: Paper) -> Iterator[Statement]:
     main = paper.table(1)
     pup, base = (main.value(row, M360, "time_s") for row in ("pup", "3dgs"))
     why = "another version of the base code (protocol.md, C6)"
-    yield Check(
+    yield Statement(
         f"PUP-3DGS takes longer than the 3DGS in it on {M360}", f"{pup:.0f} s and {base:.0f} s", pup > base, why
     )
     lines = {line.row: line.values[TT] for line in paper.table(3).rows}
     by_count = sorted(lines, key=lambda row: lines[row]["num_gaussians_k"])
     times = [lines[row]["time_s"] for row in by_count]
-    yield Check(
+    yield Statement(
         f"in the module ablation more Gaussians take longer on {TT}",
         ", ".join(f"{row} {lines[row]['num_gaussians_k']:.0f}k {lines[row]['time_s']:.0f} s" for row in by_count),
         times == sorted(times),

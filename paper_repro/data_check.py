@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
 from paper_repro.jobs import Job
-from paper_repro.scenes import DATASETS, Scene, find_folder, source_of
+from paper_repro.scenes import DATASETS, PaperScene, find_folder, source_of
 from pop_fast.errors import CaptureError, PopError
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class Found:
         sizes: their widths and heights, px, the most frequent first.
     """
 
-    scene: Scene
+    scene: PaperScene
     status: Status
     reason: str
     folder: Path | None = None
@@ -52,7 +52,7 @@ class Found:
         return -(-self.n_images // HOLD_OUT)
 
 
-def check_scene(scene: Scene, root: Path) -> Found:
+def check_scene(scene: PaperScene, root: Path) -> Found:
     """Look at a scene's files under a data root, the headers of its photographs and its camera model among them."""
     try:
         folder = find_folder(scene, root)
@@ -152,7 +152,7 @@ def _listing(folder: Path) -> tuple[list[str], bool, list[tuple[int, int]]]:
     return [f"{shot.folder}/{shot.file}" for shot in shots], any(shot.split for shot in shots), cameras
 
 
-def _photographs(scene: Scene, folder: Path, listed: Sequence[str]) -> list[Path]:
+def _photographs(scene: PaperScene, folder: Path, listed: Sequence[str]) -> list[Path]:
     from pop_fast.io.images import find_image
 
     if scene.images is not None:
@@ -179,7 +179,7 @@ def _size(path: Path) -> tuple[int, int]:
     return width, height
 
 
-def _wrong_split(scene: Scene, own_split: bool, n_images: int) -> str | None:
+def _wrong_split(scene: PaperScene, own_split: bool, n_images: int) -> str | None:
     if own_split:
         return f"{scene.name} names a split of its own; the protocol holds out every {HOLD_OUT}th by name: remove it"
     if n_images != scene.n_images:
@@ -190,7 +190,7 @@ def _wrong_split(scene: Scene, own_split: bool, n_images: int) -> str | None:
     return None
 
 
-def _wrong_ratio(scene: Scene, cameras: Sequence[tuple[int, int]], sizes: Sequence[tuple[int, int]]) -> str | None:
+def _wrong_ratio(scene: PaperScene, cameras: Sequence[tuple[int, int]], sizes: Sequence[tuple[int, int]]) -> str | None:
     for camera, size in zip(cameras, sizes, strict=False):
         if any(abs(n * scene.shrunk - m) > _ROUNDING * scene.shrunk for n, m in zip(size, camera, strict=True)):
             what = f"a photograph is {size[0]} x {size[1]} and its camera {camera[0]} x {camera[1]}"
@@ -201,7 +201,7 @@ def _wrong_ratio(scene: Scene, cameras: Sequence[tuple[int, int]], sizes: Sequen
     return None
 
 
-def _wrong_size(scene: Scene, sizes: Sequence[tuple[int, int]], factor: int) -> str | None:
+def _wrong_size(scene: PaperScene, sizes: Sequence[tuple[int, int]], factor: int) -> str | None:
     for size in sizes:
         wanted = [side / factor for side in scene.size]
         if any(abs(side - due) > _ROUNDING for side, due in zip(size, wanted, strict=True)):
@@ -213,5 +213,5 @@ def _wrong_size(scene: Scene, sizes: Sequence[tuple[int, int]], factor: int) -> 
     return None
 
 
-def _doubt(scene: Scene) -> str:
+def _doubt(scene: PaperScene) -> str:
     return "" if scene.verified else " (as is recalled; nobody compared it with the photographs here)"

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 from paper_repro import results
 from paper_repro.rows import ROWS, Row, load_row
 from paper_repro.scales import Scale, scale_named
-from paper_repro.scenes import Scene, scene_named
+from paper_repro.scenes import PaperScene, scene_named
 from pop_fast.errors import PopError
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class Job:
     """One training and its result."""
 
     row: Row
-    scene: Scene
+    scene: PaperScene
     scale: Scale
     seed: int = SEED
 

@@ -14,7 +14,7 @@ from typing import Final
 from paper_repro.data_check import check_scene
 from paper_repro.jobs import Job
 from paper_repro.paper import paper
-from paper_repro.scenes import DATASETS, MADE, Scene
+from paper_repro.scenes import DATASETS, MADE, PaperScene
 
 __all__ = ["hours", "hours_by_row", "lacking"]
 
@@ -131,7 +131,7 @@ def _gaussians(job: Job) -> float:
     return 1e3 * max(own or _printed(None, job.scene, "num_gaussians_k"))
 
 
-def _printed(row: str | None, scene: Scene, metric: str) -> list[float]:
+def _printed(row: str | None, scene: PaperScene, metric: str) -> list[float]:
     """List what the tables print of a row on a scene's dataset, of all rows for None."""
     dataset = DATASETS[scene.dataset].name
     lines = [line for table in paper().tables if dataset in table.datasets for line in table.rows]

@@ -14,7 +14,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Final
 
-from paper_repro.scenes import DATASETS, SCENES, Scene
+from paper_repro.scenes import DATASETS, SCENES, PaperScene
 from pop_fast.errors import PopError
 from pop_ref.registry import Registry
 
@@ -70,7 +70,7 @@ class Row:
     scenes: Mapping[str, tuple[str, ...]]
     base: str | None = None
 
-    def options_for(self, scene: Scene) -> tuple[str, ...]:
+    def options_for(self, scene: PaperScene) -> tuple[str, ...]:
         """Return its options on a scene: its own, the dataset's, the scene's."""
         return (*self.options, *self.scenes.get(scene.dataset, ()), *self.scenes.get(scene.name, ()))
 

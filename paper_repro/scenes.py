@@ -25,7 +25,7 @@ __all__ = [
     "MADE",
     "SCENES",
     "Dataset",
-    "Scene",
+    "PaperScene",
     "find_folder",
     "load_scene",
     "load_scenes",
@@ -52,7 +52,7 @@ class Dataset:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scene:
+class PaperScene:
     """One capture.
 
     Attributes:
@@ -118,7 +118,7 @@ _KINDS: Final = {
 }
 
 
-def load_scene(path: Path) -> Scene:
+def load_scene(path: Path) -> PaperScene:
     """Read a scene's file.
 
     Raises:
@@ -128,7 +128,7 @@ def load_scene(path: Path) -> Scene:
         found = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise PopError(f"{path}: is not a scene's TOML file: {error}") from error
-    known = {field.name: field for field in fields(Scene) if field.name != "name"}
+    known = {field.name: field for field in fields(PaperScene) if field.name != "name"}
     for name in [*known, *found]:
         if name not in known:
             raise PopError(f"{path}: {name} is not a field of a scene; the fields are {', '.join(known)}")
@@ -148,11 +148,11 @@ def load_scene(path: Path) -> Scene:
         raise fail("factors", "a table of whole numbers of at least 1, by scale")
     if found["dataset"] not in DATASETS:
         raise fail("dataset", f"one of {', '.join(DATASETS)}")
-    return Scene(name=path.stem, **{**found, "size": (size[0], size[1])})
+    return PaperScene(name=path.stem, **{**found, "size": (size[0], size[1])})
 
 
-def load_scenes(folder: Path = FOLDER) -> dict[str, Scene]:
-    """Read every scene, in the order of the datasets and of `Scene.order`.
+def load_scenes(folder: Path = FOLDER) -> dict[str, PaperScene]:
+    """Read every scene, in the order of the datasets and of `PaperScene.order`.
 
     Raises:
         PopError: as `load_scene`.
@@ -172,7 +172,7 @@ SCENES: Final = load_scenes()
 MADE: Final = ("demo", "still_life")
 
 
-def scene_named(name: str) -> Scene:
+def scene_named(name: str) -> PaperScene:
     """Return a scene by its name.
 
     Raises:
@@ -183,7 +183,7 @@ def scene_named(name: str) -> Scene:
     return SCENES[name]
 
 
-def find_folder(scene: Scene, root: Path) -> Path:
+def find_folder(scene: PaperScene, root: Path) -> Path:
     """Find a scene's folder under a data root, in the first of the published layouts that has it.
 
     Raises:
@@ -199,6 +199,6 @@ def find_folder(scene: Scene, root: Path) -> Path:
     return found
 
 
-def source_of(scene: Scene) -> str:
+def source_of(scene: PaperScene) -> str:
     """Say where a scene comes from."""
     return scene.source or DATASETS[scene.dataset].source

@@ -17,7 +17,7 @@ from paper_repro import results
 from paper_repro.base import begin_from_base, keep_for_others, remove_what_was_kept, steps_for_others
 from paper_repro.jobs import WORK, Job
 from paper_repro.results import Result
-from paper_repro.scenes import MADE, Scene, find_folder
+from paper_repro.scenes import MADE, PaperScene, find_folder
 from pop_fast.errors import PopError
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ def train_row(job: Job, options: Options) -> Result:
     return result
 
 
-def capture_folder(scene: Scene, options: Options) -> Path:
+def capture_folder(scene: PaperScene, options: Options) -> Path:
     """Find a scene's capture; one that the program makes is made where it is absent.
 
     Raises:

@@ -31,7 +31,7 @@ from pop_fast.children import python_command
 from pop_fast.errors import PopError
 from pop_fast.machine import machine_name, processor_kind
 
-__all__ = ["TOLERANCES", "Verdict", "history", "other_kind", "verify"]
+__all__ = ["TOLERANCES", "Verification", "history", "other_kind", "verify"]
 
 # how far another kind of machine may come out: a share of the Gaussians, and dB and SSIM of the held-out views
 TOLERANCES: Final = {"num_gaussians": 0.05, "psnr_test": 0.3, "ssim": 0.01}
@@ -50,7 +50,7 @@ train_row(job_named(*asked["job"]), Options(**places, **how))
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Verification:
     """What came out.
 
     Attributes:
@@ -68,7 +68,7 @@ class Verdict:
     differences: tuple[str, ...]
 
 
-def verify(job: Job, options: Options, steps: int | None = None) -> Verdict:
+def verify(job: Job, options: Options, steps: int | None = None) -> Verification:
     """Train a job's result again with the program of its commit, and compare.
 
     The clone and what is trained lie in the work folder, under "verify", until there is a verdict: the same call
@@ -214,7 +214,7 @@ def _steps_taken(work: Path) -> int:
     return int(json.loads(lines[-1])["step"]) + 1 if lines else 0
 
 
-def _compare(result: Result, work: Path, taken: int, kind: tuple[str, ...]) -> Verdict:
+def _compare(result: Result, work: Path, taken: int, kind: tuple[str, ...]) -> Verification:
     last = int(result.schedule["max_steps"])
     finished = (work / "stats" / f"val_step{last - 1:04d}.json").is_file()
     # of the last step that was logged some may not have been written
@@ -231,7 +231,7 @@ def _compare(result: Result, work: Path, taken: int, kind: tuple[str, ...]) -> V
     ]
     if finished:
         found += _differences_at_the_end(result, work, last - 1, bool(kind))
-    return Verdict(kind, len(common), last if finished else taken, finished, tuple(found))
+    return Verification(kind, len(common), last if finished else taken, finished, tuple(found))
 
 
 def _differences_at_the_end(result: Result, work: Path, last: int, within: bool) -> list[str]:

@@ -22,7 +22,7 @@ from pop_fast.train import checkpoint as ckpt
 
 from .corpus import HERE
 from .forks import TOLD, start, wait
-from .runs import KINDS, STEPS, Scene, ended, run_parts, same
+from .runs import KINDS, STEPS, UndisturbedRun, ended, run_parts, same
 
 # what changes a disk; a process may end, and the system may refuse, right before each of them
 _CHANGES = ((os, "replace"), (os, "fsync"), (Path, "mkdir"), (Path, "unlink"), (Path, "rmdir"), (shutil, "rmtree"))
@@ -30,7 +30,7 @@ CRASHED = 77
 _ERRORS = (errno.ENOSPC, errno.EACCES, errno.EIO, errno.EROFS)
 
 
-def crash_points(of: Scene, most: int | None) -> dict[str, Any]:
+def crash_points(of: UndisturbedRun, most: int | None) -> dict[str, Any]:
     """End the process right before every change of the disk, and look at what is left.
 
     Args:
@@ -40,7 +40,7 @@ def crash_points(of: Scene, most: int | None) -> dict[str, Any]:
     return _at_points(of, most, lambda number: lambda: os._exit(CRASHED), short_writes=False)
 
 
-def failing_writes(of: Scene, most: int | None) -> dict[str, Any]:
+def failing_writes(of: UndisturbedRun, most: int | None) -> dict[str, Any]:
     """Let every change of the disk, and every write of a file in its middle, be refused by the system in turn."""
 
     def refused(number: int) -> Callable[[], None]:
@@ -54,7 +54,7 @@ def failing_writes(of: Scene, most: int | None) -> dict[str, Any]:
 
 
 def _at_points(
-    of: Scene, most: int | None, fault: Callable[[int], Callable[[], None]], short_writes: bool
+    of: UndisturbedRun, most: int | None, fault: Callable[[int], Callable[[], None]], short_writes: bool
 ) -> dict[str, Any]:
     results: dict[str, Any] = {}
     for job, (work, check) in _jobs(of).items():
@@ -84,7 +84,7 @@ def _at_points(
     return results
 
 
-def _jobs(of: Scene) -> dict[str, tuple[Callable[[], int], Callable[[], str | None]]]:
+def _jobs(of: UndisturbedRun) -> dict[str, tuple[Callable[[], int], Callable[[], str | None]]]:
     """List what writes, each with what must hold after it was disturbed."""
 
     def replaced() -> str | None:
@@ -98,7 +98,7 @@ def _jobs(of: Scene) -> dict[str, tuple[Callable[[], int], Callable[[], str | No
     return {"train": train, "train --overwrite": overwrite, "write a PLY": _writing(of)}
 
 
-def _writing(of: Scene) -> tuple[Callable[[], int], Callable[[], str | None]]:
+def _writing(of: UndisturbedRun) -> tuple[Callable[[], int], Callable[[], str | None]]:
     splat, old = of.folder / "splat.ply", of.folder / "old.ply"
 
     def rewrite() -> int:
@@ -113,7 +113,7 @@ def _writing(of: Scene) -> tuple[Callable[[], int], Callable[[], str | None]]:
     return rewrite, old_or_new
 
 
-def _prepare(of: Scene, job: str) -> None:
+def _prepare(of: UndisturbedRun, job: str) -> None:
     for name in ("run", "over"):
         shutil.rmtree(of.folder / name, ignore_errors=True)
     if job == "train --overwrite":
@@ -123,7 +123,7 @@ def _prepare(of: Scene, job: str) -> None:
             shutil.copy(HERE / "splats" / "splat.ply", of.folder / name)
 
 
-def _count(of: Scene, job: str, work: Callable[[], int], short_writes: bool) -> int:
+def _count(of: UndisturbedRun, job: str, work: Callable[[], int], short_writes: bool) -> int:
     """Count the changes of the disk of a job that nobody disturbs."""
     told = of.folder / "count"
 
@@ -192,7 +192,7 @@ class _Meeting(io.FileIO):
         return super().write(data) or 0
 
 
-def bit_flips(of: Scene, flips: int, seed: int) -> dict[str, Any]:
+def bit_flips(of: UndisturbedRun, flips: int, seed: int) -> dict[str, Any]:
     """Flip single bits of a checkpoint: it is refused, or read as what it was."""
     path = ckpt.checkpoint_path(of.folder / "whole", STEPS - 1)
     data, whole, rng = path.read_bytes(), ckpt.load_checkpoint(path), random.Random(seed)

@@ -70,7 +70,7 @@ KINDS: Final = {
 
 
 @dataclass(frozen=True)
-class Scene:
+class UndisturbedRun:
     """What is trained and how, and what a run of it that nobody disturbs ends with.
 
     Attributes:
@@ -156,7 +156,7 @@ def why_not() -> str | None:
 
 
 @contextmanager
-def scene(kind: str) -> Iterator[Scene]:
+def scene(kind: str) -> Iterator[UndisturbedRun]:
     """Train once, undisturbed, in this process, which then has imported all that its children need."""
     run_parts(in_children=True)
     # a child has none of its parent's threads, and waits for ever to dismiss a pool that torch had made here
@@ -167,7 +167,7 @@ def scene(kind: str) -> Iterator[Scene]:
             capture = Path(folder) / "toy"
             with redirect_stdout(io.StringIO()):
                 main(["demo", str(capture), "--views", "8", "--width", "40", "--height", "32"])
-        made = Scene(KINDS[kind], capture, Path(folder), {})
+        made = UndisturbedRun(KINDS[kind], capture, Path(folder), {})
         status = made.train("whole")
         stats = ResultFolder(Path(folder) / "whole").read_stats("val", STEPS - 1) or {}
         stepper = made.kind.stepper or stats.get("stepper")
@@ -213,7 +213,7 @@ def same(a: Any, b: Any) -> bool:
     return type(a) is type(b) and a == b
 
 
-def kill_loop(of: Scene, kills: int, minutes: float, seed: int) -> dict[str, Any]:
+def kill_loop(of: UndisturbedRun, kills: int, minutes: float, seed: int) -> dict[str, Any]:
     """Kill runs at random moments, each at most so often, with one thread or two by turns, then let them end.
 
     Of two ranks one is killed, or both at once; of a run in blocks the starter with the part that it waits for.
@@ -241,7 +241,7 @@ def kill_loop(of: Scene, kills: int, minutes: float, seed: int) -> dict[str, Any
     return {"kills": count["kills"], "runs": count["runs"], "seed": seed, "failures": failures}
 
 
-def _killed(of: Scene, name: str, threads: int, rng: random.Random, longest: float) -> bool:
+def _killed(of: UndisturbedRun, name: str, threads: int, rng: random.Random, longest: float) -> bool:
     """Start or continue a run, kill it at a random moment, and tell whether that was before its end."""
 
     def work() -> int:

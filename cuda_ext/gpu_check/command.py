@@ -33,7 +33,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cuda_ext.gpu_check.shared import ROOT, SHORTEST, Budget, Check, first_line, python_path, read_json, write_json
+from cuda_ext.gpu_check.shared import (
+    ROOT,
+    SHORTEST,
+    Budget,
+    StageContext,
+    first_line,
+    python_path,
+    read_json,
+    write_json,
+)
 from cuda_ext.gpu_check.stages import JOBS, SHARES, STAGES
 from pop_fast.children import python_command
 
@@ -80,7 +89,7 @@ def begun_report(path: Path) -> dict[str, Any]:
     return {**report, "stages": dict(stages) if isinstance(stages, dict) else {}}
 
 
-def run_stages(names: list[str], limit: float, check: Check, report: dict[str, Any], path: Path) -> list[str]:
+def run_stages(names: list[str], limit: float, check: StageContext, report: dict[str, Any], path: Path) -> list[str]:
     """Run stages in order, each in its share of the time, and write down what each found; return those that failed."""
     # how long emulated kernels take says nothing: only the limit ends them
     shares = {name: replace(share, most=limit) for name, share in SHARES.items()} if check.rehearsal else SHARES
@@ -107,7 +116,7 @@ def run_stages(names: list[str], limit: float, check: Check, report: dict[str, A
     return failed
 
 
-def _held(name: str, check: Check) -> dict[str, Any]:
+def _held(name: str, check: StageContext) -> dict[str, Any]:
     """Run a stage; what it raises is kept, and does not reach the other stages."""
     if check.seconds < SHORTEST:
         return {"status": 124, "seconds": 0.0, "output": "no time was left; name the stage in another call"}
@@ -170,7 +179,7 @@ def main(argv: list[str] | None = None) -> int:
     report = begun_report(path)
     report |= {"job": args.job, "complete": False, "rehearsal": args.rehearse, "limit_s": args.limit_s}
     report["environment"] = environment(commit)
-    check = Check(
+    check = StageContext(
         *(0.0, out, PLACE if os.access(ROOT, os.W_OK) else Path(tempfile.mkdtemp(prefix="gpu_check_"))),
         *(path.with_suffix(".log"), packed.resolve() if packed else None),
         *(tuple(folder.resolve() for folder in args.captures), args.steps_scaler, commit, args.rehearse),

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from cuda_ext.gpu_check.shared import Check, all_lines, skipped
+from cuda_ext.gpu_check.shared import StageContext, all_lines, skipped
 from cuda_ext.gpu_check.training import TRAIN, captures_of, last_stats, no_capture
 from pop_fast.children import python_command
 
@@ -15,12 +15,12 @@ from pop_fast.children import python_command
 REHEARSED, FEW = 2, 8
 
 
-def count_gpus(check: Check) -> int:
+def count_gpus(check: StageContext) -> int:
     """Return how many GPUs the node has."""
     return REHEARSED if check.rehearsal else len(all_lines(["nvidia-smi", "--list-gpus"]))
 
 
-def ranks_stage(check: Check) -> dict[str, Any]:
+def ranks_stage(check: StageContext) -> dict[str, Any]:
     """Train on the first capture by 1, 2, 4 ... GPUs, each step of as many views as the node has GPUs.
 
     The bits must be the same. What a rank received of the others (`received_bytes`) stands with the seconds.
@@ -43,7 +43,7 @@ def ranks_stage(check: Check) -> dict[str, Any]:
     return found | {"status": found["status"] or int(not found["same_bits"])}
 
 
-def blocks_stage(check: Check) -> dict[str, Any]:
+def blocks_stage(check: StageContext) -> dict[str, Any]:
     """Train on the first capture in blocks, one a GPU, and as a whole: seconds and PSNR of both."""
     gpus, captures = count_gpus(check), captures_of(check)
     if not captures:
@@ -59,7 +59,7 @@ def blocks_stage(check: Check) -> dict[str, Any]:
     return found
 
 
-def _train(check: Check, path: Path, name: str, limit: float, size: int, *more: str) -> dict[str, Any]:
+def _train(check: StageContext, path: Path, name: str, limit: float, size: int, *more: str) -> dict[str, Any]:
     """Train by so many processes, started by torchrun where they are several."""
     folder = check.work / f"{path.name}_{name}_{check.steps_scaler:g}_{check.commit[:12]}"
     # blocks are processes of their own, in which nothing stands for a GPU in a rehearsal

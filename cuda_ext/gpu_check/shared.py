@@ -187,7 +187,7 @@ NOTHING: Mapping[str, str] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
-class Check:
+class StageContext:
     """What the stages share.
 
     Attributes:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cuda_ext.gpu_check.several import blocks_stage, ranks_stage
-from cuda_ext.gpu_check.shared import NOTHING, ROOT, Check, Command, Share, python_path, read_json, skipped
+from cuda_ext.gpu_check.shared import NOTHING, ROOT, Command, Share, StageContext, python_path, read_json, skipped
 from cuda_ext.gpu_check.tests import (
     laws_of_gaussian_parallel_stage,
     laws_stage,
@@ -24,7 +24,7 @@ _COMPILE = "import time; t = time.time(); from gsplat.cuda._backend import _C; p
 _COMPILE += "assert _C is not None, 'gsplat found no CUDA toolkit'"
 
 
-def wheels_stage(check: Check) -> dict[str, Any]:
+def wheels_stage(check: StageContext) -> dict[str, Any]:
     """Install the wheels that were brought along into a scratch folder; continue without what is absent.
 
     Where pip refuses them together, each is installed by itself, so that a damaged one costs no other.
@@ -43,7 +43,7 @@ def wheels_stage(check: Check) -> dict[str, Any]:
     return found | {"wheels": sound, "damaged": bad, "output": "\n".join(bad.values()) or found["output"]}
 
 
-def build_stage(check: Check) -> dict[str, Any]:
+def build_stage(check: StageContext) -> dict[str, Any]:
     """Build the extension for this machine's GPU; what an earlier call built is only built where sources changed."""
     jobs = str(os.cpu_count() or 2)
     found = check.run(check.python("-m", "cuda_ext.build", "--jobs", jobs), check.seconds)
@@ -52,12 +52,12 @@ def build_stage(check: Check) -> dict[str, Any]:
     return found
 
 
-def bench_stage(check: Check) -> dict[str, Any]:
+def bench_stage(check: StageContext) -> dict[str, Any]:
     """Time every kernel and the whole step."""
     return _benchmark(check, "gpu_kernels.py", check.seconds)
 
 
-def gsplat_stage(check: Check) -> dict[str, Any]:
+def gsplat_stage(check: StageContext) -> dict[str, Any]:
     """Time gsplat too, when its own compilation, begun during earlier stages, has come to an end."""
     compiling = check.beside.get("gsplat")
     if compiling is None:
@@ -73,7 +73,7 @@ def gsplat_stage(check: Check) -> dict[str, Any]:
     return found | {"compilation": compiled}
 
 
-def reproduce_stage(check: Check) -> dict[str, Any]:
+def reproduce_stage(check: StageContext) -> dict[str, Any]:
     """Train the rows of the paper's tables that are missing, the cheapest first, as `pop-repro queue` does.
 
     Of the scenes that were brought along, at the scale whose rows take days on a CPU. A row that the time
@@ -92,18 +92,18 @@ def reproduce_stage(check: Check) -> dict[str, Any]:
     return found | {"rows": sorted(str(path.relative_to(results)) for path in results.rglob("*.jsonl"))}
 
 
-def _start_gsplat(check: Check) -> None:
+def _start_gsplat(check: StageContext) -> None:
     environment = {"PYTHONPATH": python_path(ROOT, check.site), **_of_gsplat(check)}
     command = python_command("-c", _COMPILE)
     check.beside["gsplat"] = Command(command, check.work / "gsplat_compilation.log", environment)
 
 
-def _of_gsplat(check: Check) -> dict[str, str]:
+def _of_gsplat(check: StageContext) -> dict[str, str]:
     jobs = str(max((os.cpu_count() or 2) // 2, 1))
     return {"TORCH_EXTENSIONS_DIR": str(check.work / "torch_extensions"), "MAX_JOBS": jobs}
 
 
-def _benchmark(check: Check, script: str, limit: float, over: Mapping[str, str] = NOTHING) -> dict[str, Any]:
+def _benchmark(check: StageContext, script: str, limit: float, over: Mapping[str, str] = NOTHING) -> dict[str, Any]:
     target = check.out / f"{script.removesuffix('.py')}.json"
     target.unlink(missing_ok=True)
     words = [str(ROOT / "benchmarks" / script), str(target), "--scenes", *check.scenes()]
@@ -119,7 +119,7 @@ def _stem(path: str) -> str:
     return "-".join(Path(path).name.split("-")[:2])
 
 
-STAGES: dict[str, Callable[[Check], dict[str, Any]]] = {
+STAGES: dict[str, Callable[[StageContext], dict[str, Any]]] = {
     "wheels": wheels_stage,
     "build": build_stage,
     "smoke": smoke_stage,

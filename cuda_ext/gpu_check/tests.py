@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from cuda_ext.gpu_check.outcomes import FILE, outcomes
-from cuda_ext.gpu_check.shared import NOTHING, ROOT, Check, skipped
+from cuda_ext.gpu_check.shared import NOTHING, ROOT, StageContext, skipped
 from pop_fast.children import python_command
 
 LAWS = ("test_laws.py",)
@@ -32,22 +32,22 @@ WATCHED = ("test_ten_steps.py::test_rasterization_and_its_gradients_give_the_sam
 LAWS_REHEARSED = "remaining_light_lies"
 
 
-def smoke_stage(check: Check) -> dict[str, Any]:
+def smoke_stage(check: StageContext) -> dict[str, Any]:
     """Replay graphs, overflow buffers, compare ten steps with the CPU's and an image with the oracle's."""
     return _pytest(check, "smoke", SMOKE)
 
 
-def laws_stage(check: Check) -> dict[str, Any]:
+def laws_stage(check: StageContext) -> dict[str, Any]:
     """Hold every law of the kit, gradients and thresholds among them, to the CUDA backend."""
     return _laws(check, "laws", "pixel_parallel atomics")
 
 
-def laws_of_gaussian_parallel_stage(check: Check) -> dict[str, Any]:
+def laws_of_gaussian_parallel_stage(check: StageContext) -> dict[str, Any]:
     """Hold the laws to the other backward kernel, which is not the default."""
     return _laws(check, "laws_of_gaussian_parallel", "gaussian_parallel")
 
 
-def steps_stage(check: Check) -> dict[str, Any]:
+def steps_stage(check: StageContext) -> dict[str, Any]:
     """Compare ten training steps with the CPU's, the bits of two runs, overflows, and short trainings with the CPU's.
 
     And hold single kernels, rows of every place and size, and other readings of the paper, to the CPU.
@@ -56,7 +56,7 @@ def steps_stage(check: Check) -> dict[str, Any]:
     return _pytest(check, "steps", STEPS, *few)
 
 
-def sanitizer_stage(check: Check) -> dict[str, Any]:
+def sanitizer_stage(check: StageContext) -> dict[str, Any]:
     """Run compute-sanitizer over a render, its gradients and fused steps; note where it cannot run."""
     tool = shutil.which("compute-sanitizer")
     if tool is None:
@@ -79,7 +79,7 @@ def sanitizer_stage(check: Check) -> dict[str, Any]:
     return found
 
 
-def _laws(check: Check, name: str, kinds: str) -> dict[str, Any]:
+def _laws(check: StageContext, name: str, kinds: str) -> dict[str, Any]:
     if check.rehearsal:
         # all are collected, few are run
         few = ("-k", LAWS_REHEARSED)
@@ -91,7 +91,7 @@ def _laws(check: Check, name: str, kinds: str) -> dict[str, Any]:
 
 
 def _pytest(
-    check: Check,
+    check: StageContext,
     name: str,
     tests: tuple[str, ...],
     *options: str,

@@ -6,7 +6,7 @@ import importlib.util
 from pathlib import Path
 from typing import Any
 
-from cuda_ext.gpu_check.shared import Check, read_json, skipped
+from cuda_ext.gpu_check.shared import StageContext, read_json, skipped
 
 TRAIN = "from pop_fast.cli import main; raise SystemExit(main())"
 # what a training run is judged by
@@ -15,7 +15,7 @@ _KEPT += ("gpu", "gpu_memory_bytes", "instance_buffers_grown", "photograph_bytes
 _KEPT += ("received_bytes",)
 
 
-def captures_of(check: Check) -> list[Path]:
+def captures_of(check: StageContext) -> list[Path]:
     """List what was brought along to train on, and what was given."""
     packed = sorted((check.packed / "captures").glob("*/")) if check.packed else []
     return [*packed, *check.captures]
@@ -35,7 +35,7 @@ def last_stats(folder: Path) -> dict[str, Any] | None:
     return {**{name: last.get(name) for name in _KEPT}, "seconds_training": last.get("seconds")}
 
 
-def train_stage(check: Check) -> dict[str, Any]:
+def train_stage(check: StageContext) -> dict[str, Any]:
     """Train POP on every capture as `pop train --backend cuda` does; seconds, Gaussians, PSNR, SSIM."""
     captures = captures_of(check)
     if not captures:
@@ -53,7 +53,7 @@ def train_stage(check: Check) -> dict[str, Any]:
     return found
 
 
-def train_one(check: Check, path: Path, limit: float, backend: str = "cuda") -> dict[str, Any]:
+def train_one(check: StageContext, path: Path, limit: float, backend: str = "cuda") -> dict[str, Any]:
     """Train on one capture, or continue with the training of an earlier call at the same commit."""
     folder = check.work / f"{path.name}_{backend}_{check.steps_scaler:g}_{check.commit[:12]}"
     words = ["train", str(path), "--out", str(folder), "--backend", backend]

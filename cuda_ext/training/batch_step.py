@@ -37,7 +37,7 @@ from cuda_ext.arrays import (
     stream_of,
 )
 from cuda_ext.render.capacity import Capacity, Size
-from cuda_ext.train_settings import Collected, Phase, Ranks, StepSettings
+from cuda_ext.train_settings import KernelStatistics, Phase, Ranks, StepSettings
 from cuda_ext.training.resident import ResidentViews
 from cuda_ext.training.step_buffers import FrameBuffers, RowBuffers, Rows, Shared, SplatBuffers
 from cuda_ext.training.step_program import DrawProgram, gaussians, pop_term, regularizers, schedule, update, view_of
@@ -146,7 +146,7 @@ class BatchTrainer:
         own = slice(self._first, last)
         with torch.cuda.device_of(params["means"]):
             waits = params["shN"].shape[1] if self.settings.updates.sh_rest_every > 1 else None
-            self.statistics = Collected.zeros(n, self.device, waits)
+            self.statistics = KernelStatistics.zeros(n, self.device, waits)
             self._whole = [dict(group) for group in (params, m, v)]
             own_params, own_m, own_v = ({key: tensor[own] for key, tensor in group.items()} for group in self._whole)
             own_rows = RowBuffers.make(own_params, own_m, own_v, self.statistics.rows(own))

@@ -13,7 +13,7 @@ from cuda_ext import load
 from cuda_ext.arrays import STEP, Settings, empty, fill, new_state
 from cuda_ext.render.capacity import Size
 from cuda_ext.render.lists import LOWER, TileBuffers, list_tile, splat_struct
-from cuda_ext.train_settings import Collected, StepSettings
+from cuda_ext.train_settings import KernelStatistics, StepSettings
 from cuda_ext.training.resident import ResidentViews
 
 Rows = Mapping[str, Tensor]
@@ -131,13 +131,13 @@ class RowBuffers:
     params: Rows
     m: Rows
     v: Rows
-    statistics: Collected
+    statistics: KernelStatistics
     drawn: SplatBuffers
     pop_sides: Tensor
     pop_sums: Tensor
 
     @classmethod
-    def make(cls, params: Rows, m: Rows, v: Rows, statistics: Collected) -> RowBuffers:
+    def make(cls, params: Rows, m: Rows, v: Rows, statistics: KernelStatistics) -> RowBuffers:
         """Allocate what belongs to the rows but for the statistics."""
         kernels, n, device = load(), len(params["means"]), params["means"].device
         return cls(

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from cuda_ext.arrays import BAD_ROW, N_INSTANCES, NOT_BAD, OVERFLOW, STEP, VIEW
 from cuda_ext.render.capacity import Capacity, Size
-from cuda_ext.train_settings import Collected, Phase, StepSettings
+from cuda_ext.train_settings import KernelStatistics, Phase, StepSettings
 from cuda_ext.training.graphs import Watch, captured
 from cuda_ext.training.resident import ResidentViews
 from cuda_ext.training.step_buffers import FrameBuffers, RowBuffers, Shared
@@ -77,7 +77,7 @@ class FusedTrainer:
         self._capacity.settle(len(params["means"]))
         with torch.cuda.device_of(params["means"]):
             waits = params["shN"].shape[1] if self.settings.updates.sh_rest_every > 1 else None
-            self._rows = RowBuffers.make(params, m, v, Collected.zeros(len(params["means"]), self.device, waits))
+            self._rows = RowBuffers.make(params, m, v, KernelStatistics.zeros(len(params["means"]), self.device, waits))
 
     def run(self, until: int, phase: Phase) -> None:
         """Take steps until the counter stands at `until`, all of one phase.
@@ -131,7 +131,7 @@ class FusedTrainer:
         return self._population.params
 
     @property
-    def statistics(self) -> Collected:
+    def statistics(self) -> KernelStatistics:
         """What density control reads; zeros after `rebind`."""
         return self._population.statistics
 

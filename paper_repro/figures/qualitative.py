@@ -23,7 +23,7 @@ from pop_fast.view.report.source import read_view
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["View", "most_different", "renders_and_photographs"]
+__all__ = ["ComparedView", "most_different", "renders_and_photographs"]
 
 _SCENES: Final = ("truck", "train", "playroom", "bonsai")
 _ROWS: Final = ("pop", "3dgs")
@@ -34,7 +34,7 @@ _BOX: Final = "#E1261C"
 
 
 @dataclass(frozen=True)
-class View:
+class ComparedView:
     """One held-out view of a scene.
 
     Attributes:
@@ -102,7 +102,7 @@ def most_different(one: np.ndarray, other: np.ndarray, side: int) -> tuple[int, 
     return int(x), int(y)
 
 
-def _view(asked: Asked, runs: dict[tuple[str, str], Result], scene: str) -> View | None:
+def _view(asked: Asked, runs: dict[tuple[str, str], Result], scene: str) -> ComparedView | None:
     """Read what both rows have kept of the first held-out view; None where one has not."""
     found: dict[str, Any] = {}
     for row in _ROWS:
@@ -117,10 +117,10 @@ def _view(asked: Asked, runs: dict[tuple[str, str], Result], scene: str) -> View
     side = max(min(photo.shape[:2]) // 4, 1)
     psnr = {row: float(found[row]["psnr"]) for row in _ROWS}
     place = most_different(renders["pop"], renders["3dgs"], side)
-    return View(scene, str(found["pop"]["name"]), photo, renders, psnr, (*place, side))
+    return ComparedView(scene, str(found["pop"]["name"]), photo, renders, psnr, (*place, side))
 
 
-def _drawn(views: Sequence[View], note: str) -> Any:
+def _drawn(views: Sequence[ComparedView], note: str) -> Any:
     width = (TEXT - _SIDE - 2.0 * _GAP) / 3.0
     heights = [min(width * v.photo.shape[0] / v.photo.shape[1], _HIGHEST) for v in views]
     sheet = Sheet(note, _TITLE + sum(heights) + _GAP * len(views), TEXT)
@@ -144,7 +144,7 @@ def _drawn(views: Sequence[View], note: str) -> Any:
     return sheet.figure
 
 
-def _boxed(axes: Axes, view: View, label: str) -> None:
+def _boxed(axes: Axes, view: ComparedView, label: str) -> None:
     from matplotlib.patches import Rectangle
 
     x, y, side = view.box
@@ -161,7 +161,7 @@ def _boxed(axes: Axes, view: View, label: str) -> None:
 
 
 def _enlarged(
-    sheet: Sheet, picture: np.ndarray, view: View, place: tuple[float, float, float, float], width: float
+    sheet: Sheet, picture: np.ndarray, view: ComparedView, place: tuple[float, float, float, float], width: float
 ) -> None:
     """Show the box enlarged: beside a narrow picture, else in that corner of a wide one that is farthest from it."""
     from matplotlib.patches import Rectangle
@@ -190,6 +190,8 @@ def _enlarged(
     axes.add_patch(Rectangle((0, 0), 1, 1, transform=axes.transAxes, fill=False, edgecolor=_BOX, linewidth=1.4))
 
 
-def _table(views: Sequence[View], runs: dict[tuple[str, str], Result]) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
+def _table(
+    views: Sequence[ComparedView], runs: dict[tuple[str, str], Result]
+) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
     rows = [(v.scene, row, v.name, v.psnr[row], *v.box, runs[row, v.scene].run) for v in views for row in _ROWS]
     return ("scene", "row", "view", "psnr", "box_x", "box_y", "box_side", "run"), rows

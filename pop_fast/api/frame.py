@@ -18,7 +18,7 @@ _GATHERED = ("means2d", "depths", "conics", "opacities", "radii")
 
 
 @dataclass(frozen=True)
-class Scene:
+class BatchedScene:
     """Gaussians and cameras, batch dimensions flattened: B scenes, I = B * cameras images.
 
     Attributes:
@@ -67,7 +67,7 @@ class Image:
 
 
 @dataclass(frozen=True)
-class Frame:
+class RasterizationCall:
     """One call of `rasterization`.
 
     Attributes:
@@ -82,7 +82,7 @@ class Frame:
         stages: of the backend.
     """
 
-    scene: Scene
+    scene: BatchedScene
     image_shape: tuple[int, ...]
     settings: ProjectionSettings
     tile_size: int

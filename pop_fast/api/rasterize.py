@@ -18,7 +18,7 @@ from pop_fast.api.checks import (
     check_supported,
     resolved_profile,
 )
-from pop_fast.api.frame import Frame, Scene
+from pop_fast.api.frame import BatchedScene, RasterizationCall
 from pop_fast.api.meta import RenderMeta
 from pop_fast.api.registry import fastest_backend, require_backend
 from pop_fast.errors import PopError
@@ -163,7 +163,7 @@ def rasterization(
     n_images = n_scenes * n_cameras
     rows = {"quats": quats, "scales": scales} if covars is None else {}
     flat = {name: None if t is None else t.reshape(n_scenes, n, t.shape[-1]) for name, t in rows.items()}
-    scene = Scene(
+    scene = BatchedScene(
         means=means.reshape(n_scenes, n, 3),
         quats=flat.get("quats"),
         scales=flat.get("scales"),
@@ -177,7 +177,7 @@ def rasterization(
     )
     settings = ProjectionSettings(Ks, width, height, chosen, rasterize_mode == "antialiased", radius_clip)
     options = (tile_size, sh_degree, render_mode, packed, absgrad)
-    frame = Frame(scene, (*batch, n_cameras), settings, *options, drawing.stages())
+    frame = RasterizationCall(scene, (*batch, n_cameras), settings, *options, drawing.stages())
     return frame.render(backgrounds, dominance, counts)
 
 

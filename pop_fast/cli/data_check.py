@@ -14,7 +14,7 @@ from pop_fast.cli.arguments import parse
 from pop_fast.cli.errors import printable
 
 if TYPE_CHECKING:
-    from pop_fast.data.photo_quality import Finding
+    from pop_fast.data.photo_quality import CaptureFinding
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -62,10 +62,10 @@ def run(argv: Sequence[str]) -> int:
     return 1 if bad else 0
 
 
-def look_over(root: Path, images: str | None = None) -> list[Finding]:
+def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
     """Examine a capture, or photographs alone; all findings in reading order."""
     from pop_fast.data import check_dataset
-    from pop_fast.data.photo_quality import Finding, about_quality, measure_file, number
+    from pop_fast.data.photo_quality import CaptureFinding, about_quality, measure_file, number
     from pop_fast.data.sfm import photo_folder, photographs
     from pop_fast.machine import memory_bytes
 
@@ -76,22 +76,22 @@ def look_over(root: Path, images: str | None = None) -> list[Finding]:
         shown, damage = _each(files, lambda path: measure_file(path, path.relative_to(folder).as_posix()), lambda p: p)
         findings = [
             *check_dataset.about_bare(root, shown),
-            *(Finding("bad", "photographs", problem) for problem in damage),
+            *(CaptureFinding("bad", "photographs", problem) for problem in damage),
         ]
         return [*findings, *about_quality(shown)]
     shots, cloud = listing.shots, listing.cloud
     where = listing.path.relative_to(root).as_posix()
     inside = "" if listing.made_from == where else f" in {where}"
     what = f"{len(shots)} {number(len(shots), 'view', 'views')} from the {listing.made_from}{inside}"
-    findings = [Finding("ok" if len(shots) > 1 else "bad", "poses", what)]
-    findings += [Finding("warn", "poses", note) for note in listing.notes]
+    findings = [CaptureFinding("ok" if len(shots) > 1 else "bad", "poses", what)]
+    findings += [CaptureFinding("warn", "poses", note) for note in listing.notes]
     findings += check_dataset.about_cameras(shots)
     paths = {id(shot): check_dataset.file_of(root, shot) for shot in shots}
     photos, damage = _each(
         shots, lambda shot: check_dataset.read_photo(shot, paths[id(shot)], cloud), lambda shot: paths[id(shot)]
     )
     findings += check_dataset.about_photos(photos, root)
-    findings += [Finding("bad", "photographs", problem) for problem in damage]
+    findings += [CaptureFinding("bad", "photographs", problem) for problem in damage]
     findings += about_quality([photo.shown for photo in photos if photo.shown is not None])
     findings += check_dataset.about_drift(photos)
     findings += check_dataset.about_masks(photos, root)

@@ -89,7 +89,7 @@ _PACKAGES: Final = (
 
 
 @dataclass(frozen=True)
-class Finding:
+class DoctorLine:
     """One line of the examination: a thing, its state, what was found, and how to get it when it is missing."""
 
     name: str
@@ -129,7 +129,7 @@ def run(argv: Sequence[str]) -> int:
     return 1 if missing else 0
 
 
-def packages() -> Iterator[Finding]:
+def packages() -> Iterator[DoctorLine]:
     """Import every package that pop uses, all but torch, whose library is loaded, and tell its version."""
     for distribution, module, purpose, needed in _PACKAGES:
         version = _installed(distribution)
@@ -137,40 +137,40 @@ def packages() -> Iterator[Finding]:
         if fault is not None:
             reason = f"{purpose}; import fails: {fault}" if version else purpose
             fix = f"pip install --force-reinstall {distribution}" if version else f"pip install {distribution}"
-            yield Finding(distribution, "missing" if needed else "off", reason, fix if needed else "")
+            yield DoctorLine(distribution, "missing" if needed else "off", reason, fix if needed else "")
             continue
-        yield Finding(distribution, "ok", f"{version or 'version unknown'}  ({purpose})")
+        yield DoctorLine(distribution, "ok", f"{version or 'version unknown'}  ({purpose})")
 
 
-def machine() -> Iterator[Finding]:
+def machine() -> Iterator[DoctorLine]:
     """Tell processor, cores and memory."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    yield Finding("processor", "ok", f"{machine_name()}, {cores} usable core{'s' if cores != 1 else ''}")
+    yield DoctorLine("processor", "ok", f"{machine_name()}, {cores} usable core{'s' if cores != 1 else ''}")
     total, free = memory_bytes()
     if total:
         low = free < 2e9
         hint = "close other programs, or train with --factor 4" if low else ""
-        yield Finding("memory", "ok", f"{total / 1e9:.1f} GB, {free / 1e9:.1f} GB free", hint)
+        yield DoctorLine("memory", "ok", f"{total / 1e9:.1f} GB, {free / 1e9:.1f} GB free", hint)
 
 
-def torch_build() -> Iterator[Finding]:
+def torch_build() -> Iterator[DoctorLine]:
     """Tell whether torch was built for the CPU alone."""
     with contextlib.suppress(ImportError):
         cuda = cuda_version()
-        yield Finding("torch build", "ok", f"CUDA {cuda}" if cuda else "CPU")
+        yield DoctorLine("torch build", "ok", f"CUDA {cuda}" if cuda else "CPU")
 
 
-def backends() -> Iterator[Finding]:
+def backends() -> Iterator[DoctorLine]:
     """Ask every backend whether it can run here and, if not, why; all of them need torch."""
     for name in backend_names():
         backend = get_backend(name)
         if backend.available():
-            yield Finding(f"backend {name}", "ok", "can run here")
+            yield DoctorLine(f"backend {name}", "ok", "can run here")
         else:
-            yield Finding(f"backend {name}", "off", f"{backend.why_not()} (optional)")
+            yield DoctorLine(f"backend {name}", "off", f"{backend.why_not()} (optional)")
 
 
-def cuda_build() -> Finding:
+def cuda_build() -> DoctorLine:
     """Tell whether `pop build-cuda` has what it needs here, or what it lacks."""
     from cuda_ext.build import BuildError, tools
     from cuda_ext.toolkit import nvcc_version
@@ -179,22 +179,22 @@ def cuda_build() -> Finding:
         nvcc, _ = tools()
         version = ".".join(map(str, nvcc_version(nvcc)))
     except (BuildError, RuntimeError, OSError) as error:
-        return Finding("CUDA build", "off", f"{error} (optional)")
-    return Finding("CUDA build", "ok", f"nvcc {version} at {nvcc}, cmake and nanobind are here")
+        return DoctorLine("CUDA build", "off", f"{error} (optional)")
+    return DoctorLine("CUDA build", "ok", f"nvcc {version} at {nvcc}, cmake and nanobind are here")
 
 
-def lpips(args: Args) -> Iterator[Finding]:
+def lpips(args: Args) -> Iterator[DoctorLine]:
     """Read the LPIPS weights that were given, or say how to give them."""
     given: dict[Literal["vgg", "alex"], tuple[str, ...]] = {"vgg": args.lpips_vgg, "alex": args.lpips_alex}
     if not any(given.values()):
         fix = "give files with --lpips-alex or --lpips-vgg to doctor, train and eval"
-        yield Finding("LPIPS", "off", "no weights given, none are shipped (optional)", fix)
+        yield DoctorLine("LPIPS", "off", "no weights given, none are shipped (optional)", fix)
     for net, files in given.items():
         if files:
             from pop_fast.train.lpips import LPIPS
 
             weights = LPIPS(net, files)
-            yield Finding(f"LPIPS {net}", "ok", ", ".join(f"{k} {v[:12]}" for k, v in weights.sha256.items()))
+            yield DoctorLine(f"LPIPS {net}", "ok", ", ".join(f"{k} {v[:12]}" for k, v in weights.sha256.items()))
 
 
 def _why_not_imported(module: str) -> str | None:

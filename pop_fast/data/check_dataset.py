@@ -15,7 +15,7 @@ from pop_fast.data.colmap import find_model
 from pop_fast.data.exposure_drift import UNEVEN, exposures, levels_at
 from pop_fast.data.load import find_listing
 from pop_fast.data.photo_quality import (
-    Finding,
+    CaptureFinding,
     Shown,
     State,
     about_mixed_sizes,
@@ -93,7 +93,7 @@ def _is_rotated(path: Path) -> bool:
     return as_stored is not None and as_shown is not None and not np.array_equal(as_stored, as_shown)
 
 
-def about_cameras(shots: Sequence[PosedImage]) -> Iterator[Finding]:
+def about_cameras(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:
     """Tell the lens models and sizes."""
     kinds: Counter[str] = Counter()
     for shot in shots:
@@ -103,59 +103,65 @@ def about_cameras(shots: Sequence[PosedImage]) -> Iterator[Finding]:
         else:
             kinds[f"{camera.model_name} {camera.width}x{camera.height}, f = {camera.mean_focal_length():.1f} px"] += 1
     for kind, count in kinds.most_common(8):
-        yield Finding("ok", "cameras", f"{count} x {kind}")
+        yield CaptureFinding("ok", "cameras", f"{count} x {kind}")
     if len(kinds) > 8:
-        yield Finding("ok", "cameras", f"and {len(kinds) - 8} more kinds")
+        yield CaptureFinding("ok", "cameras", f"and {len(kinds) - 8} more kinds")
 
 
-def about_photos(photos: Sequence[Photo], root: Path) -> Iterator[Finding]:
+def about_photos(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding]:
     """Tell which photographs are absent, damaged, of another size, rotated by EXIF, or not listed."""
     sizes = Counter(photo.size for photo in photos if photo.size != (0, 0))
     listed = ", ".join(f"{count} of {w}x{h} px" for (w, h), count in sizes.most_common(4))
-    yield Finding("ok" if sizes else "bad", "photographs", listed or "none could be read")
+    yield CaptureFinding("ok" if sizes else "bad", "photographs", listed or "none could be read")
     absent = [photo for photo in photos if photo.path is None]
     if absent:
         names = ", ".join(photo.shot.name for photo in absent[:3])
         fix = "restore them or train with --missing skip"
-        yield Finding("bad", "photographs", f"{len(absent)} of {len(photos)} listed are absent, first {names}; {fix}")
+        yield CaptureFinding(
+            "bad", "photographs", f"{len(absent)} of {len(photos)} listed are absent, first {names}; {fix}"
+        )
     for photo in photos:
         if photo.path is not None and photo.problem:
-            yield Finding("bad", "photographs", photo.problem)
+            yield CaptureFinding("bad", "photographs", photo.problem)
         elif photo.shot.camera is not None and photo.path is not None:
             yield from _about_size(photo)
     turned = sum(photo.shot.turns > 0 for photo in photos)
     if turned:
-        yield Finding("ok", "EXIF", f"{turned} are stored turned and shown upright, as pop sfm noted")
+        yield CaptureFinding("ok", "EXIF", f"{turned} are stored turned and shown upright, as pop sfm noted")
     rotated = [photo.shot.name for photo in photos if photo.rotated and not photo.shot.turns]
     if rotated:
         note = "the pixels are used as stored, as COLMAP does; poses must have been made so too"
-        yield Finding("warn", "EXIF", f"{len(rotated)} ask to be rotated, first {rotated[0]}: {note}")
+        yield CaptureFinding("warn", "EXIF", f"{len(rotated)} ask to be rotated, first {rotated[0]}: {note}")
     with_alpha = sum(photo.alpha for photo in photos)
     if with_alpha:
-        yield Finding("ok", "alpha", f"{with_alpha} photographs have it: composited over the background, no mask")
+        yield CaptureFinding(
+            "ok", "alpha", f"{with_alpha} photographs have it: composited over the background, no mask"
+        )
     yield from _about_unlisted(photos, root)
 
 
-def _about_size(photo: Photo) -> Iterator[Finding]:
+def _about_size(photo: Photo) -> Iterator[CaptureFinding]:
     camera, (width, height) = photo.shot.camera, photo.size
     if (width, height) == (camera.width, camera.height) or camera.width < 1:
         return
     same_shape = abs(width * camera.height - height * camera.width) <= max(camera.width, camera.height)
     note = "K is scaled to fit" if same_shape else "another shape: cropped or rotated since the poses were made"
     text = f"{photo.shot.name} is {width}x{height} px, its camera {camera.width}x{camera.height}: {note}"
-    yield Finding("ok" if same_shape else "bad", "sizes", text)
+    yield CaptureFinding("ok" if same_shape else "bad", "sizes", text)
 
 
-def _about_unlisted(photos: Sequence[Photo], root: Path) -> Iterator[Finding]:
+def _about_unlisted(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding]:
     used = {photo.path.resolve() for photo in photos if photo.path is not None}
     for folder in sorted({photo.shot.folder for photo in photos}):
         if folder and (root / folder).is_dir():
             spare = [path.name for path in list_images(root / folder) if path.resolve() not in used]
             if spare:
-                yield Finding("warn", "pairing", f"{len(spare)} files in {folder}/ are not listed, first {spare[0]}")
+                yield CaptureFinding(
+                    "warn", "pairing", f"{len(spare)} files in {folder}/ are not listed, first {spare[0]}"
+                )
 
 
-def about_masks(photos: Sequence[Photo], root: Path) -> Iterator[Finding]:
+def about_masks(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding]:
     """Tell how many masks there are and how much they keep; white means keep."""
     folder = root / "masks"
     kept: list[float] = []
@@ -168,22 +174,30 @@ def about_masks(photos: Sequence[Photo], root: Path) -> Iterator[Finding]:
         try:
             kept.append(float(read_mask(path).mean()))
         except CaptureError as error:
-            yield Finding("bad", "masks", str(error))
+            yield CaptureFinding("bad", "masks", str(error))
     if not kept:
         if folder.is_dir():
-            yield Finding("bad", "masks", f"{folder} holds none named as a photograph (<name>.png or <name>.jpg.png)")
+            yield CaptureFinding(
+                "bad", "masks", f"{folder} holds none named as a photograph (<name>.png or <name>.jpg.png)"
+            )
         return
     mean = float(np.mean(kept))
     text = f"{len(kept)} masks keep {100 * mean:.0f} % of the pixels (white = keep)"
-    yield Finding("warn" if mean < 0.35 else "ok", "masks", text + ("; are they inverted?" if mean < 0.35 else ""))
+    yield CaptureFinding(
+        "warn" if mean < 0.35 else "ok", "masks", text + ("; are they inverted?" if mean < 0.35 else "")
+    )
     if lone:
-        yield Finding("warn", "masks", f"{len(lone)} photographs have none, first {lone[0]}: all of their pixels count")
+        yield CaptureFinding(
+            "warn", "masks", f"{len(lone)} photographs have none, first {lone[0]}: all of their pixels count"
+        )
 
 
-def about_points(shots: Iterable[PosedImage], cloud: SparsePoints | None, sample: int = 2000) -> Iterator[Finding]:
+def about_points(
+    shots: Iterable[PosedImage], cloud: SparsePoints | None, sample: int = 2000
+) -> Iterator[CaptureFinding]:
     """Project a sample of the points into every view: poses and points that do not belong together show here."""
     if cloud is None or len(cloud) == 0:
-        yield Finding("warn", "points", "none: training starts from random points in the cameras' view")
+        yield CaptureFinding("warn", "points", "none: training starts from random points in the cameras' view")
         return
     chosen = cloud.xyz[np.random.default_rng(0).permutation(len(cloud))[:sample]]
     shares: dict[str, float] = {}
@@ -197,12 +211,12 @@ def about_points(shots: Iterable[PosedImage], cloud: SparsePoints | None, sample
         shares[shot.name] = float(inside.sum()) / len(chosen)
     blind = [name for name, share in shares.items() if share == 0.0]
     mean = 100.0 * float(np.mean(list(shares.values()) or [0.0]))
-    yield Finding("ok", "points", f"{len(cloud):,}; a view sees {mean:.0f} % of them on average")
+    yield CaptureFinding("ok", "points", f"{len(cloud):,}; a view sees {mean:.0f} % of them on average")
     if blind:
-        yield Finding("warn", "points", f"{len(blind)} views see none, first {blind[0]}: are these poses right?")
+        yield CaptureFinding("warn", "points", f"{len(blind)} views see none, first {blind[0]}: are these poses right?")
 
 
-def about_reprojection(root: Path) -> Iterator[Finding]:
+def about_reprojection(root: Path) -> Iterator[CaptureFinding]:
     """Tell the mean reprojection error of the model's tracks, where it has any."""
     from pop_fast.data.colmap import quiet_colmap
     from pop_fast.data.pinhole import require_colmap
@@ -221,16 +235,16 @@ def about_reprojection(root: Path) -> Iterator[Finding]:
     except Exception as problem:
         words = " ".join(str(problem).split())
         fix = "training does without its tracks; write the model again to have them"
-        yield Finding("warn", "reprojection", f"{model}: COLMAP cannot read its tracks ({words}); {fix}")
+        yield CaptureFinding("warn", "reprojection", f"{model}: COLMAP cannot read its tracks ({words}); {fix}")
         return
     if observations == 0:
-        yield Finding("ok", "reprojection", "the model has no tracks, so its error is unknown")
+        yield CaptureFinding("ok", "reprojection", "the model has no tracks, so its error is unknown")
         return
     state: State = "ok" if error < 2.0 else "warn"
-    yield Finding(state, "reprojection", f"mean error {error:.2f} px over {observations:,} observations")
+    yield CaptureFinding(state, "reprojection", f"mean error {error:.2f} px over {observations:,} observations")
 
 
-def about_drift(photos: Sequence[Photo]) -> Iterator[Finding]:
+def about_drift(photos: Sequence[Photo]) -> Iterator[CaptureFinding]:
     """Tell how much the photographs differ in brightness where they see the same points."""
     known = [photo for photo in photos if photo.levels is not None and photo.shot.seen is not None]
     seen = [photo.shot.seen for photo in known if photo.shot.seen is not None]
@@ -244,20 +258,20 @@ def about_drift(photos: Sequence[Photo]) -> Iterator[Finding]:
     text += "" if uneven is None else f"; a photograph differs by {uneven:.2f} from those taken next to it"
     bad = uneven is not None and uneven > UNEVEN
     fix = "; lock the exposure, or train with --exposure" if bad else ""
-    yield Finding("warn" if bad else "ok", "exposure", text + fix)
+    yield CaptureFinding("warn" if bad else "ok", "exposure", text + fix)
 
 
-def about_memory(photos: Sequence[Photo], cloud: SparsePoints | None, free: int) -> Iterator[Finding]:
+def about_memory(photos: Sequence[Photo], cloud: SparsePoints | None, free: int) -> Iterator[CaptureFinding]:
     """Estimate the memory that photographs take at each factor, and Gaussians in training."""
     pixels = sum(photo.size[0] * photo.size[1] for photo in photos)
     by_factor = ", ".join(f"{3 * pixels / f**2 / 1e6:,.0f} MB at factor {f}" for f in (1, 2, 4, 8))
     too_much = free > 0 and 3 * pixels > 0.7 * free
-    yield Finding("warn" if too_much else "ok", "memory", f"photographs take {by_factor}")
+    yield CaptureFinding("warn" if too_much else "ok", "memory", f"photographs take {by_factor}")
     start = f"; training starts with {len(cloud):,}" if cloud is not None else ""
-    yield Finding("ok", "memory", f"Gaussians take {BYTES_IN_TRAINING:,.0f} MB a million{start}")
+    yield CaptureFinding("ok", "memory", f"Gaussians take {BYTES_IN_TRAINING:,.0f} MB a million{start}")
 
 
-def about_bare(root: Path, shown: Sequence[Shown]) -> Iterator[Finding]:
+def about_bare(root: Path, shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     """Tell what there is where nothing says where the photographs were taken."""
     sound = [one for one in shown if not one.problem]
     enough = len(sound) >= 2
@@ -265,13 +279,13 @@ def about_bare(root: Path, shown: Sequence[Shown]) -> Iterator[Finding]:
         "pop train finds their cameras first, or pop sfm alone" if enough else "a scene needs two or more that overlap"
     )
     count = f"{len(sound)} {number(len(sound), 'photograph', 'photographs')}"
-    yield Finding("ok" if enough else "bad", "poses", f"none yet, {count}: {fix}")
+    yield CaptureFinding("ok" if enough else "bad", "poses", f"none yet, {count}: {fix}")
     sizes = Counter(one.size for one in sound)
     listed = ", ".join(f"{count} of {w}x{h} px" for (w, h), count in sizes.most_common(4))
-    yield Finding("ok" if sizes else "bad", "photographs", listed or "none could be read")
+    yield CaptureFinding("ok" if sizes else "bad", "photographs", listed or "none could be read")
     for one in shown:
         if one.problem:
-            yield Finding("bad", "photographs", one.problem)
+            yield CaptureFinding("bad", "photographs", one.problem)
     yield from about_number(len(sound))
     yield from about_use(sound)
     mixed = about_mixed_sizes(sound)
@@ -279,7 +293,7 @@ def about_bare(root: Path, shown: Sequence[Shown]) -> Iterator[Finding]:
         yield mixed
     left = unreadable_photographs(photo_folder(root))
     if left:
-        yield Finding("warn", "photographs", left)
+        yield CaptureFinding("warn", "photographs", left)
     turned = sum(one.exif.orientation in (3, 6, 8) for one in sound)
     if turned:
-        yield Finding("ok", "EXIF", f"{turned} are stored turned; what is trained on is upright")
+        yield CaptureFinding("ok", "EXIF", f"{turned} are stored turned; what is trained on is upright")

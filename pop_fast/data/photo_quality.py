@@ -30,7 +30,7 @@ def number(count: int, one: str, more: str) -> str:
 
 
 @dataclass(frozen=True)
-class Finding:
+class CaptureFinding:
     """One line: how bad, about what, and what was found."""
 
     state: State
@@ -148,7 +148,7 @@ def _shrunk(gray: np.ndarray) -> np.ndarray:
     return gray if scale >= 1.0 else cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
 
 
-def about_quality(shown: Sequence[Shown]) -> Iterator[Finding]:
+def about_quality(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     """Tell what may harm the search for cameras or the training: blur, exposure, copies, another lens."""
     sound = [one for one in shown if not one.problem]
     if len(sound) < 2:
@@ -159,18 +159,18 @@ def about_quality(shown: Sequence[Shown]) -> Iterator[Finding]:
     yield from _about_copies(sound)
 
 
-def about_number(count: int) -> Iterator[Finding]:
+def about_number(count: int) -> Iterator[CaptureFinding]:
     """Tell that there are few photographs."""
     if count < _FEW:
         fix = f"{_FEW} to 200 that overlap by two thirds show a scene from all sides"
-        yield Finding("warn", "photographs", f"{count} {number(count, 'is', 'are')} few; {fix}")
+        yield CaptureFinding("warn", "photographs", f"{count} {number(count, 'is', 'are')} few; {fix}")
 
 
-def _about_camera(shown: Sequence[Shown]) -> Iterator[Finding]:
+def _about_camera(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     kinds = Counter(one.exif.camera for one in shown if one.exif.camera)
     lenses = Counter(round(one.exif.focal, 1) for one in shown if one.exif.focal)
     if not kinds and not lenses:
-        yield Finding("ok", "EXIF", "no camera noted its lens or its exposure")
+        yield CaptureFinding("ok", "EXIF", "no camera noted its lens or its exposure")
         return
     named = ", ".join(f"{count} x {kind}" for kind, count in kinds.most_common(3))
     focal = ", ".join(f"{mm:g} mm" for mm, _ in lenses.most_common(4))
@@ -178,18 +178,18 @@ def _about_camera(shown: Sequence[Shown]) -> Iterator[Finding]:
     without = [one.name for one in shown if not one.exif.focal]
     if without:
         fix = "where photographs were edited, use the originals: cameras are found more surely from a known lens"
-        yield Finding(
+        yield CaptureFinding(
             "warn",
             "EXIF",
             f"{len(without)} {number(len(without), 'has', 'have')} no focal length, {some(without)}; {fix}",
         )
     if len(kinds) > 1 or len(lenses) > 1:
-        yield Finding("warn", "EXIF", f"{text}: several lenses or zooms; one fixed lens is placed more surely")
+        yield CaptureFinding("warn", "EXIF", f"{text}: several lenses or zooms; one fixed lens is placed more surely")
     else:
-        yield Finding("ok", "EXIF", text)
+        yield CaptureFinding("ok", "EXIF", text)
 
 
-def _about_blur(shown: Sequence[Shown]) -> Iterator[Finding]:
+def _about_blur(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     values = np.array([one.sharpness for one in shown])
     # by name, photographs of one place follow one another
     around = [np.median(values[max(i - _NEIGHBOURS, 0) : i + _NEIGHBOURS + 1]) for i in range(len(values))]
@@ -197,17 +197,17 @@ def _about_blur(shown: Sequence[Shown]) -> Iterator[Finding]:
     if blurred:
         fix = "out of focus or shaken: leave them out"
         what = f"{len(blurred)} {number(len(blurred), 'is', 'are')} far less sharp than those around them"
-        yield Finding("warn", "blur", f"{what}, {some(blurred)}; {fix}")
+        yield CaptureFinding("warn", "blur", f"{what}, {some(blurred)}; {fix}")
     else:
-        yield Finding("ok", "blur", "all about as sharp as those around them")
+        yield CaptureFinding("ok", "blur", "all about as sharp as those around them")
 
 
-def _about_exposure(shown: Sequence[Shown]) -> Iterator[Finding]:
+def _about_exposure(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     dark = [one.name for one in shown if one.dark > _CLIPPED]
     bright = [one.name for one in shown if one.bright > _CLIPPED]
     for names, what in ((dark, "black"), (bright, "white")):
         if names:
-            yield Finding(
+            yield CaptureFinding(
                 "warn",
                 "exposure",
                 f"{len(names)} {number(len(names), 'is', 'are')} over a quarter pure {what}, {some(names)}",
@@ -215,11 +215,11 @@ def _about_exposure(shown: Sequence[Shown]) -> Iterator[Finding]:
     stops = exposure_stops([one.exif for one in shown])
     fix = "lock the exposure, or train with --exposure: without it training takes one brightness for all"
     if stops is not None and stops > DRIFT_STOPS:
-        yield Finding("warn", "exposure", f"exposures differ by {stops:.1f} stops; {fix}")
+        yield CaptureFinding("warn", "exposure", f"exposures differ by {stops:.1f} stops; {fix}")
     elif not dark and not bright:
         levels = [one.brightness for one in shown]
         known = "" if stops is None else f"within {stops:.1f} stops, "
-        yield Finding("ok", "exposure", f"{known}mean brightness {min(levels):.0f} to {max(levels):.0f} of 255")
+        yield CaptureFinding("ok", "exposure", f"{known}mean brightness {min(levels):.0f} to {max(levels):.0f} of 255")
 
 
 def exposure_stops(noted: Sequence[Exif]) -> float | None:
@@ -228,11 +228,13 @@ def exposure_stops(noted: Sequence[Exif]) -> float | None:
     return float(np.log2(max(taken) / min(taken))) if taken and len(taken) == len(noted) else None
 
 
-def _about_copies(shown: Sequence[Shown]) -> Iterator[Finding]:
+def _about_copies(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     digests = Counter(one.digest for one in shown)
     copies = [one.name for one in shown if digests[one.digest] > 1]
     if copies:
-        yield Finding("warn", "duplicates", f"{len(copies)} are the same file more than once, {some(copies)}; keep one")
+        yield CaptureFinding(
+            "warn", "duplicates", f"{len(copies)} are the same file more than once, {some(copies)}; keep one"
+        )
     thumbs = np.stack([one.thumb for one in shown])
     alike: list[str] = []
     for i in range(len(shown) - 1):
@@ -241,13 +243,13 @@ def _about_copies(shown: Sequence[Shown]) -> Iterator[Finding]:
         alike += [f"{shown[i].name} and {other.name}" for other in others if other.digest != shown[i].digest]
     if alike:
         fix = "they add nothing, from the same place"
-        yield Finding(
+        yield CaptureFinding(
             "warn",
             "duplicates",
             f"{len(alike)} {number(len(alike), 'pair looks', 'pairs look')} the same, {some(alike)}; {fix}",
         )
     if not copies and not alike:
-        yield Finding("ok", "duplicates", "none")
+        yield CaptureFinding("ok", "duplicates", "none")
 
 
 def some(names: Sequence[str]) -> str:
@@ -268,7 +270,7 @@ _RATIO: Final = 0.8
 _SHARED: Final = 12
 
 
-def about_use(shown: Sequence[Shown]) -> Iterator[Finding]:
+def about_use(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     """Tell what stands against finding cameras: photographs that show nothing, or nothing in common.
 
     Args:
@@ -280,17 +282,17 @@ def about_use(shown: Sequence[Shown]) -> Iterator[Finding]:
         are = number(len(plain), "is of one colour all over", "are of one colour all over")
         text = f"{len(plain)} of {len(shown)} photographs {are} (black, white or covered), {some(plain)}"
         if left < 2:
-            yield Finding("bad", "photographs", f"no cameras could be found: {text}; {FIX}")
+            yield CaptureFinding("bad", "photographs", f"no cameras could be found: {text}; {FIX}")
             return
-        yield Finding("warn", "photographs", f"{text}; leave {number(len(plain), 'it', 'them')} out")
+        yield CaptureFinding("warn", "photographs", f"{text}; leave {number(len(plain), 'it', 'them')} out")
     useful = [one for one in shown if float(one.thumb.std()) >= _PLAIN]
     comparable = 2 <= len(useful) <= _COMPARED and all(len(one.features[0]) >= _ENOUGH for one in useful)
     if comparable and not any(_share_something(one, other) for one, other in combinations(useful, 2)):
         text = f"no two of the {len(useful)} photographs show the same thing"
-        yield Finding("bad", "photographs", f"no cameras could be found: {text}; {FIX}")
+        yield CaptureFinding("bad", "photographs", f"no cameras could be found: {text}; {FIX}")
 
 
-def about_mixed_sizes(shown: Sequence[Shown]) -> Finding | None:
+def about_mixed_sizes(shown: Sequence[Shown]) -> CaptureFinding | None:
     """Tell that photographs of several sizes are taken to be of several cameras; None where they are of one."""
     sizes = Counter(one.size for one in shown)
     if len(sizes) < 2:
@@ -298,7 +300,7 @@ def about_mixed_sizes(shown: Sequence[Shown]) -> Finding | None:
     listed = ", ".join(f"{count} of {w}x{h} px" for (w, h), count in sizes.most_common(3))
     more = f" and {len(sizes) - 3} more" if len(sizes) > 3 else ""
     text = f"mixed cameras: the photographs have {len(sizes)} sizes ({listed}{more}), and each is taken as another lens"
-    return Finding("warn", "cameras", f"{text}; one camera, not zoomed or cropped, is placed more surely")
+    return CaptureFinding("warn", "cameras", f"{text}; one camera, not zoomed or cropped, is placed more surely")
 
 
 def _share_something(one: Shown, other: Shown) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 from pop_fast.data.capture import Progress
 from pop_fast.data.colmap import quiet_colmap
 from pop_fast.data.pinhole import require_colmap
-from pop_fast.demo.scene import Scene, make_scene
+from pop_fast.demo.scene import DemoScene, make_scene
 from pop_fast.demo.tracer import first_hits, render_view
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import check_folder, folder_atomically
@@ -109,7 +109,7 @@ def _orbit(generator: np.random.Generator, views: int) -> np.ndarray:
 
 
 def _photograph(
-    scene: Scene, viewmats: np.ndarray, K: np.ndarray, size: tuple[int, int], progress: Progress | None
+    scene: DemoScene, viewmats: np.ndarray, K: np.ndarray, size: tuple[int, int], progress: Progress | None
 ) -> list[np.ndarray]:
     photographs: list[np.ndarray] = []
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
@@ -131,7 +131,7 @@ class _Survey:
 
 
 def _survey(
-    scene: Scene, viewmats: np.ndarray, K: np.ndarray, photographs: list[np.ndarray], generator: np.random.Generator
+    scene: DemoScene, viewmats: np.ndarray, K: np.ndarray, photographs: list[np.ndarray], generator: np.random.Generator
 ) -> _Survey:
     """Pick points of visible surfaces, find the cameras that see them, and add a matcher's noise."""
     points = np.concatenate(
@@ -169,7 +169,7 @@ def _project(viewmat: np.ndarray, K: np.ndarray, points: np.ndarray) -> np.ndarr
 
 
 def _candidates(
-    scene: Scene, viewmat: np.ndarray, K: np.ndarray, photograph: np.ndarray, generator: np.random.Generator
+    scene: DemoScene, viewmat: np.ndarray, K: np.ndarray, photograph: np.ndarray, generator: np.random.Generator
 ) -> np.ndarray:
     """Draw pixels of a photograph, textured ones rather than smooth ones, and find the surfaces there. [<=M, 3]"""
     gray = photograph.mean(axis=2)
@@ -186,7 +186,7 @@ def _candidates(
     return (center[:, None] + t[hit] * directions[:, hit]).T
 
 
-def _sees(scene: Scene, viewmat: np.ndarray, points: np.ndarray) -> np.ndarray:
+def _sees(scene: DemoScene, viewmat: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Tell which points nothing hides from a camera. bool [P]"""
     center = -viewmat[:3, :3].T @ viewmat[:3, 3]
     away = points - center

@@ -14,13 +14,13 @@ import numpy as np
 
 from pop_fast.demo.shapes import Ball, Box, Frustum, Paint, Shape, Torus
 
-__all__ = ["Scene", "make_scene"]
+__all__ = ["DemoScene", "make_scene"]
 
 _TERRACE = 2.7
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class DemoScene:
     """Objects on a ground at z = 0, and the light.
 
     Attributes:
@@ -183,7 +183,7 @@ def _sprinkles(generator: np.random.Generator) -> np.ndarray:
     return np.where(generator.random((30, 64)) < 0.22, grid, np.float32(-1.0))
 
 
-def make_scene(seed: int) -> Scene:
+def make_scene(seed: int) -> DemoScene:
     """Set the scene: the same seed gives the same scene, another one other textures, turns and places.
 
     Args:
@@ -237,4 +237,4 @@ def make_scene(seed: int) -> Scene:
         shapes.append(Frustum(pole, partial(_bands, "f4f1ea", color, 0.12), bottom=0.022, top=0.022, height=1.05))
         shapes.append(Ball((pole[0], pole[1], 1.12), partial(_plain, color), 0.0, 0.6, 80.0, 0.05, radius=0.09))
     sun = np.array([0.52, -0.38, 0.77], np.float32)
-    return Scene(tuple(shapes), partial(_ground, clouds, fine, hues.astype(np.float32)), sun / np.linalg.norm(sun))
+    return DemoScene(tuple(shapes), partial(_ground, clouds, fine, hues.astype(np.float32)), sun / np.linalg.norm(sun))

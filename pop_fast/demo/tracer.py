@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pop_fast.demo.scene import Scene
+from pop_fast.demo.scene import DemoScene
 from pop_fast.demo.shapes import Shape, dot
 
 __all__ = ["first_hits", "render_view"]
@@ -26,7 +26,7 @@ _WORLD = 1000.0
 _EXPOSURE = 0.75
 
 
-def render_view(scene: Scene, viewmat: np.ndarray, K: np.ndarray, width: int, height: int) -> np.ndarray:
+def render_view(scene: DemoScene, viewmat: np.ndarray, K: np.ndarray, width: int, height: int) -> np.ndarray:
     """Take a picture.
 
     Args:
@@ -47,7 +47,7 @@ def render_view(scene: Scene, viewmat: np.ndarray, K: np.ndarray, width: int, he
     return np.rint(255.0 * image).astype(np.uint8)
 
 
-def first_hits(scene: Scene, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def first_hits(scene: DemoScene, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find what rays from one point meet first.
 
     Args:
@@ -86,7 +86,7 @@ def _may_meet(shape: Shape, origin: np.ndarray, directions: np.ndarray) -> bool:
     return bool(angle < spread + np.arcsin(shape.bound / distance) + 1e-3)
 
 
-def _patch(scene: Scene, viewmat: np.ndarray, K: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+def _patch(scene: DemoScene, viewmat: np.ndarray, K: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Trace a patch with _GRID^2 rays a pixel and average what the eye would see. float32 [h, w, 3] in [0, 1]"""
     sub = (np.arange(_GRID) + 0.5) / _GRID
     y, x, sy, sx = np.meshgrid(rows, columns, sub, sub, indexing="ij")
@@ -107,7 +107,7 @@ def _sky(directions: np.ndarray) -> np.ndarray:
     return _HORIZON + (_ZENITH - _HORIZON) * np.sqrt(height)
 
 
-def _shade(scene: Scene, origin: np.ndarray, directions: np.ndarray, sample: np.ndarray) -> np.ndarray:
+def _shade(scene: DemoScene, origin: np.ndarray, directions: np.ndarray, sample: np.ndarray) -> np.ndarray:
     """Find the light that arrives along rays. float32 [3, M]"""
     t, which = first_hits(scene, origin, directions)
     color = _sky(directions)
@@ -162,7 +162,7 @@ def _gleaming(d: np.ndarray, n: np.ndarray, light: np.ndarray, lit: np.ndarray, 
     return out
 
 
-def _sun_directions(scene: Scene) -> np.ndarray:
+def _sun_directions(scene: DemoScene) -> np.ndarray:
     """Nine points of the sun's disc. float32 [3, 9]"""
     side = np.cross(scene.sun, [0.0, 0.0, 1.0])
     side /= np.linalg.norm(side)
@@ -173,7 +173,7 @@ def _sun_directions(scene: Scene) -> np.ndarray:
     return (points / np.linalg.norm(points, axis=0)).astype(np.float32)
 
 
-def _unshadowed(scene: Scene, points: np.ndarray, light: np.ndarray) -> np.ndarray:
+def _unshadowed(scene: DemoScene, points: np.ndarray, light: np.ndarray) -> np.ndarray:
     """Tell which points see their point of the sun. bool [M]"""
     clear = np.ones(points.shape[1], bool)
     if len(clear) == 0:
@@ -193,7 +193,7 @@ def _unshadowed(scene: Scene, points: np.ndarray, light: np.ndarray) -> np.ndarr
     return clear
 
 
-def _openness(scene: Scene, points: np.ndarray, normals: np.ndarray, which: np.ndarray) -> np.ndarray:
+def _openness(scene: DemoScene, points: np.ndarray, normals: np.ndarray, which: np.ndarray) -> np.ndarray:
     """Estimate how much of the sky a point sees: every object hides what a ball of its size would. float32 [M]"""
     open_sky = np.ones(points.shape[1], np.float32)
     middle = points.mean(axis=1)

@@ -21,7 +21,7 @@ from cuda_ext.gpu_check import tests as gpu_check_tests
 from cuda_ext.gpu_check import training as gpu_check_training
 from cuda_ext.gpu_check.command import commit_of, main
 from cuda_ext.gpu_check.outcomes import outcomes
-from cuda_ext.gpu_check.shared import MARGIN, Budget, Check, Command, Share, first_line, run, write_json
+from cuda_ext.gpu_check.shared import MARGIN, Budget, Command, Share, StageContext, first_line, run, write_json
 from cuda_ext.gpu_check.stages import JOBS, SHARES, STAGES, wheels_stage
 from cuda_ext.gpu_check.training import train_one
 from pop_fast.cli import main as pop
@@ -30,10 +30,10 @@ from tests.app.captures import colmap_capture
 from tests.cuda.bare_node import stand_in_gsplat
 
 
-def check(folder: Path, **changes: object) -> Check:
+def check(folder: Path, **changes: object) -> StageContext:
     shared = {"seconds": 60.0, "out": folder, "work": folder / "work", "log": folder / "log", "packed": None}
     shared |= {"captures": (), "steps_scaler": 1.0, "commit": "c0ffee", "rehearsal": False, "note": lambda found: None}
-    return Check(**{**shared, **changes})
+    return StageContext(**{**shared, **changes})
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from paper_repro import status
-from paper_repro.checks import Check, checks, places
+from paper_repro.checks import Statement, checks, places
 from paper_repro.paper import PAPER, load, paper
 from paper_repro.results import RESULTS, SCALES, Result, read_all
 from paper_repro.status import HERE, files, status_table, with_part
@@ -182,7 +182,7 @@ CHECKS = checks(paper())
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.says)
-def test_it_holds_or_fails_for_a_known_reason(check: Check) -> None:
+def test_it_holds_or_fails_for_a_known_reason(check: Statement) -> None:
     assert check.holds == (check.known == ""), check.found
 
 
