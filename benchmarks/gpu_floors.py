@@ -1,8 +1,9 @@
 """What each kernel of a training step has to do at least: bytes, instructions, and the time that a card needs for them.
 
 The blend's instructions are counted in its machine code for sm_90 (`results/sass.json`), the loss's are estimated from
-its loops there; a floor is the larger of the time for the bytes at the bandwidth that this card copies with and that
-for the instructions at its full issue rate.
+its loops there. A floor is the largest of four times: for the bytes, at the bandwidth that this card copies with; for
+the instructions, at its full issue rate; for comparisons, selections and integers of the blend, which go through a pipe
+of half that rate; and for the longest list, whose warp issues one instruction a cycle when the others are done.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import shutil
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -19,6 +21,7 @@ LANES_PER_SM = 128
 ROW = 48  # bytes of a packed splat, and of a gradient slot
 PARAMETERS = 59  # floats of a Gaussian
 GEOMETRY = 11  # of these, what a culled Gaussian is read for
+HALF_RATE = ("compare", "integer")  # classes of instructions, by the tables of arithmetic throughput for sm_90
 LANE_PIXELS = 4  # pixels that a lane of the blend evaluates a splat at
 SASS = json.loads((Path(__file__).resolve().parent / "results" / "sass.json").read_text(encoding="utf-8"))
 # what a POP step launches
@@ -36,6 +39,7 @@ class Loads:
         evaluated: pairs of a list entry and a pixel up to where the last pixel of the tile stops.
         contributing: of these, those that are blended.
         pixels: of the image.
+        longest: entries of one tile's list up to where its last pixel stops, at most.
     """
 
     gaussians: int
@@ -44,14 +48,16 @@ class Loads:
     evaluated: int
     contributing: int
     pixels: int
+    longest: int = 0
 
 
 @dataclass(frozen=True)
 class Card:
-    """What a card can do: bytes copied and lane instructions issued, per second."""
+    """What a card can do: bytes copied and lane instructions issued, per second, and its processors' clock, Hz."""
 
     bytes_per_s: float
     instructions_per_s: float
+    clock_hz: float
 
 
 def measured_card(device: torch.device, copied: int = 1 << 30) -> Card:
@@ -66,8 +72,8 @@ def measured_card(device: torch.device, copied: int = 1 << 30) -> Card:
         end.record()
         end.synchronize()
         best = min(best, start.elapsed_time(end))
-    lanes = torch.cuda.get_device_properties(device).multi_processor_count * LANES_PER_SM
-    return Card(2e3 * copied / best, lanes * _clock_hz())
+    lanes, clock = torch.cuda.get_device_properties(device).multi_processor_count * LANES_PER_SM, _clock_hz()
+    return Card(2e3 * copied / best, lanes * clock, clock)
 
 
 def _clock_hz() -> float:
@@ -80,11 +86,17 @@ def _clock_hz() -> float:
     return 1e6 * float(printed[0]) if printed else 1e9
 
 
-def instructions_a_pair(kernel: str, arch: str = "sm_90") -> float:
-    """Return what a lane issues for one splat at one pixel, by the count of the kernel's loop over records."""
+def instructions_a_record(kernel: str, arch: str = "sm_90") -> tuple[float, float]:
+    """Return what a warp issues for a record, by the count of the kernel's loop, and how much of it at half rate."""
     (entry,) = (entry for entry in SASS["kernels"] if (entry["kernel"], entry["arch"]) == (kernel, arch))
     (loop,) = (loop for loop in entry["loops"] if loop["per"] == "record")
-    return loop["all"] / loop["iterations"] / LANE_PIXELS
+    half = sum(loop["always_by_class"].get(name, 0) for name in HALF_RATE)
+    return loop["all"] / loop["iterations"], half / loop["iterations"]
+
+
+def instructions_a_pair(kernel: str) -> float:
+    """Return what a lane issues for one splat at one pixel."""
+    return instructions_a_record(kernel)[0] / LANE_PIXELS
 
 
 def work(loads: Loads) -> dict[str, tuple[float, float]]:
@@ -108,13 +120,22 @@ def work(loads: Loads) -> dict[str, tuple[float, float]]:
     }
 
 
-def floors(loads: Loads, card: Card) -> dict[str, dict[str, float]]:
-    """Return bytes, instructions and the floor in ms of every kernel."""
-    return {
-        name: {
+def floors(loads: Loads, card: Card) -> dict[str, dict[str, Any]]:
+    """Return bytes, instructions, the floor in ms and what it is of, for every kernel."""
+    blends = {"blend_forward": FORWARD, "blend_backward": BACKWARD}
+    found: dict[str, dict[str, Any]] = {}
+    for name, (moved, issued) in work(loads).items():
+        times = {"memory": moved / card.bytes_per_s, "issue": issued / card.instructions_per_s}
+        if name in blends:
+            record, half = instructions_a_record(blends[name])
+            times["half rate"] = 2.0 * half / LANE_PIXELS * loads.evaluated / card.instructions_per_s
+            times["longest list"] = record * loads.longest / card.clock_hz
+        bound = max(times, key=lambda name: times[name])
+        found[name] = {
             "bytes": float(moved),
             "instructions": issued,
-            "floor_ms": 1e3 * max(moved / card.bytes_per_s, issued / card.instructions_per_s),
+            "times_ms": {name: 1e3 * seconds for name, seconds in times.items()},
+            "bound": bound,
+            "floor_ms": 1e3 * times[bound],
         }
-        for name, (moved, issued) in work(loads).items()
-    }
+    return found

@@ -86,6 +86,7 @@ def step_loads(trainer: FusedTrainer) -> Loads:
         int(longest.long().sum()) * 16 * 8,
         int(stats["n_blended"].long().sum()),
         width * height,
+        int(longest.max()),
     )
 
 

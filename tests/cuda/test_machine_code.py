@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -144,9 +145,18 @@ def test_the_notes_hold_what_the_counts_give(monkeypatch: pytest.MonkeyPatch) ->
     assert gpu_predictions.main(["--check"]) == 0
     # twice the issue rate halves what is bound by it
     slow = gpu_predictions.floors(gpu_predictions.CASE, gpu_predictions.H200)
-    twice = gpu_predictions.Card(gpu_predictions.H200.bytes_per_s, 2.0 * gpu_predictions.H200.instructions_per_s)
-    fast = gpu_predictions.floors(gpu_predictions.CASE, twice)
+    card, case = gpu_predictions.H200, gpu_predictions.CASE
+    fast = gpu_predictions.floors(case, replace(card, instructions_per_s=2.0 * card.instructions_per_s))
     assert fast["blend_backward"]["floor_ms"] == pytest.approx(slow["blend_backward"]["floor_ms"] / 2.0)
+    # a list that is long enough bounds the blend whatever the others are
+    long = gpu_predictions.floors(replace(case, longest=50_000), card)
+    assert (slow["blend_forward"]["bound"], long["blend_forward"]["bound"]) == ("issue", "longest list")
+    again = gpu_predictions.floors(replace(case, longest=100_000), card)
+    assert again["blend_forward"]["floor_ms"] == pytest.approx(2.0 * long["blend_forward"]["floor_ms"])
+    # what goes through the half-rate pipe is a part of what is issued
+    for name in ("blend_forward", "blend_backward"):
+        times = slow[name]["times_ms"]
+        assert 0.5 * times["half rate"] < times["issue"]
 
 
 @pytest.mark.slow
