@@ -126,6 +126,7 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, nargs="+", default=[42, 43, 44])
     parser.add_argument("--json", type=Path, required=True, help="keep the runs here, and go on from those in it")
     parser.add_argument("--write", action="store_true", help="put the tables into benchmarks/NOTES.md")
+    parser.add_argument("--check", action="store_true", help="exit with 1 where benchmarks/NOTES.md has others")
     args = parser.parse_args(words)
     kept: dict[str, Any] = read_json(args.json) or {"machine": machine(), "runs": {}}
     if args.capture is not None:
@@ -138,10 +139,15 @@ def main(words: list[str] | None = None) -> int:
                     done[kind] = curve(kind, capture, args.capture, seed)
                     write_json(args.json, kept)
     text = "\n".join([*ends_table(kept["runs"]), "", *curve_table(kept["runs"])])
-    print(text)
+    notes = Path(__file__).resolve().parent / "NOTES.md"
+    before = notes.read_text(encoding="utf-8")
+    after = with_table(before, "quick", text)
+    if args.check and after != before:
+        print("NOTES.md: the tables of preset quick are not what was measured; run quick_curve.py --json FILE --write")
+        return 1
     if args.write:
-        notes = Path(__file__).resolve().parent / "NOTES.md"
-        notes.write_text(with_table(notes.read_text(encoding="utf-8"), "quick", text), encoding="utf-8")
+        notes.write_text(after, encoding="utf-8")
+    print(text)
     return 0
 
 

@@ -140,8 +140,19 @@ def test_exposures_that_were_learned_are_no_fault_and_ask_for_nothing() -> None:
         assert (about.kind, bool(about.next)) == (kind, not learned)
         assert "-0.50 (a) to +0.50 stops (b)" in about.text
         assert "30.60 dB instead of 29.50" in about.text
-    even = verdict({}, replace(GOOD, exposures_learned=True), None)
-    assert not any("Held-out views have none" in one.text for one in even)
+
+
+def test_held_out_views_without_an_exposure_of_their_own_are_judged_after_scaling() -> None:
+    measured = {"train_psnr": 27.0, "held_out_psnr": 16.5, "matched_psnr": 25.5, "held_out": {"a": 25.0, "b": 26.0}}
+    plain, learned = (verdict({}, replace(GOOD, **measured, exposures_learned=on), None) for on in (False, True))
+    kinds = [{one.about: one.kind for one in found} for found in (plain, learned)]
+    assert (kinds[0]["Quality"], kinds[0]["Overfitting"]) == ("bad", "bad")
+    assert (kinds[1]["Quality"], kinds[1]["Overfitting"]) == ("good", "good")
+    assert "25.50 dB on average. Each was scaled to its photograph's brightness" in learned[0].text
+    assert "16.50 dB as they are" in learned[0].text
+    fell = ([700.0, 3000.0], [20.2, 16.7])
+    told = [verdict({}, replace(GOOD, **measured, exposures_learned=on), fell) for on in (False, True)]
+    assert ["Course" in {one.about for one in found} for found in told] == [True, False]
 
 
 def test_no_two_findings_send_to_schedules_of_two_lengths() -> None:

@@ -60,7 +60,7 @@ class Checks:
         train_psnr: mean over the training views that were rendered, dB.
         train_measured: how many these are.
         held_out_psnr: mean over the held-out views, dB; None where there are none.
-        held_out: of each of these views, dB.
+        held_out: of each of these views, as `judged_psnr` takes them, dB.
         matched_psnr: the mean after each channel of each render was scaled to its photograph's brightness, dB.
         neighbour_degrees: median over the training cameras of the angle to the nearest other one, seen from the point
             that they look at.
@@ -85,6 +85,11 @@ class Checks:
     orbit_floaters: Mapping[str, float] = field(default_factory=dict)
     steps: int | None = None
     exposures_learned: bool = False
+
+    @property
+    def judged_psnr(self) -> float | None:
+        """What held-out views are judged by: after scaling where exposures were learned, of which these have none."""
+        return self.matched_psnr if self.exposures_learned else self.held_out_psnr
 
 
 def write_checks(
@@ -127,6 +132,8 @@ def write_checks(
                 _keep_picture(results, stem, view, layers)
             depth = np.where(layers.alpha >= _SEEN, layers.depth / capture.world_scale, np.nan).astype(np.float32)
             results.write_arrays(f"depth_step{step}_{i:04d}", name=view.name, depth=fit(depth, nearest=True))
+    matched = {view.name: _psnr(view, _matched(view, seen[view.name].image)) for view in test}
+    exposures = any("exposure" in found for found in learned.values())
     # random points say nothing of where things are
     known = _RANDOM not in capture.source
     turn = orbit_views(train)
@@ -135,14 +142,14 @@ def write_checks(
         train_psnr=float(np.mean([_psnr(view, _exposed(seen[view.name].image, view, learned)) for view in some])),
         train_measured=len(some),
         held_out_psnr=_mean(list(held_out.values())),
-        held_out=held_out,
-        matched_psnr=_mean([_psnr(view, _matched(view, seen[view.name].image)) for view in test]),
+        held_out=matched if exposures else held_out,
+        matched_psnr=_mean(list(matched.values())),
         neighbour_degrees=neighbour_degrees(np.stack([view.viewmat for view in train])),
         stops={view.name: stops_between(*_kept(view, seen[view.name].image)) for view in (*some, *test)},
         floaters=_floaters(capture, test or some, params, looked) if known else {},
         orbit_floaters=_floaters(capture, turn, params, looked) if known else {},
         steps=step + 1,
-        exposures_learned=any("exposure" in found for found in learned.values()),
+        exposures_learned=exposures,
     )
     text = json.dumps(asdict(checks), indent=2) + "\n"
     target = folder / "report_data" / f"checks_step{step}.json"

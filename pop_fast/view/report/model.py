@@ -72,10 +72,12 @@ def verdict(
         held_out: steps and PSNR of the held-out views during the run, or None.
     """
     # what was measured last: of a run that was stopped, statistics are of an earlier step
-    psnr = stats.get("psnr") if checks is None else checks.held_out_psnr
-    found = list(_quality(psnr, {} if checks is None else checks.held_out))
-    fewer = _fewer_steps(held_out)
-    found += _course(held_out, fewer)
+    psnr = stats.get("psnr") if checks is None else checks.judged_psnr
+    found = list(_quality(psnr, checks))
+    # while exposures are learned, measurements without them fall for another reason
+    course = None if checks is not None and checks.exposures_learned else held_out
+    fewer = _fewer_steps(course)
+    found += _course(course, fewer)
     if checks is not None:
         found += [
             *_unfitting(checks),
@@ -87,17 +89,22 @@ def verdict(
     return found
 
 
-def _quality(psnr: float | None, by_view: Mapping[str, float]) -> Iterator[Finding]:
+def _quality(psnr: float | None, checks: Checks | None) -> Iterator[Finding]:
     if psnr is None:
         return
-    odd = ""
+    by_view, notes = {} if checks is None else checks.held_out, ""
+    if checks is not None and checks.exposures_learned and checks.held_out_psnr is not None:
+        notes += (
+            " Each was scaled to its photograph's brightness, as exposures were learned, of which these views have "
+        )
+        notes += f"none; {checks.held_out_psnr:.2f} dB as they are."
     if len(by_view) > 1:
         worst = min(by_view, key=lambda name: by_view[name])
         rest = float(np.mean([value for name, value in by_view.items() if name != worst]))
         if rest - psnr >= _ONE_VIEW:
-            odd = f" {worst} is the worst, {by_view[worst]:.2f} dB; the mean without it is {rest:.2f} dB."
+            notes += f" {worst} is the worst, {by_view[worst]:.2f} dB; the mean without it is {rest:.2f} dB."
     _, kind, words = next(grade for grade in _GRADES if psnr >= grade[0])
-    text = f"Views that training never saw are {words}: {psnr:.2f} dB on average.{odd}"
+    text = f"Views that training never saw are {words}: {psnr:.2f} dB on average.{notes}"
     yield Finding(kind, "Quality", text, () if kind == "good" else ("data", "check", "DATA"))
 
 
@@ -144,7 +151,7 @@ def _too_short(checks: Checks) -> bool:
 
 
 def _gap(checks: Checks) -> float:
-    return 0.0 if checks.held_out_psnr is None else checks.train_psnr - checks.held_out_psnr
+    return 0.0 if checks.judged_psnr is None else checks.train_psnr - checks.judged_psnr
 
 
 def _overfitting(checks: Checks, fewer: float | None) -> Iterator[Finding]:
@@ -153,7 +160,7 @@ def _overfitting(checks: Checks, fewer: float | None) -> Iterator[Finding]:
         yield Finding("look", "Overfitting", text, ("train", "DATA", "--test-every", "8"))
         return
     gap = _gap(checks)
-    numbers = f"training views {checks.train_psnr:.2f} dB, held-out views {checks.held_out_psnr:.2f} dB"
+    numbers = f"training views {checks.train_psnr:.2f} dB, held-out views {checks.judged_psnr:.2f} dB"
     if gap < _SOME_OVERFITTING:
         if checks.train_psnr < _FITS:
             # little of it says nothing good where the training views are missed as well
@@ -205,8 +212,7 @@ def _exposure(checks: Checks) -> Iterator[Finding]:
         gain = f" Scaling each held-out render to its photograph's brightness gives {matched:.2f} dB instead "
         gain += f"of {measured:.2f}."
     if checks.exposures_learned:
-        text = f"Learned for each training photograph: {differ}"
-        text += f" Held-out views have none of their own.{gain}" if won >= _WON else ""
+        text = f"Learned for each training photograph: {differ}{gain}"
         yield Finding("good", "Exposure", text)
         return
     what = "It drifts" if spread >= _DRIFT or won >= _WON else "Even, but for some"
