@@ -241,4 +241,5 @@ def with_length(config: TrainConfig, capture: Capture, options: Any) -> tuple[Tr
     )
     largest = max(capture.views, key=lambda view: view.width * view.height)
     config = automatic.with_choice(config, choice.scaler, {"factor": config.factor, **terms.settings})
-    return config, (automatic.line_of(choice, config, (largest.width, largest.height)), *terms.why)
+    why = terms.why if choice.why is None else (choice.why, *terms.why)
+    return config, (automatic.line_of(choice, config, (largest.width, largest.height)), *why)

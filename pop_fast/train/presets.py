@@ -39,7 +39,7 @@ from pop_fast.errors import PopError
 from pop_fast.train.jsonable import from_plain, to_plain
 from pop_ref.recipes import BASELINES, RECIPES, Recipe
 from pop_ref.registry import Registry
-from pop_ref.settings import DensityConfig, PopTerm, UpdateRules
+from pop_ref.settings import DensityConfig, LearningRates, PopTerm, UpdateRules
 
 if TYPE_CHECKING:
     from pop_fast.stages.losses import Loss
@@ -90,7 +90,8 @@ AUTOMATIC: Final = "auto"
 PRESETS: Final = {"paper": 1.0, "quick": QUICK_SCALER, AUTOMATIC: 1.0}
 # what "quick" multiplies the rates by: with so few steps the published ones leave most of the way undone, and rates as
 # high as these must fall towards the end. Opacities go fast enough. Chosen on fox; what it brings on four captures
-# stands in benchmarks/NOTES.md
+# stands in benchmarks/NOTES.md. A longer schedule of "auto" begins with rates that are lower by as much as it is
+# longer, never below the published ones, and they fall by less
 QUICK_RATES: Final = {"means": 12.0, "scales": 6.0, "quats": 6.0, "sh0": 8.0, "sh_rest": 12.0}
 QUICK_DECAY: Final = 0.1
 # steps of the full schedule until which "quick" sees the photographs at a quarter, and at a half, of their size
@@ -118,7 +119,8 @@ class Given:
         preset: "paper" is the paper's 30,000 steps, for a GPU or a night; "quick" 1,500 steps at higher rates that
             fall, from coarse photographs to fine ones, with thresholds for small images; "auto" has these thresholds
             and as much of the schedule as the time allows, which `pop train` chooses; where that is no more than
-            "quick" has, it is as "quick" is. It gives defaults: explicit settings win.
+            "quick" has, it is as "quick" is, and up to 0.6 of the schedule its rates are higher than the paper's. It
+            gives defaults: explicit settings win.
         steps_scaler: multiplies the default of every step number; None takes the preset's.
         scale_lambda_pop: divide the default of lambda_pop by the scaler, so that the push of the prior adds up to the
             same over a short schedule; it then weighs more against the photographs than in the paper.
@@ -221,15 +223,20 @@ def defaults(given: Given) -> dict[str, Any]:
 
     if given.few_steps:
         strategy = _quick(strategy)
-        lr = recipe.lr
-        rates = {name: factor * getattr(lr, name) for name, factor in QUICK_RATES.items()}
-        values["lr"] = replace(lr, **rates, others_decay=QUICK_DECAY)
         values["coarse_stop_iters"] = tuple(scaled(step) for step in QUICK_COARSE)
+    if given.few_steps or given.preset == AUTOMATIC:
+        values["lr"] = _quicker(recipe.lr, 1.0 if given.few_steps else QUICK_SCALER / by)
 
     for name in ("max_steps", "sh_interval", "l2_stop_iter"):
         values[name] = None if values[name] is None else scaled(values[name])
     milestones = tuple(scaled(step) for step in MILESTONES)
     return {**values, "eval_steps": milestones, "save_steps": milestones, "strategy": strategy}
+
+
+def _quicker(lr: LearningRates, share: float) -> LearningRates:
+    """Return rates that begin at this share of what "quick" has more than the published ones, and fall as far."""
+    rates = {name: max(factor * share, 1.0) * getattr(lr, name) for name, factor in QUICK_RATES.items()}
+    return replace(lr, **rates, others_decay=min(QUICK_DECAY / share, lr.others_decay))
 
 
 def _quick(strategy: DensityControl) -> DensityControl:

@@ -23,6 +23,7 @@ from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.automatic import (
     DEPTH_LAMBDAS,
     FEW,
+    LOOKS,
     MINUTES,
     SHORTEST,
     Speed,
@@ -68,13 +69,28 @@ def test_the_schedule_fills_the_minutes_and_is_at_most_the_papers() -> None:
     assert shortest.seconds > 0.6
 
 
+def test_few_photographs_are_not_looked_at_for_as_long_as_the_minutes_allow() -> None:
+    config = TrainConfig.of(preset="auto")
+    few = choose_length(config, SPEED, 1e4, 1e5, 11, 2)
+    assert few.scaler == pytest.approx(LOOKS * 9 / 30_000, rel=1e-2)
+    assert "each of 9 photographs is seen 200 times" in str(few.why)
+    # four views a step are looked at four times as often
+    batch = choose_length(replace(config, given=None, batch_size=4), SPEED, 1e4, 1e5, 11, 2)
+    assert batch.scaler == pytest.approx(few.scaler / 4.0, rel=1e-2)
+    # what the minutes cut shorter has that reason
+    short = choose_length(config, SPEED, 0.5, 1e5, 11, 2)
+    assert short.scaler < few.scaler
+    assert short.why is None
+    enough = choose_length(config, SPEED, 1e4, 1e5, 18, 2)
+    assert (enough.scaler, enough.why) == (1.0, None)
+
+
 @pytest.mark.parametrize("method", ["pop", "gsplat", "3dgs"])
 def test_a_short_schedule_has_the_rates_and_the_coarse_photographs_of_quick(method: str) -> None:
     quick = TrainConfig.of(method=method, preset="quick")
     same = TrainConfig.of(method=method, preset="auto", steps_scaler=QUICK_SCALER)
     assert replace(same, given=None) == replace(quick, given=None)
     longer = TrainConfig.of(method=method, preset="auto", steps_scaler=1.01 * QUICK_SCALER)
-    assert longer.lr == TrainConfig.of(method=method).lr
     assert longer.coarse_stop_iters == ()
     shorter = TrainConfig.of(method=method, preset="auto", steps_scaler=SHORTEST)
     assert shorter.lr == quick.lr
@@ -83,6 +99,24 @@ def test_a_short_schedule_has_the_rates_and_the_coarse_photographs_of_quick(meth
         method=method, preset="auto", steps_scaler=SHORTEST, **{"lr.sh0": 0.5, "coarse_stop_iters": ()}
     )
     assert (said.lr.sh0, said.coarse_stop_iters) == (0.5, ())
+
+
+@pytest.mark.parametrize("method", ["pop", "gsplat", "3dgs"])
+def test_rates_go_from_those_of_quick_to_the_published_ones_and_no_length_jumps(method: str) -> None:
+    scalers = np.geomspace(QUICK_SCALER, 1.0, 40)
+    found = [TrainConfig.of(method=method, preset="auto", steps_scaler=float(by)).lr for by in scalers]
+    quick, published = TrainConfig.of(method=method, preset="quick").lr, TrainConfig.of(method=method).lr
+    assert (found[0], found[-1]) == (quick, published)
+    for name in ("means", "scales", "quats", "sh0", "sh_rest"):
+        rates = np.array([getattr(lr, name) for lr in found])
+        assert (rates >= getattr(published, name)).all()
+        # no rate falls faster than the schedule grows
+        assert (rates[1:] <= rates[:-1]).all()
+        assert (rates[1:] >= rates[:-1] * scalers[:-1] / scalers[1:] * (1.0 - 1e-9)).all()
+        # all end where those of quick end or the published ones, or above
+        least = min(getattr(quick, name) * quick.others_decay, getattr(published, name))
+        assert (rates * [lr.others_decay for lr in found] >= 0.999 * least).all()
+    assert {lr.opacities for lr in found} == {published.opacities}
 
 
 def test_no_minute_more_makes_a_schedule_shorter() -> None:
