@@ -220,8 +220,9 @@ def surfaces() -> str:
         judged, every = sum(c["passed"] + c["failed"] for c in counts), sum(sum(c.values()) for c in counts)
         groups = [surface[group] for group in ("whole views", "arguments", "stage functions")]
         reached = [f"{len(g['offered'])} of {len(g['offered']) + len(g['not'])}" for g in groups]
-        rows.append([title, f"{judged} of {every}", surface["profile"], *reached])
-    head = ["", "laws tried", "constants", "of whole views", "of gsplat's arguments", "stage functions"]
+        cpu = told["made"]["cpu seconds"][backend]
+        rows.append([title, f"{judged} of {every}", f"{cpu}", surface["profile"], *reached])
+    head = ["", "laws tried", "CPU seconds", "constants", "of whole views", "of gsplat's arguments", "stage functions"]
     return _table(head, rows)
 
 
