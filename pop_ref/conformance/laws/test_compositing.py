@@ -167,6 +167,8 @@ def test_a_round_splat_on_the_axis_looks_as_the_formula_says(backend, opacity, d
 @law(
     "compositing",
     RENDER,
+    # the fourth would pass the stop, the fifth alone would not
+    first=[{"alphas": [0.9, 0.9, 0.9, 0.99, 0.5], "name": name} for name in sorted(ALL_PROFILES)],
     alphas=st.lists(opacities(), min_size=1, max_size=6),
     name=st.sampled_from(sorted(ALL_PROFILES)),
 )
