@@ -30,8 +30,8 @@ class Ask:
         cotangent: of the outputs: "dense", one of LAYOUTS, "channels", a pixel's first number in all of its channels
             without memory for the others, or "expanded", the first number everywhere likewise.
         outputs: which of "image" and "alpha" have a cotangent.
-        before: what else is done: "nothing", "no_grad" draws without gradients first, "another" draws another scene
-            between the forward and the backward pass, "twice" goes back twice, "present" leaves ones as gradients
+        before: what else is done: "nothing", "no_grad" and "inference_mode" draw under torch's mode of that name first,
+            "another" draws another scene between the forward and the backward pass, "twice" goes back twice, "present" leaves ones as gradients
             from before, "edited" changes the arguments in place between the passes, "written" the outputs.
     """
 
@@ -49,7 +49,7 @@ class Differentiated:
     Attributes:
         gradients: of the wanted arguments by name, None for one that got none.
         others: names of arguments that got a gradient without asking.
-        changed: names of arguments that are not what they were.
+        changed: names of arguments, and of what torch keeps for everybody, that are not what they were.
         refused: what torch or the program said where it would not go back; empty where it did.
         follows: whether the image follows its arguments, and whether one drawn without gradients does.
         image: the image, and the one drawn without gradients.
@@ -161,11 +161,21 @@ def _differentiate(
     torch = importlib.import_module("torch")
     laid = {name: Laid(value, ask.layout, name in ask.wanted) for name, value in values.items()}
     arguments = {name: each.view for name, each in laid.items()}
+    unsettled: set[str] = set()
+
+    def drawn() -> Sequence[Any]:
+        # a state that no seed leaves
+        torch.rand(1)
+        settings = _settings_of_torch()
+        found = draw(arguments)
+        unsettled.update(name for name, value in _settings_of_torch().items() if value != settings[name])
+        return found
+
     still = None
-    if ask.before == "no_grad":
-        with torch.no_grad():
-            still = draw(arguments)[0]
-    outputs: dict[str, Any] = dict(zip(("image", "alpha"), draw(arguments), strict=True))
+    if ask.before in ("no_grad", "inference_mode"):
+        with getattr(torch, ask.before)():
+            still = drawn()[0]
+    outputs: dict[str, Any] = dict(zip(("image", "alpha"), drawn(), strict=True))
     image = outputs["image"].detach().clone()
     if ask.before == "another":
         other()
@@ -177,11 +187,22 @@ def _differentiate(
     return Differentiated(
         gradients={name: None if laid[name].gradient is None else laid[name].gradient.clone() for name in ask.wanted},
         others=tuple(name for name in laid if name not in ask.wanted and laid[name].base.grad is not None),
-        changed=tuple(name for name in kept if not torch.equal(laid[name].view.detach(), values[name])),
+        changed=(*sorted(unsettled), *(n for n in kept if not torch.equal(laid[n].view.detach(), values[n]))),
         refused=refused,
         follows=(bool(outputs["image"].requires_grad), still is not None and bool(still.requires_grad)),
         image=(image, still),
     )
+
+
+def _settings_of_torch() -> dict[str, Any]:
+    """Return, by name, what a call has to leave as it was."""
+    torch = importlib.import_module("torch")
+    return {
+        "the random numbers": torch.random.get_rng_state().numpy().tobytes(),
+        "the default type of numbers": torch.get_default_dtype(),
+        "the number of threads": torch.get_num_threads(),
+        "whether gradients are taken": torch.is_grad_enabled(),
+    }
 
 
 def _went_back(outputs: dict[str, Any], cotangents: dict[str, Any], laid: dict[str, Laid], ask: Ask) -> str:

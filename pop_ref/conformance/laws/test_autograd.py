@@ -91,11 +91,13 @@ def test_an_output_that_no_loss_reads_adds_nothing(backend):
 
 @law("autograd", GRADIENTS, "differentiate")
 def test_without_gradients_the_same_image_is_drawn_and_follows_nothing(backend):
-    done = _assert_gradients(backend, Ask(before="no_grad"))
-    with_gradients, without = done.image
-    assert done.follows == (True, False), "an image that was drawn under no_grad requires a gradient, or another not"
-    size = np.abs(with_gradients) + 1.0
-    assert_close("autograd.image", without, with_gradients, size, backend.dtype)
+    for mode in ("no_grad", "inference_mode"):
+        done = _assert_gradients(backend, Ask(before=mode))
+        with_gradients, without = done.image
+        assert done.follows == (True, False), f"an image that was drawn under {mode} requires a gradient, or another not"
+        assert not done.changed, f"a call under {mode} changes {done.changed}"
+        size = np.abs(with_gradients) + 1.0
+        assert_close("autograd.image", without, with_gradients, size, backend.dtype)
 
 
 @law("autograd", GRADIENTS, "differentiate")

@@ -183,11 +183,12 @@ def test_the_colour_gradient_is_what_the_colour_adds_to_the_image(backend, scene
     seen, error_bounds = with_error_bounds(backend, bright)
     g, v_image, v_T_final = _pulled_where_unambiguous(backend, seen, error_bounds)
     bounds = gradient_error_bounds(seen, error_bounds, v_image, v_T_final)["sh"]
+    before = backend.render(seen).image
     for i in range(n):
         brighter = np.full((n, 3), 1.0)
         brighter[i] += 1.0
         more = backend.sees(colored(scene, brighter))
-        moved = backend.render(more).image - backend.render(seen).image
+        moved = backend.render(more).image - before
         gained = np.sum(v_image * moved, axis=(0, 1)) * SH_C0
         size = bounds[i, 0] + np.sum(np.abs(v_image) * (error_bounds.image + 2.0 * error_bounds.absolute), axis=(0, 1))
         assert_close("gradients.color", gained, g["sh"][i, 0], size, backend.dtype)
