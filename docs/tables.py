@@ -216,11 +216,11 @@ def surfaces() -> str:
     rows = []
     for title, (file, backend) in JUDGED.items():
         told = card(file)
-        surface, counts = told["surface"][backend], told["summary"][backend].values()
+        surface, counts, cpu = told["surface"][backend], told["summary"][backend].values(), told["made"]["cpu seconds"]
         tried, every = sum(c["passed"] + c["failed"] for c in counts), sum(sum(c.values()) for c in counts)
         groups = [surface[group] for group in ("whole views", "arguments", "stage functions")]
         reached = [f"{len(g['offered'])} of {len(g['offered']) + len(g['not'])}" for g in groups]
-        rows.append([title, f"{tried} of {every}", str(told["made"]["cpu seconds"][backend]), surface["profile"], *reached])
+        rows.append([title, f"{tried} of {every}", str(cpu[backend]), surface["profile"], *reached])
     head = ["", "laws tried", "CPU seconds", "constants", "of whole views", "of gsplat's arguments", "stage functions"]
     return _table(head, rows)
 

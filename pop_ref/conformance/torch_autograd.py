@@ -31,8 +31,9 @@ class Ask:
             without memory for the others, or "expanded", the first number everywhere likewise.
         outputs: which of "image" and "alpha" have a cotangent.
         before: what else is done: "nothing", "no_grad" and "inference_mode" draw under torch's mode of that name first,
-            "another" draws another scene between the forward and the backward pass, "twice" goes back twice, "present" leaves ones as gradients
-            from before, "edited" changes the arguments in place between the passes, "written" the outputs.
+            "another" draws another scene between the forward and the backward pass, "twice" goes back twice, "present"
+            leaves ones as gradients from before, "edited" changes the arguments in place between the passes,
+            "written" the outputs.
     """
 
     wanted: tuple[str, ...] = NAMES

@@ -94,7 +94,9 @@ def test_without_gradients_the_same_image_is_drawn_and_follows_nothing(backend):
     for mode in ("no_grad", "inference_mode"):
         done = _assert_gradients(backend, Ask(before=mode))
         with_gradients, without = done.image
-        assert done.follows == (True, False), f"an image that was drawn under {mode} requires a gradient, or another not"
+        assert done.follows == (True, False), (
+            f"an image that was drawn under {mode} requires a gradient, or another not"
+        )
         assert not done.changed, f"a call under {mode} changes {done.changed}"
         size = np.abs(with_gradients) + 1.0
         assert_close("autograd.image", without, with_gradients, size, backend.dtype)
