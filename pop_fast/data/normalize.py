@@ -11,6 +11,8 @@ gsplat leaves to LAPACK, are fixed so that the largest entry of the x and y axes
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from pop_fast.errors import CaptureError
@@ -86,9 +88,30 @@ def focus_point(viewmats: np.ndarray) -> np.ndarray:
     return centers.mean(axis=0) + (spread or 1.0) * forward.mean(axis=0)
 
 
+# four of five cameras of ten captures look past the point by up to 13 degrees where people went round a subject; by 49
+# to 155 on a walk, in rooms photographed from their middle, and from the air
+_LOOKS_AT: Final = np.radians(25.0)
+_MOST_CAMERAS: Final = 0.8
+
+
+def look_at_one_point(viewmats: np.ndarray) -> bool:
+    """Tell whether four of five cameras look at `focus_point`, as those do that went round a subject. [V, 4, 4]"""
+    rays = focus_point(viewmats) - camera_centers(viewmats)
+    along = np.einsum("mj,mj->m", rays, viewmats[:, 2, :3])
+    cosines = along / np.maximum(np.linalg.norm(rays, axis=1), 1e-12)
+    return bool(np.mean(cosines >= np.cos(_LOOKS_AT)) >= _MOST_CAMERAS)
+
+
 def neighbour_degrees(viewmats: np.ndarray) -> float | None:
-    """Give the median angle from a camera to the nearest other one, seen from the point they look at. [V, 4, 4]"""
-    if len(viewmats) < 2:
+    """Give the median angle from a camera to the nearest other one, seen from the point they look at.
+
+    Args:
+        viewmats: world -> camera. [V, 4, 4]
+
+    Returns:
+        Degrees; None of a single camera, and where they look at no one point.
+    """
+    if len(viewmats) < 2 or not look_at_one_point(viewmats):
         return None
     offsets = camera_centers(viewmats) - focus_point(viewmats)
     rays = offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12)

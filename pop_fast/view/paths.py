@@ -1,8 +1,9 @@
 """Camera paths made from the cameras of a capture (NumPy float64, viewmats in, viewmats out), and videos along them.
 
-Every path is closed (its last camera leads back to its first) except `interpolate`, which runs once through the given
-cameras. Frames: world -> camera, OpenCV axes (+x right, +y down, +z forward), as everywhere in the package. Videos are
-written by OpenCV's own encoder, so that no program outside the package is needed.
+Every path is closed (its last camera leads back to its first) except those that run once through the given cameras:
+`interpolate`, and `orbit` of cameras that look at no one point. Frames: world -> camera, OpenCV axes (+x right, +y
+down, +z forward), as everywhere in the package. Videos are written by OpenCV's own encoder, so that no program outside
+the package is needed.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from pop_fast.data.normalize import camera_centers, focus_point
+from pop_fast.data.normalize import camera_centers, focus_point, look_at_one_point
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import file_atomically
 from pop_fast.io.images import SILENT, set_log_level
@@ -31,6 +32,8 @@ from pop_fast.io.images import SILENT, set_log_level
 _WIDE_GAP: Final = np.pi / 2.0
 _STANDS_OUT: Final = 1.5
 _LEAST_SWAY: Final = np.radians(5.0)  # to either side of a single camera
+# frames between two cameras that a path passes through: with fewer it would follow every shake of a hand
+_GLIDE: Final = 3
 _SWAY: Final = 0.9  # the percentile that the ellipse keeps of the cameras' spread, so that one outlier does not set it
 
 
@@ -38,15 +41,19 @@ def orbit(viewmats: np.ndarray, n_frames: int) -> np.ndarray:
     """Turn about the point the cameras look at, at their median distance and height, as far round as cameras stand.
 
     Where they stand all round it is a full circle. Else it goes from the middle of their arc to one end, to the other
-    and back, so that nothing is shown from where no photograph was taken.
+    and back, so that nothing is shown from where no photograph was taken. Cameras that look at no one point, as on a
+    walk or in a room, have nothing to turn about: the path then glides through them, from the first to the last.
 
     Args:
-        viewmats: cameras of the capture, world -> camera. [M, 4, 4]
+        viewmats: cameras of the capture in the order of their names, world -> camera. [M, 4, 4]
         n_frames: cameras on the path.
 
     Returns:
         Cameras on the path, world -> camera. [n_frames, 4, 4]
     """
+    if not look_at_one_point(viewmats):
+        passed = np.linspace(0, len(viewmats) - 1, min(len(viewmats), max(2, n_frames // _GLIDE)))
+        return interpolate(viewmats[np.round(passed).astype(int)], n_frames)
     up, focus = mean_up(viewmats), focus_point(viewmats)
     offsets = camera_centers(viewmats) - focus
     heights = offsets @ up

@@ -20,6 +20,7 @@ from pop_fast.view.html import PageCamera, camera_of_points, cameras_of, first_v
 from tests.app.browser import Browser, browser
 from tests.app.clouds import many
 from tests.app.conftest import Pop
+from tests.app.test_paths import walk
 from tests.app.tiny import look_at, tiny_capture
 
 WIDTH, HEIGHT = 200, 150
@@ -210,6 +211,15 @@ def test_cameras_that_look_the_same_way_turn_about_the_median_gaussian() -> None
         cameras.append(PageCamera("x", viewmat, np.eye(3), 10, 10))
     for distance in view_distances(cameras, many(2000)["means"]):
         assert distance == pytest.approx(7.0, abs=0.2)
+
+
+def test_a_page_of_a_walk_starts_with_its_first_camera() -> None:
+    stands = [
+        PageCamera(str(i), camera, np.array([[40.0, 0, 20], [0, 40, 20], [0, 0, 1]]), 40, 40)
+        for i, camera in enumerate(walk())
+    ]
+    assert first_view(stands) == 0
+    assert first_view(stands[::-1]) == 0
 
 
 def test_a_page_starts_where_most_photographs_stand_with_the_subject_in_the_middle() -> None:

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
-from pop_fast.data.normalize import camera_centers, focus_point
+from pop_fast.data.normalize import camera_centers, focus_point, look_at_one_point, neighbour_degrees
 from pop_fast.errors import PopError
 from pop_fast.view import paths
 from pop_fast.view.paths import (
@@ -93,6 +94,43 @@ def test_an_orbit_is_a_full_circle_where_cameras_stand_all_round() -> None:
         offsets = camera_centers(orbit(ring(n), 8)) - [0.5, -0.25, 0.0]
         angles = np.sort(np.degrees(np.arctan2(offsets[:, 1], offsets[:, 0])) % 360.0)
         np.testing.assert_allclose(np.diff(angles), 45.0)
+
+
+def walk(n: int = 30, turn: float = 0.0) -> np.ndarray:
+    """Cameras of a walk along y that looks ahead and, by `turn` degrees, to the sides. [n, 4, 4]"""
+    along = np.linspace(0.0, 10.0, n)
+    centers = np.stack([0.1 * np.sin(3.0 * along), along, 0.02 * np.cos(5.0 * along)], axis=1)
+    side = np.radians(turn) * np.sin(along)
+    return np.concatenate(
+        [
+            look_at(center[None], center + np.array([np.sin(angle), np.cos(angle), 0.0]), UP)
+            for center, angle in zip(centers, side, strict=True)
+        ]
+    )
+
+
+@pytest.mark.parametrize("turn", [0.0, 15.0, 60.0, 180.0])
+def test_an_orbit_of_a_walk_or_a_room_follows_the_cameras(turn: float) -> None:
+    cameras = walk(turn=turn)
+    assert not look_at_one_point(cameras)
+    assert neighbour_degrees(cameras) is None
+    path = orbit(cameras, 60)
+    np.testing.assert_allclose(path[[0, -1]], cameras[[0, -1]], atol=1e-9)
+    apart = np.linalg.norm(camera_centers(path)[:, None] - camera_centers(cameras), axis=2)
+    assert apart.min(axis=1).max() < 0.5  # cameras stand 0.34 apart
+    nearest = apart.argmin(axis=1)
+    gaze = np.einsum("mj,mj->m", path[:, 2, :3], cameras[nearest, 2, :3])
+    assert gaze.min() > np.cos(np.radians(40.0))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_cameras_that_shake_still_look_at_one_point(seed: int) -> None:
+    shaken = ring(n=24)
+    turns = Rotation.random(24, rng=np.random.default_rng(seed)).as_rotvec()
+    for camera, turn in zip(shaken, turns, strict=True):
+        camera[:3] = Rotation.from_rotvec(np.radians(15.0) * turn / np.linalg.norm(turn)).as_matrix() @ camera[:3]
+    assert look_at_one_point(shaken)
+    assert neighbour_degrees(shaken) is not None
 
 
 def test_a_single_camera_sways_and_does_not_fly_round() -> None:

@@ -32,6 +32,7 @@ from pop_fast.view.report import checks, write_report
 from pop_fast.view.report.checks import (
     Checks,
     are_floaters,
+    misfit_share,
     near_limit,
     nearer_than,
     read_checks,
@@ -289,6 +290,24 @@ def test_a_photograph_of_twice_the_light_is_one_stop_brighter() -> None:
     assert stops_between(brighter, render) == pytest.approx(1.0)
     assert stops_between(render, render) == 0.0
     assert stops_between(np.zeros((50, 3)), render) == 0.0
+
+
+@pytest.mark.parametrize("share", [0.01, 0.05, 0.2])
+@pytest.mark.parametrize(("rest", "moved", "told"), [(0.01, 0.3, True), (0.03, 0.1, False), (0.005, 0.05, False)])
+def test_what_moved_is_told_where_the_rest_fits(share: float, rest: float, moved: float, told: bool) -> None:
+    generator = np.random.default_rng(3)
+    photo = generator.integers(60, 160, (128, 256, 3), np.uint8)
+    error = rest * generator.choice([-1.0, 1.0], photo.shape)
+    side = round(np.sqrt(share * 128 * 256) / 8) * 8
+    error[16 : 16 + side, 64 : 64 + side] = moved
+    view = View("v", photo, np.eye(4), np.eye(3))
+    found = misfit_share(view, photo / 255.0 + error)
+    assert found == pytest.approx(side * side / (128 * 256) if told else 0.0, abs=1e-6)
+    # neither what a mask leaves out counts, nor its pixels
+    mask = np.ones((128, 256), bool)
+    mask[16 : 16 + side, 64 : 64 + side] = False
+    assert misfit_share(replace(view, mask=mask), photo / 255.0 + error) == 0.0
+    assert misfit_share(replace(view, mask=np.zeros_like(mask)), photo / 255.0 + error) == 0.0
 
 
 def test_neighbours_in_a_ring_of_twelve_are_thirty_degrees_apart() -> None:

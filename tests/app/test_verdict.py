@@ -25,6 +25,7 @@ GOOD = Checks(
     neighbour_degrees=4.0,
     stops={"a": -0.02, "b": 0.03},
     floaters={"a": 0.0, "b": 0.002},
+    misfits={"a": 0.0, "b": 0.004},
 )
 
 
@@ -60,6 +61,7 @@ GOOD = Checks(
             "2 photographs' views and 60",
         ),
         ("Fit", {}, "good", "reach 31.00 dB"),
+        ("Fit", {"misfits": {"a": 0.02, "b": 0.05}}, "look", "3.5 % of a photograph is far from its render"),
         ("Fit", {"train_psnr": 21.0, "held_out_psnr": 19.0}, "look", "cameras that are wrong"),
         ("Fit", {"train_psnr": 18.09, "held_out_psnr": 17.0}, "bad", "contradict one another"),
         ("Fit", {"train_psnr": 18.09, "held_out_psnr": 17.0, "steps": 90}, "bad", "few steps"),

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.data.capture import View
-from pop_fast.data.normalize import focus_point
+from pop_fast.data.normalize import focus_point, look_at_one_point
 from pop_fast.io.formats import encoded
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.views import evenly
@@ -104,9 +104,12 @@ def first_view(cameras: Sequence[PageCamera]) -> int:
     The subject is the point that is nearest to all optical axes. In the middle is what lies within a quarter of the
     image's size from its centre; where no camera has the subject there, all are asked. Of these, the half that stands
     farthest away, which cuts least of the subject, and of that half the one whose direction from the subject is nearest
-    to those of all cameras: the largest sum of cosines, the first of equals.
+    to those of all cameras: the largest sum of cosines, the first of equals. Of cameras that look at no one point, as
+    on a walk or in a room, it is the first.
     """
     viewmats = np.stack([camera.viewmat for camera in cameras])
+    if not look_at_one_point(viewmats):
+        return 0
     focus = focus_point(viewmats)
     seen = viewmats[:, :3, :3] @ focus + viewmats[:, :3, 3]
     sizes = np.array([(camera.width, camera.height) for camera in cameras], dtype=float)

@@ -30,6 +30,7 @@ _WON: Final = 0.5  # dB, by scaling each render to its photograph's brightness
 # training views under it contradict one another, or were not trained on for long; dB
 _FITS: Final = 22.0
 _FITS_BADLY: Final = 19.0
+_PARTS: Final = 0.01  # of a training view, on average: what does not fit where the rest does
 _EPOCHS: Final = 30  # how often each photograph is to be seen
 
 Kind = Literal["good", "look", "bad"]
@@ -134,7 +135,7 @@ def _unfitting(checks: Checks) -> Iterator[Finding]:
     """Judge whether the training views fit: what training could not reach there is no question of views in between."""
     text = f"training views, which it has seen, reach {checks.train_psnr:.2f} dB"
     if checks.train_psnr >= _FITS:
-        yield Finding("good", "Fit", f"They fit together: {text}.")
+        yield _parts(checks, text)
         return
     short = " The run had few steps for it." if _too_short(checks) else ""
     more = ("train", "DATA", "--minutes", "240") if short else ("data", "check", "DATA")
@@ -143,6 +144,20 @@ def _unfitting(checks: Checks) -> Iterator[Finding]:
     )
     why += "one another"
     yield Finding("bad" if checks.train_psnr < _FITS_BADLY else "look", "Fit", f"They do not all fit: {why}.", more)
+
+
+def _parts(checks: Checks, text: str) -> Finding:
+    """Judge whether parts of the training views do not fit where the rest does."""
+    share = float(np.mean(list(checks.misfits.values()))) if checks.misfits else 0.0
+    if share < _PARTS:
+        return Finding("good", "Fit", f"They fit together: {text}.")
+    worst = max(checks.misfits, key=lambda name: checks.misfits[name])
+    why = (
+        f"But for parts they fit: {text}; {100.0 * share:.1f} % of a photograph is far from its render where the rest "
+        f"is near, most in {worst}, {100.0 * checks.misfits[worst]:.1f} %. Something moved, or mirrors what did. "
+        "A mask leaves it out: masks/NAME.png for photograph NAME, black where it moved, white elsewhere."
+    )
+    return Finding("look", "Fit", why, ("data", "check", "DATA"))
 
 
 def _too_short(checks: Checks) -> bool:

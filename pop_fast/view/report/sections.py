@@ -46,7 +46,8 @@ def orbit_section(orbit: tuple[str, bytes] | None) -> str:
     if orbit is None:
         return ""
     path, data = orbit
-    about = "A turn about what the cameras look at, as far round as photographs were taken."
+    about = "A turn about what the cameras look at, as far round as photographs were taken; where they look at no one "
+    about += "thing, as on a walk or in a room, a path through them."
     if len(data) > _LARGEST_FILM:
         return f"<h2>The orbit</h2><p>{about} {_link(path, path)}, {len(data) / 1e6:.0f} MB.</p>"
     uri = f"data:video/webm;base64,{base64.b64encode(data).decode('ascii')}"
