@@ -30,7 +30,7 @@ _WON: Final = 0.5  # dB, by scaling each render to its photograph's brightness
 # training views under it contradict one another, or were not trained on for long; dB
 _FITS: Final = 22.0
 _FITS_BADLY: Final = 19.0
-_PARTS: Final = 0.01  # of a training view, on average: what does not fit where the rest does
+_PARTS: Final = 0.006  # of a training view, on average: what does not fit where the rest does
 _EPOCHS: Final = 30  # how often each photograph is to be seen
 
 Kind = Literal["good", "look", "bad"]
