@@ -48,8 +48,9 @@ QUICKLY = ("--checkpoint-every", "50", "--skip-checks", "--skip-sizes", "--no-pr
 @pytest.mark.parametrize(
     ("side", "gpu", "minutes", "left"),
     [
-        *((4032, True, MINUTES, 1344), (3000, True, MINUTES, 1500), (1920, True, 1.0, 1920)),
+        *((4032, True, MINUTES, 2016), (3000, True, MINUTES, 1500), (1920, True, 1.0, 1920)),
         *((4032, False, MINUTES, 1008), (1920, False, MINUTES, 960), (1920, False, 3.0, 480), (512, False, 1.0, 512)),
+        *((640, False, 3.0, 640), (777, False, 3.0, 777), (778, False, 3.0, 389), (4032, False, 3.0, 576)),
     ],
 )
 def test_photographs_are_shrunk_to_what_the_machine_trains_on(side: int, gpu: bool, minutes: float, left: int) -> None:

@@ -11,6 +11,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
+from pop_fast.train.automatic import LOOKS
 from pop_fast.view.report.checks import Checks
 from pop_fast.view.report.curves import Window
 from pop_ref.settings import Recipe
@@ -188,7 +189,12 @@ def _overfitting(checks: Checks, fewer: float | None) -> Iterator[Finding]:
     text = f"{'Some' if some else 'Much'}: {numbers}, {gap:.1f} dB apart."
     text += "" if some else " The splat knows its photographs by heart and little in between."
     # no two findings send to schedules of two lengths
-    scaler = fewer or (checks.steps or Recipe.max_steps) / Recipe.max_steps / 2.0
+    steps = checks.steps or Recipe.max_steps
+    if fewer is None and steps <= LOOKS * checks.photographs:
+        text += f" The schedule is short already, {steps / checks.photographs:.0f} steps a photograph."
+        yield Finding("look" if some else "bad", "Overfitting", text, ("data", "check", "DATA"))
+        return
+    scaler = fewer or max(steps / 2.0, LOOKS * checks.photographs) / Recipe.max_steps
     yield Finding("look" if some else "bad", "Overfitting", text, ("train", "DATA", "--steps-scaler", f"{scaler:.2g}"))
 
 
