@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 # an evening
 MINUTES: Final = 120.0
 # the longest side that photographs have, px, nearly: on a GPU, on a CPU, and there where less than this is allowed. A
-# kitchen in 640 x 480 px, measured at that size, came out 0.2 dB better (0.4 dB with colours fitted) from 5,000 steps at
-# that size than from 6,200 or 12,450 at 320 x 240, in the time of the 12,450
+# kitchen in 640 x 480 px, measured at that size, came out 0.2 dB better (0.4 dB with colours fitted) from 5,000 steps
+# at that size than from 6,200 or 12,450 at 320 x 240, in the time of the 12,450
 SIDES: Final = {"gpu": 2000, "cpu": 1100, "cpu, soon": 550}
 SOON: Final = 15.0  # minutes
 # of the paper's schedule; with fewer steps there is nothing to see, and more of them are another method
