@@ -4,7 +4,7 @@ A block's Gaussians are those of its core. To train them it gets
 
 -   the training views that stand in the core or within its margin, and those that stand elsewhere and see enough of
     it: the core holds at least the share `share` of the sparse points in their picture. A border is so seen from both
-    sides, and a core that is looked at from afar is trained by those who look at it.
+    sides, and a core that is looked at from afar is trained by the blocks that look at it.
 -   the sparse points of the core and its margin, and of the points outside that its views have in their pictures an
     even selection, at most as many. Without those, Gaussians of the core would have to explain what lies behind it;
     with all of them, a block would be no smaller than the whole. What grows there is dropped when blocks are merged.

@@ -1,4 +1,4 @@
-"""Who is judged: what stands between the laws and an implementation, and its form for the oracle itself.
+"""What is judged: what stands between the laws and an implementation, and its form for the oracle itself.
 
 Everything crosses the border as NumPy float64 (ids int64), in the oracle's names and shapes, one camera at a time. An
 adapter says with `has` what its implementation can do; laws that need more are skipped by name.

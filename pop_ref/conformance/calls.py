@@ -68,7 +68,7 @@ class Call:
         no_background: whether the argument is left out; scenes are then black behind.
         sparse_grad: as gsplat's.
         absgrad: likewise, where gradients are asked for.
-        dominance: whether who offers it is asked for the dominant Gaussians in the same pass.
+        dominance: whether a backend that offers it is asked for the dominant Gaussians in the same pass.
     """
 
     frames: tuple[tuple[Frame, ...], ...]

@@ -147,8 +147,8 @@ def first_gaussian(backend: Any, scene: Scene) -> str | None:
     for k in range(len(order) + 1):
         found = first_pixel(backend, scene.rows(np.sort(order[:k])))
         if found is not None:
-            who = f"Gaussian {int(order[k - 1])} is added to those in front of it" if k else "there is no Gaussian"
-            return f"as soon as {who}: {found[0]}"
+            added = f"Gaussian {int(order[k - 1])} is added to those in front of it" if k else "there is no Gaussian"
+            return f"as soon as {added}: {found[0]}"
     return None
 
 
@@ -193,7 +193,7 @@ def failure_report(name: str, backend: Any, scenes: dict[str, Scene]) -> str:
 
     Args:
         name: the law.
-        backend: who broke it; as a law watched it, it says whether gradients were asked for, and which calls were made.
+        backend: that broke it; as a law watched it, it says whether gradients were asked for, and what calls were made.
         scenes: what was drawn, by name; the first that the backend draws otherwise than the oracle is reported.
     """
     title = f"law {name.removeprefix('test_')} fails on {backend.name}"

@@ -117,9 +117,9 @@ def assert_tiles_where_told(backend: Any, of: Made) -> None:
 
 
 def assert_tiles(backend: Any, of: Made) -> None:
-    """Assert that the tile lists of meta run front to back, and hold who is blended and nobody whom the oracle culls.
+    """Assert that tile lists run front to back, and hold every Gaussian that is blended and none that the oracle culls.
 
-    A list may be tighter than the oracle's, which is of whole extents; who is culled by rounding is left out.
+    A list may be tighter than the oracle's, which is of whole extents; what rounding culls is left out.
     """
     call, meta, every = of.call, of.called.meta, list(of.each())
     B, C, n = call.shape

@@ -29,7 +29,7 @@ def breaks(backend: Any, call: Call, check: Check | None) -> str | None:
     """Return how a call breaks; None if it does not.
 
     Args:
-        backend: who is judged.
+        backend: that is judged.
         call: that it is asked for.
         check: that has to hold of its answer; None asks whether there is an answer.
     """
@@ -52,7 +52,7 @@ def narrowed(backend: Any, call: Call, check: Check | None, gaussians: bool = Fa
     """Return the plainest call that breaks as well, and how it breaks.
 
     Args:
-        backend: who is judged.
+        backend: that is judged.
         call: that breaks.
         check: what breaks, as for `breaks`.
         gaussians: whether Gaussians that do not matter are left out, too.

@@ -211,7 +211,7 @@ def call_of(backend: Any, row: Mapping[str, str], number: int) -> Call:
     for factor, name in row.items():
         asks |= level(factor, name).asks
     # what a scene is, as a backend reads it, follows from these
-    # a bound method is another at every look; of a wrapper it is that of whom it wraps
+    # a bound method is another at every look; of a wrapper it is that of what it wraps
     reader = getattr(backend.sees, "__func__", backend.sees)
     key = (tuple(row.items()), number, np.dtype(backend.dtype).name, backend.profile, reader)
     side = getattr(backend, "own_tile_size", None) if not backend.takes("tile_size") else None

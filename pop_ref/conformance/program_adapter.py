@@ -30,9 +30,9 @@ Functions that may be offered, and are then called by their names:
   and the field, key or place for each of its parts. Normal deviates of a split are asked for with `draw`.
 - `rasterization`, with gsplat's arguments: several cameras, batch dimensions, modes of depth, plain colours, clipping.
   It answers `images` and `alphas`, and what it likes of gsplat's meta. With `rasterization_vjp` it is pulled back: the
-  same arguments, `v_images` and `v_alphas` give `v_` and the name of each array that has a gradient. Who offers it
-  need not offer `image` or `v_means`. An argument that a program does not have it refuses, in these words: `error
-  batch dimensions are not supported`.
+  same arguments, `v_images` and `v_alphas` give `v_` and the name of each array that has a gradient. A program that
+  offers it need not offer `image` or `v_means`. An argument that a program does not have it refuses, in these words:
+  `error batch dimensions are not supported`.
 """
 
 from __future__ import annotations

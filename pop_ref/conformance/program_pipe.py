@@ -165,7 +165,7 @@ class Pipe:
 
 
 def _write(process: subprocess.Popen[bytes], request: bytes) -> None:
-    # a program that has ended is noticed by who reads
+    # the reader notices a program that has ended
     with contextlib.suppress(OSError, ValueError):
         assert process.stdin is not None
         left = memoryview(request)
@@ -185,7 +185,7 @@ def _read(process: subprocess.Popen[bytes], chunks: queue.Queue[bytes]) -> None:
 def _end(process: subprocess.Popen[bytes]) -> None:
     process.kill()
     process.wait()
-    # the other end is closed by who reads there
+    # the reader closes the other end
     with contextlib.suppress(OSError):
         assert process.stdin is not None
         process.stdin.close()

@@ -1,6 +1,6 @@
 """Training without pictures: what a rasterizer would have said at every step, written down, to drive a strategy by.
 
-A script is made of formulas of the step and of the number of Gaussians, so that everybody who is driven by it sees the
+A script is made of formulas of the step and of the number of Gaussians, so that every strategy that it drives sees the
 same. Numbers are dyadic: no precision rounds them, and averages over one, two or four views are exact.
 """
 

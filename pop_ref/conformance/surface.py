@@ -29,7 +29,7 @@ WHOLE: Final = (RENDER, GRADIENTS, DOMINANCE, DOMINANT_WEIGHTS, DOMINANT_COUNTS,
 
 
 def introduction(backend: Any) -> list[str]:
-    """Return the lines that a session begins with: who is judged, as what, by how many laws, and what is not."""
+    """Return the lines that a session begins with: what is judged, as what, by how many laws, and what is not."""
     if hasattr(backend, "reason"):
         return [f"conformance: {backend.name} is not judged: {backend.reason}"]
     laws = list(every_law().values())
@@ -45,7 +45,9 @@ def introduction(backend: Any) -> list[str]:
         lines += [f"  refused, and not judged: {need} ({words})" for need in ASKED if (words := backend.why_not(need))]
     idle = {law.stage for law in laws} - {law.stage for law in judged}
     if idle:
-        lines.append(f"  no law of {_listed(idle)}: --stages, --adapter and --strategy name who offers them")
+        lines.append(
+            f"  no law of {_listed(idle)}: --stages, --adapter and --strategy name an implementation that offers them"
+        )
     lines.append("  next: a broken law prints where, and a scene or call to paste; --scorecard card.html tells of all")
     return [part for line in lines for part in textwrap.wrap(line, 110, subsequent_indent="    ")]
 
@@ -68,7 +70,7 @@ def surface_of(backend: Any) -> dict[str, Any]:
 
     Returns:
         Constants and precision; of whole views, of gsplat's arguments and of stage functions, those offered and those
-        not. Empty for who is absent.
+        not. Empty for an `Absent`.
     """
     if hasattr(backend, "reason"):
         return {}

@@ -81,7 +81,7 @@ def assert_one_of_the_oracles_outcomes(
     """Assert that a render equals the oracle's where that is unambiguous, and one of its outcomes elsewhere.
 
     Args:
-        backend: who draws.
+        backend: that draws.
         scene: what is drawn.
         error_bounds: of the scene.
         drawn: the backend's view of it, if it is not to be drawn by `render`.

@@ -347,7 +347,7 @@ class TorchAdapter(Adapter):
         return Called(self._array(images), self._array(alphas), shown, gradients)
 
     def _asked_by(self, call: Call) -> dict[str, Any]:
-        """Return the arguments of a call that are not at gsplat's defaults, and the profile for who takes one."""
+        """Return the arguments of a call that are not at gsplat's defaults, and the profile where one is taken."""
         scene = call.first.scene
         asked: dict[str, Any] = {"near_plane": scene.profile.near_plane, "eps2d": scene.profile.eps2d} | call.planes
         asked |= {"render_mode": call.render_mode} if call.render_mode != "RGB" else {}

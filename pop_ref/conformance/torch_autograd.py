@@ -209,7 +209,7 @@ def _settings_of_torch() -> dict[str, Any]:
 def _went_back(outputs: dict[str, Any], cotangents: dict[str, Any], laid: dict[str, Laid], ask: Ask) -> str:
     """Hold the backward pass, and return why not, or an empty text."""
     torch = importlib.import_module("torch")
-    # alphas do not follow a background; who lets them follow nothing else has gradients that lack a part
+    # alphas do not follow a background; where nothing else reaches them, gradients lack a part
     names = [name for name in ask.outputs if outputs[name].requires_grad]
     chosen = [outputs[name] for name in names]
     given = [_cotangent(cotangents[name], ask.cotangent) for name in names]

@@ -56,7 +56,7 @@ def drive(strategy: Any, script: Script, rows: Any, trainer: Trainer, dtype: Any
         Of every step what `pop_ref.methods.scripted_steps` returns, as tensors, and besides: whether each parameter
         is trained and of which type ("trainable", "dtypes"), whether its optimizer holds it and nothing else ("held"),
         which parameters the strategy has "moved", whether it adds noise to the centres at every step ("noisy", which
-        who has a `noise_lr` does, as gsplat's MCMC), and whether it left all counters as they were ("counted").
+        one that has a `noise_lr` does, as gsplat's MCMC), and whether it left all counters as they were ("counted").
     """
     params, optimizers = population(rows, trainer.optimizers, dtype)
     if hasattr(strategy, "check_sanity"):
@@ -148,7 +148,7 @@ def _looked(
         return {}
     extras = trainer.extras(step)
     if not strategy.needs_passes(step):
-        # as in a run, where nobody can look at views who does not say so
+        # as in a run, where no strategy looks at views that does not say so
         extras["passes"] = None
     found = strategy.change(params, optimizers, state, step, **extras)
     return {f.name: int(getattr(found, f.name)) for f in fields(found) if getattr(found, f.name)}

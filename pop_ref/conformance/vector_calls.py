@@ -126,8 +126,8 @@ _MASKS: Final = {
 # gsplat's lists of intersections; of an entry of a batch they are left out
 _LISTS: Final = {
     "tiles_per_gauss": ("[C, N]", "tiles that each Gaussian's extent overlaps, 'tiles_per_gauss' of meta"),
-    "list_rows": ("[I]", "who lies in each tile of each camera, front to back: row c N + i, or where rows are packed "
-                  "the place among visible ones; 'flatten_ids' of meta"),
+    "list_rows": ("[I]", "which Gaussians lie in each tile of each camera, front to back: row c N + i, or where rows "
+                  "are packed the place among visible ones; 'flatten_ids' of meta"),
     "list_keys": ("[I]", "camera and tile of each: c 2^b + tile, b the bits of the number of tiles; the upper 32 bits "
                   "of 'isect_ids' of meta"),
 }  # fmt: skip

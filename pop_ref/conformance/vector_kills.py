@@ -3,7 +3,7 @@
 Every mutant answers the vectors as a port would; it is killed where an array fails, or where it raises. The laws see
 more: they draw scenes, compare a rasterizer with itself, and judge stages that no vector is about.
 
-With `--more`, after vectors or mutants were added and none was changed, whom the file says to be killed stays so, and
+With `--more`, after vectors or mutants were added and none was changed, what the file says to be killed stays so, and
 the others are tried.
 """
 
@@ -61,11 +61,11 @@ Kills = dict[str, dict[str, str | None]]
 
 
 def kills(report: Callable[[str, str | None], None] = lambda name, found: None, known: Kills | None = None) -> Kills:
-    """Return by family and mutant what fails first, None for who survives; sound backends are a family, too.
+    """Return by family and mutant what fails first, None for a mutant that survives; sound backends are a family, too.
 
     Args:
         report: is given every name and result as it comes.
-        known: who is killed in these is not tried.
+        known: a mutant that is killed in these is not tried.
     """
     families = {"stages of the oracle": MUTANTS, "the program that trains": PROGRAM, "whole rasterizers": BLACK_BOXES}
     found: Kills = {family: {} for family in (*families, "sound")}

@@ -136,7 +136,7 @@ class Replay:
         if not len(at):
             raise LookupError(f"no pass over view {index} of {n} Gaussians, {sh_degree} bands, {divisor} times smaller")
         k, rows = int(at[0]), slice(self._pass_ends[at[0]] - n, self._pass_ends[at[0]])
-        # who is shown a pass may add to its arrays
+        # what is shown a pass may add to its arrays
         found = Contributions(*(self._arrays[f"pass_{name}"][rows].copy() for name in _SUMS))
         of_rows = {name: self._arrays[f"pass_{name}"][rows].copy() for name in _OF_ROWS}
         return Pass(found, **of_rows, **{name: self._arrays[f"pass_{name}"][k] for name in _OF_PIXELS})

@@ -117,7 +117,7 @@ def pop_kind() -> dict[str, Any]:
     arrays = {
         "opacities": entry("input", "[N]", "in [0, 1]"),
         "dominant_counts": entry("input", "[N]", "pixels that each Gaussian has dominated", "int64"),
-        "important": entry("output", "[N]", "1 for who has dominated a pixel, else 0", "int64", [equal()]),
+        "important": entry("output", "[N]", "1 for a Gaussian that has dominated a pixel, else 0", "int64", [equal()]),
         **output("pop_loss", "[]", "mean of 1 - o over the important + mean of o over the others", "polarization.loss"),
         **output("v_opacities", "[N]", "derivative of v_loss times the loss", "polarization.gradient"),
     }

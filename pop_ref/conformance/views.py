@@ -231,8 +231,9 @@ def refusal_of(backend: Any, call: Call) -> str | None:
     """Make a call that asks for one thing, and return in what words the backend refuses it; None if it does not.
 
     A refusal is an error that the backend raised on purpose about an argument where it is asked for without
-    backgrounds; who takes it with backgrounds takes it. Where the call without backgrounds ends in any other error, an
-    assertion among them, that is a defect: the argument counts as taken, so that laws run into the error and report it.
+    backgrounds; a rasterizer that takes it with backgrounds takes it. Where the call without backgrounds ends in any
+    other error, an assertion among them, that is a defect: the argument counts as taken, so that laws run into the
+    error and report it.
     What goes wrong with backgrounds alone, as packed rows in gsplat 1.5.3 (gsplat#764), is for laws of packed rows.
 
     Args:

@@ -1,7 +1,7 @@
 """The course's own inputs of every function: a few plain ones, and ones that only a part of the definition decides.
 
 Each special input says in words what is special about it, so that a function which is wrong on these alone can be told
-so. All are drawn once from fixed seeds: who is judged twice is judged alike.
+so. All are drawn once from fixed seeds: a solution that is judged twice is judged alike.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Who may talk to the viewer's server, and how much: checked before viser hears of it.
+"""Which pages may talk to the viewer's server, and how much: checked before viser hears of it.
 
 Any page that a browser has open can send requests to this machine, and with a name that resolves to it (DNS rebinding)
 read the answers. So a request must name this server (Host), come from the page that it sent (Origin) and carry the
@@ -191,7 +191,7 @@ class Guard:
     Args:
         host: what the server was asked to listen on.
         listening: the socket that it listens on.
-        tell: is called with a line on what was refused of somebody who was let in.
+        tell: is called with a line on what was refused of a connection that was let in.
 
     Attributes:
         token: a random word that stands in the address.

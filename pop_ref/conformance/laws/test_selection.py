@@ -1,4 +1,4 @@
-"""Laws of selection: who is kept by a score, by a share of the mass, or by a draw."""
+"""Laws of selection: which Gaussians are kept by a score, by a share of the mass, or by a draw."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_a_draw_takes_the_first_arrivals_of_an_exponential_race(backend, masses,
     arrivals = np.array([-math.log1p(-p) / w if w > 0.0 else math.inf for p, w in zip(u, masses, strict=True)])
     last = np.max(arrivals[drawn], initial=-math.inf)
     left = np.delete(arrivals, drawn)
-    assert np.all(left >= last * (1.0 - 2.0**-20)), "somebody who was not drawn arrived before one who was"
+    assert np.all(left >= last * (1.0 - 2.0**-20)), "a Gaussian that was not drawn arrived before one that was"
 
 
 @law("selection", "sample_without_replacement", masses=masses, uniforms=uniforms)

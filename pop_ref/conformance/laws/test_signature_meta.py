@@ -27,7 +27,7 @@ SIZES = ("width", "height", "tile_size", "tile_width", "tile_height", "n_cameras
 
 
 def _made(backend, names, **options):
-    """Return what came of a call of two cameras; skip who tells none of the keys."""
+    """Return what came of a call of two cameras; skip a rasterizer that tells none of the keys."""
     of = made(backend, Call((frames(backend, 1, 2),), **options))
     if not any(name in of.called.meta for name in names):
         pytest.skip(f"{backend.name} has no meta {', '.join(names)}")
@@ -35,7 +35,7 @@ def _made(backend, names, **options):
 
 
 def _listed(backend, *more, **options):
-    """Return such a call whose meta has tile lists, and the keys besides; skip who does not tell them all."""
+    """Return such a call whose meta has tile lists, and the keys besides; skip a rasterizer that lacks some."""
     of = made(backend, Call((frames(backend, 1, 2),), **options))
     lacks = [*lacks_for_tiles(of), *(name for name in more if name not in of.called.meta)]
     if not backend.takes("tile_size") and backend.own_tile_size is None:

@@ -201,7 +201,7 @@ BASELINES: Final = (
     ),
     Mutant(
         "importance_of_the_never_dominant",
-        "who dominates no pixel of any view keeps its importance",
+        "a Gaussian that dominates no pixel of any view keeps its importance",
         "mini_splatting.py",
         "return np.where(dominant_sum > 0, importance, 0.0)",
         "return importance",

@@ -15,7 +15,7 @@ SUMS: Final = f"{_LAWS}:a_training_collects_the_oracles_gradients_views_and_blur
 _LINES: Final = (
     (
         "masked_pixels_are_dominated",
-        "pixels that a mask leaves out count for who dominates them",
+        "pixels that a mask leaves out count for the Gaussians that dominate them",
         "train/views.py",
         "ids = dominant_ids[0][mask & (dominant_ids[0] >= 0)]",
         "ids = dominant_ids[0][dominant_ids[0] >= 0]",

@@ -166,14 +166,14 @@ def _seen_from_the_first(sound: Rasterization, given: Given) -> Any:
 
 
 def _culled_by_the_first(given: Given) -> Any:
-    """Return opacities of 0 for whom the first camera has behind it or before its near plane."""
+    """Return opacities of 0 for Gaussians behind the first camera or before its near plane."""
     viewmat, means = given["viewmats"][..., 0, :, :], given["means"]
     depths = (means * viewmat[..., None, 2, :3]).sum(-1) + viewmat[..., 2, 3, None]
     return given["opacities"] * (depths.detach() >= given["near_plane"])
 
 
 def _clipped_along(axes: Callable[[Any], Any]) -> Breaks:
-    """Clip by a rule of one's own: `axes` says of [..., C, N, 2] small extents who is culled; by all cameras alike."""
+    """Clip by a rule of one's own: `axes` says of [..., C, N, 2] small extents what is culled; by all cameras alike."""
 
     def breaks(sound: Rasterization, given: Given) -> Any:
         if not _clipped(given) or _several(given):
@@ -359,7 +359,7 @@ BOXES: Final[tuple[tuple[str, str, Breaks, str], ...]] = (
      _if(_packed, render_mode=lambda g: g["render_mode"].replace("ED", "D")), IMAGES),
     ("packed_blind_cameras_are_black", "a camera that sees no packed row is left black, without its background",
      _then(_packed, _images_of(_black_where_nothing_is_seen)), IMAGES),
-    ("packed_rows_of_the_first_camera", "who is behind the first camera has no packed row of any",
+    ("packed_rows_of_the_first_camera", "a Gaussian behind the first camera has no packed row of any",
      _if(_both(_packed, _several), opacities=_culled_by_the_first), IMAGES),
     ("packed_lists_hold_gaussians", "flatten_ids of packed rows are Gaussians, not rows",
      _told(_packed, flatten_ids=lambda g, m: m["gaussian_ids"][m["flatten_ids"].long()]), TILES),
@@ -374,7 +374,7 @@ BOXES: Final[tuple[tuple[str, str, Breaks, str], ...]] = (
     # two arguments
     ("radius_clip_by_width", "radius_clip looks at the extent along x alone",
      _clipped_along(lambda small: small[..., 0]), IMAGES),
-    ("radius_clip_by_either", "radius_clip culls who is small along one axis",
+    ("radius_clip_by_either", "radius_clip culls Gaussians that are small along one axis",
      _clipped_along(lambda small: small.any(-1)), IMAGES),
     ("radius_clip_ignored_with_covariances", "radius_clip is lost where covariances are given",
      _if(_covars, radius_clip=0.0), IMAGES),
@@ -390,7 +390,7 @@ BOXES: Final[tuple[tuple[str, str, Breaks, str], ...]] = (
      _if(_several, rasterize_mode="classic"), IMAGES),
     ("antialiasing_has_its_own_low_pass", "antialiasing takes the low-pass of 0.3 px^2, whatever the call says",
      _if(_antialiased, eps2d=0.3), IMAGES),
-    ("near_plane_of_the_first_camera", "the first camera's depth decides for all who is before the near plane",
+    ("near_plane_of_the_first_camera", "the first camera's depth decides for all what is before the near plane",
      _if(_several, opacities=_culled_by_the_first), IMAGES),
     ("near_plane_ignored_with_depth", "depth modes have a near plane of their own",
      _if(_deep, near_plane=0.01), IMAGES),

@@ -109,7 +109,7 @@ _LINES: Final = (
     ),
     (
         "clones_before_survivors",
-        "who is split is looked up as if the clones stood before the rest",
+        "a Gaussian to split is looked up as if the clones stood before the rest",
         "density/control.py",
         "padded = torch.cat([splits, splits.new_zeros(n_clones)])",
         "padded = torch.cat([splits.new_zeros(n_clones), splits])",
@@ -309,7 +309,7 @@ _LINES: Final = (
     ),
     (
         "mask_of_the_first_camera",
-        "of several cameras the first one's counts say who is important",
+        "of several cameras the first one's counts say which Gaussians are important",
         "density/control.py",
         "mask = importance_mask(dominant_counts(info).sum(0))",
         "mask = importance_mask(dominant_counts(info)[0])",

@@ -273,7 +273,7 @@ def _order_in_steps(steps: int, farthest: float) -> Callable[[dict[str, Any]], d
         torch, depths = _torch(), _depths(given)
         keys = (depths.clamp(0.0, farthest) / farthest * steps).floor()
         order = torch.argsort(keys, stable=True)
-        # the sound program sorts by depth; it is given the depths of who stands at each place
+        # the sound program sorts by depth; it is given the depths of the Gaussians at each place
         sorted_depths = torch.sort(depths).values
         wanted = torch.empty_like(depths)
         wanted[order] = sorted_depths

@@ -438,7 +438,7 @@ _BOXES: Final = (
     ),
     (
         "radius_clip_exclusive",
-        "who is exactly as large as radius_clip is drawn (gsplat compares with <=)",
+        "a Gaussian exactly as large as radius_clip is drawn (gsplat compares with <=)",
         _given(lambda given: {"radius_clip": given["radius_clip"] * (1.0 - 2.0**-20)}),
         "test_signature_arguments:what_is_no_larger_than_radius_clip_is_culled",
     ),

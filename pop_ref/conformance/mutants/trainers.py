@@ -131,7 +131,7 @@ _LINES: Final = (
     ),
     (
         "large_on_screen_need_a_gradient",
-        "who is large on the screen is split only if its gradient is large, too (gsplat PR#354)",
+        "a Gaussian that is large on the screen is split only if its gradient is large, too (gsplat PR#354)",
         "density/control.py",
         'masks[1] | (state["radii"] > self.grow_scale2d)',
         'masks[1] | ((state["radii"] > self.grow_scale2d) & (state["grad2d"] > self.grow_grad2d * state["count"]))',

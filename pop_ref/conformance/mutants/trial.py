@@ -44,7 +44,7 @@ def obeys(stated: Law, backend: Any, examples: int = EXAMPLES["ci"]) -> str | No
 
     Args:
         stated: the law.
-        backend: who is judged.
+        backend: that is judged.
         examples: how many are drawn; 0 tries what the law is tried on first, and nothing else.
     """
     try:

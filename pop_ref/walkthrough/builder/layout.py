@@ -295,7 +295,7 @@ def _aside(title: str, code: str) -> str:
 
 
 def _folded_source(found: re.Match[str]) -> str:
-    """Fold a function that a reader may write first; a script opens it for who has passed its stage."""
+    """Fold a function that a reader may write first; a script opens it once its stage is passed."""
     first = f"Yours to write: pop learn check {found[2]}. Click again to see it."
     told = f'<span role="status" data-first="{first}"></span>'
     summary = f"<summary>The oracle's, {found[1]} {told}</summary>"
