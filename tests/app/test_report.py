@@ -343,6 +343,9 @@ def test_a_gaussian_in_front_of_a_camera_is_a_floater(result: Path, shared_captu
     assert found.floaters[view.name] > before + 0.02
     # and only there
     assert {name for name, share in found.floaters.items() if share > 0.02} == {view.name}
+    stats = json.loads((result / "stats" / "val_step0029.json").read_text())
+    assert found.held_out_psnr < stats["psnr"] - 0.02
+    assert found.without_floaters == pytest.approx(stats["psnr"], abs=1e-3)
 
 
 @pytest.mark.usefixtures("short_orbit")

@@ -61,6 +61,13 @@ GOOD = Checks(
             "good",
             "2 photographs' views and 60",
         ),
+        ("Floaters", {"floaters": {"a": 0.3}, "without_floaters": 29.45}, "bad", "29.45 dB instead of 29.50"),
+        (
+            "Floaters",
+            {"floaters": {"a": 0.3}, "without_floaters": 28.0},
+            "look",
+            "without them held-out views have 28.00",
+        ),
         ("Fit", {}, "good", "reach 31.00 dB"),
         ("Fit", {"misfits": {"a": 0.02, "b": 0.05}}, "look", "3.5 % of a photograph is far from its render"),
         ("Fit", {"train_psnr": 21.0, "held_out_psnr": 19.0}, "look", "cameras that are wrong"),

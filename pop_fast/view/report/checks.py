@@ -74,6 +74,8 @@ class Checks:
         floaters: share of each held-out view's pixels (training views where none is held out) that Gaussians cover by a
             tenth or more which are nearer than half the distance of the nearest points; empty without points.
         orbit_floaters: the same of the views of the orbit, which stand between the photographs, by their number.
+        without_floaters: mean of `held_out` once Gaussians whose centres stand where floaters do are left out, dB; None
+            where there are none, or no such views.
         misfits: share of each rendered training view that is far from its photograph where the rest is near.
         steps: that were taken; None where an older version has measured.
         exposures_learned: whether the run learned each training photograph's exposure, with which those views are
@@ -90,6 +92,7 @@ class Checks:
     stops: Mapping[str, float] = field(default_factory=dict)
     floaters: Mapping[str, float] = field(default_factory=dict)
     orbit_floaters: Mapping[str, float] = field(default_factory=dict)
+    without_floaters: float | None = None
     misfits: Mapping[str, float] = field(default_factory=dict)
     steps: int | None = None
     exposures_learned: bool = False
@@ -145,6 +148,9 @@ def write_checks(
     exposures = any("exposure" in found for found in learned.values())
     # random points say nothing of where things are
     known = _RANDOM not in capture.source
+    near = are_floaters(params["means"], capture, config.test_every) if known else torch.zeros(0, dtype=torch.bool)
+    cleared = {name: tensor[~near] for name, tensor in params.items()} if near.any() else {}
+    without = [(view, looked(view, cleared).image) for view in test] if cleared else []
     turn = orbit_views(train)
     checks = Checks(
         photographs=len(train),
@@ -157,6 +163,7 @@ def write_checks(
         stops={view.name: stops_between(*_kept(view, seen[view.name].image)) for view in (*some, *test)},
         floaters=_floaters(capture, test or some, params, looked) if known else {},
         orbit_floaters=_floaters(capture, turn, params, looked) if known else {},
+        without_floaters=_mean([_psnr(view, _matched(view, im) if exposures else im) for view, im in without]),
         misfits={view.name: misfit_share(view, fitted[view.name]) for view in some},
         steps=step + 1,
         exposures_learned=exposures,

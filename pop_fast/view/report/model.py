@@ -26,6 +26,7 @@ _FAR_APART: Final = 15.0  # degrees between neighbouring cameras
 _DRIFT: Final = 0.15  # stops, standard deviation over the photographs
 _ONE_OFF: Final = 0.35  # stops, of a single photograph
 _FLOATERS: Final = 0.01  # of the pixels
+_DEAR: Final = 0.2  # dB that held-out views may lose when floaters are left out
 _VEIL: Final = 0.25  # of the pixels of a view, which is then hidden
 _WON: Final = 0.5  # dB, by scaling each render to its photograph's brightness
 # training views under it contradict one another, or were not trained on for long; dB
@@ -255,12 +256,18 @@ def _floating(checks: Checks) -> Iterator[Finding]:
         text = f"{100.0 * values.mean():.2f} % {what}; at most {100.0 * values[worst]:.2f} % of a view{looked}."
         yield Finding("good", "Floaters", text)
         return
-    few = float(values.mean()) < _FLOATERS and values.max() < _VEIL
     text = f"{100.0 * values.mean():.1f} % {what}; worst {names[worst]}, {100.0 * values[worst]:.1f} %{looked}."
+    judged, without = checks.judged_psnr, checks.without_floaters
+    then = "" if judged is None or without is None else f"held-out views have {without:.2f} dB instead of {judged:.2f}"
+    if judged is not None and without is not None and judged - without > _DEAR:
+        text += f" They stand for what photographs show, things that moved or light that changed: without them {then}."
+        yield Finding("look", "Floaters", text, ("data", "check", "DATA"))
+        return
+    few = float(values.mean()) < _FLOATERS and values.max() < _VEIL
     covered = [name for name, share in checks.orbit_floaters.items() if share >= _VEIL]
     if covered:
         text += f" A veil hides much of {len(covered)} views between the photographs, as in {covered[0]}."
-    text += " Leaving out those whose centres stand there takes part of it away, and costs the photographs little."
+    text += " Leaving out those whose centres stand there takes part of it away" + (f"; {then}." if then else ".")
     fix = ("export", "RESULT", "--to", "html", "--without-floaters")
     yield Finding("look" if few else "bad", "Floaters", text, fix)
 
