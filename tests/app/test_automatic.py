@@ -82,7 +82,8 @@ def test_few_photographs_are_not_looked_at_for_as_long_as_the_minutes_allow() ->
     short = choose_length(config, SPEED, 0.5, 1e5, 11, 2)
     assert short.scaler < few.scaler
     assert short.why is None
-    enough = choose_length(config, SPEED, 1e4, 1e5, 18, 2)
+    assert choose_length(config, SPEED, 1e4, 1e5, 34, 4).scaler == pytest.approx(LOOKS * 30 / 30_000)
+    enough = choose_length(config, SPEED, 1e4, 1e5, 35, 4)
     assert (enough.scaler, enough.why) == (1.0, None)
 
 
