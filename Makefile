@@ -48,8 +48,8 @@ site: demo walkthrough  ## build docs/, the walk-through and the demo's report a
 # tests wait for browsers and for processes of their own; those are many, and read what the first of them compiled
 TESTS := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-test: setup  ## run the tests; those that rehearse jobs for GPU nodes are left to test-all
-	$(TESTS) -m "not rehearsal"
+test: setup  ## run the tests; slow ones and those that rehearse jobs for GPU nodes are left to test-all
+	$(TESTS) -m "not rehearsal and not slow"
 
 test-all: setup  ## run every test
 	$(TESTS)

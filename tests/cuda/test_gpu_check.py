@@ -218,6 +218,7 @@ def test_a_training_without_the_package_of_the_command_line_is_skipped(tmp_path,
     assert (found["status"], "needs tyro" in found["skipped"]) == (0, True)
 
 
+@pytest.mark.slow
 def test_rows_of_the_paper_are_trained_and_brought_back(tmp_path, monkeypatch):
     assert "no captures" in gpu_check_stages.reproduce_stage(check(tmp_path))["skipped"]
     monkeypatch.setattr(gpu_check_stages, "REPRODUCED", ("l1_div_100",))

@@ -69,7 +69,10 @@ def test_a_port_in_cpp_obeys_the_laws_of_images_and_gradients(port: Path, tmp_pa
     assert passed >= 60, done.stdout
 
 
-@pytest.mark.parametrize(("right", "wrong", "status"), [("", "", 0), ("% w.width) + 0.5", "% w.width)", 1)])
+@pytest.mark.parametrize(
+    ("right", "wrong", "status"),
+    [("", "", 0), pytest.param("% w.width) + 0.5", "% w.width)", 1, marks=pytest.mark.slow)],
+)
 def test_the_port_of_the_page_obeys_the_laws_of_images_and_a_broken_one_does_not(
     tmp_path: Path, right: str, wrong: str, status: int
 ) -> None:

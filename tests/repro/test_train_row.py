@@ -281,7 +281,10 @@ SHORT = {"steps_scaler": 0.004}
 
 @pytest.mark.parametrize(
     ("row", "base", "shared", "stop"),
-    [("pup", "3dgs_2023", 120, 140), ("mini_splatting_star", "mini_splatting", 60, 90)],
+    [
+        pytest.param("pup", "3dgs_2023", 120, 140, marks=pytest.mark.slow),
+        ("mini_splatting_star", "mini_splatting", 60, 90),
+    ],
 )
 def test_a_row_that_begins_from_its_base_comes_to_what_it_comes_to_alone(
     row, base, shared, stop, tmp_path, monkeypatch

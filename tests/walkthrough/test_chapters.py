@@ -122,6 +122,7 @@ def _run_otherwise(number: str, by: int, *changes: tuple[str, str]) -> None:
     run_chapter(read_chapter(path, moved))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", OTHER_DRAWS)
 def test_what_a_chapter_concludes_holds_for_other_draws_too(number: str) -> None:
     _run_otherwise(number, OTHER_DRAWS[number])

@@ -191,7 +191,11 @@ def test_a_number_that_is_not_finite_is_found_on_the_device(engine, tmp_path):
 # The golden ladder, and steps of a real run each judged by the oracle's from the same state; see `tests.train`.
 
 
-@pytest.mark.parametrize(("recipe", "steps"), [(SHORT, 10), (RECIPE, STEPS)], ids=["ten", "three-hundred"])
+@pytest.mark.parametrize(
+    ("recipe", "steps"),
+    [(SHORT, 10), pytest.param(RECIPE, STEPS, marks=pytest.mark.slow)],
+    ids=["ten", "three-hundred"],
+)
 def test_every_step_is_the_oracles(engine, recipe, steps, tmp_path):
     found = judged(run_of(recipe, tmp_path, engine), recipe, steps)
     agree(found)
