@@ -35,6 +35,7 @@ def test_the_named_law_kills_the_mutant(mutant: Mutant) -> None:
     assert killed_by(mutant) is not None, f"{mutant.name} survives {mutant.law}"
 
 
+@pytest.mark.slow  # together they are
 @pytest.mark.parametrize(("mutant", "dtype"), TRIED, ids=lambda value: getattr(value, "name", value))
 def test_the_named_law_kills_the_mutant_in_either_precision(mutant: Mutant | BlackBox, dtype: str) -> None:
     assert killed_by(mutant, dtype) is not None, f"{mutant.name} survives {mutant.law} in {dtype}"
