@@ -213,10 +213,10 @@ def _path() -> str:
 
 
 def drawn(run: Run, folder: Path) -> Path | None:
-    """Draw a run's picture, once; return where it is."""
+    """Draw a run's picture, once, into its folder of the run's folder; return where it is."""
     if run.picture is None:
         return None
-    png = PICTURES / (re.sub(r"\W+", "_", f"{run.of} {run.caption}").strip("_") + ".png")
+    png = folder / PICTURES.name / (re.sub(r"\W+", "_", f"{run.of} {run.caption}").strip("_") + ".png")
     if not png.exists():
         png.parent.mkdir(exist_ok=True)
         run.picture(folder, png)
@@ -263,13 +263,15 @@ def page() -> str:
     """Run every command, and make the page of it."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        shutil.rmtree(PICTURES, ignore_errors=True)
         environment = os.environ | {"PYTHONPATH": str(ROOT)}
         subprocess.run(
             module_command("pop_fast.cli", "demo", "bare"), cwd=folder, check=True, env=environment, capture_output=True
         )
         (folder / "bare" / "images").rename(folder / "photos")
         parts = [*sections(folder, RUNS, "pop", OF_POP), *sections(folder, REPRO, "pop-repro", OF_REPRO)]
+        # only now: a page that is cut off half made leaves the one that is there, with its pictures
+        shutil.rmtree(PICTURES, ignore_errors=True)
+        shutil.copytree(folder / PICTURES.name, PICTURES)
     return "\n\n".join([_HEAD, *parts]) + "\n"
 
 
@@ -278,10 +280,6 @@ def with_sections_of(names: list[str], text: str) -> str:
     with tempfile.TemporaryDirectory() as name:
         for program, all_runs, commands in (("pop", RUNS, OF_POP), ("pop-repro", REPRO, OF_REPRO)):
             runs = tuple(run for run in all_runs if run.of in names)
-            for run in runs:
-                PICTURES.joinpath(re.sub(r"\W+", "_", f"{run.of} {run.caption}").strip("_") + ".png").unlink(
-                    missing_ok=True
-                )
             made = "\n\n".join(sections(Path(name), runs, program, commands))
             for section in filter(None, re.split(r"^(?=## pop)", made, flags=re.M)):
                 head = section.partition("\n")[0]
@@ -293,6 +291,8 @@ def with_sections_of(names: list[str], text: str) -> str:
                 )
                 if n != 1:
                     raise ValueError(f"{PAGE.name} has {n} sections {head!r}; make the whole page with --write")
+        if (Path(name) / PICTURES.name).is_dir():
+            shutil.copytree(Path(name) / PICTURES.name, PICTURES, dirs_exist_ok=True)
     return text.rstrip() + "\n"
 
 
