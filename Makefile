@@ -25,7 +25,7 @@ $(STAMP): pyproject.toml pop_ref/pyproject.toml constraints.txt
 
 demo: setup  ## write the demo capture, train POP on it, leave report.html, PLY, renders and metrics in out/demo
 	$(BIN)/pop demo out/demo_capture --overwrite
-	$(BIN)/pop train out/demo_capture --out out/demo --minutes 1.5 --overwrite
+	$(BIN)/pop train out/demo_capture --out out/demo --minutes 1.25 --overwrite
 	@echo "open out/demo/report.html"
 
 walkthrough: setup  ## run the chapters and write pages, notebooks, slides and (with a Chromium) a PDF to out/walkthrough

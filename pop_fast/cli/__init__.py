@@ -171,7 +171,7 @@ def _overview() -> str:
             *lines,
             "",
             "start here:",
-            "  pop demo scene && pop train scene --preset quick",
+            "  pop demo scene && pop train scene --minutes 2",
             "  pop train my_photos --factor 4 --out out/mine",
             "",
             "'pop COMMAND --help' explains one. --debug (or POP_DEBUG=1) shows the traceback of an error.",

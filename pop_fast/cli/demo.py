@@ -12,7 +12,7 @@ import tyro
 from pop_fast.cli.arguments import parse
 
 _EXAMPLES: Final = """
-    pop demo scene && pop train scene --preset quick
+    pop demo scene && pop train scene --minutes 2
 """
 
 
@@ -45,5 +45,5 @@ def run(argv: Sequence[str]) -> int:
             args.out, args.seed, args.views, args.width, args.height, progress=progress, overwrite=args.overwrite
         )
     print(f"{args.views} photographs of {args.width} x {args.height} px -> {folder}")
-    print(f"next: pop train {folder} --preset quick")
+    print(f"next: pop train {folder} --minutes 2")
     return 0
