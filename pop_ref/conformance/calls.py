@@ -65,6 +65,7 @@ class Call:
         radius_clip: px; splats with both extents at most this are culled.
         planes: near_plane, far_plane and eps2d where they are not the profile's.
         covars: whether covariances are given instead of quaternions and scales.
+        overruled: with covariances, whether quaternions and scales of other Gaussians are given, too.
         no_background: whether the argument is left out; scenes are then black behind.
         sparse_grad: as gsplat's.
         absgrad: likewise, where gradients are asked for.
@@ -79,6 +80,7 @@ class Call:
     radius_clip: float = 0.0
     planes: dict[str, float] = field(default_factory=dict)
     covars: bool = False
+    overruled: bool = False
     no_background: bool = False
     sparse_grad: bool = False
     absgrad: bool = True
@@ -174,6 +176,14 @@ class Call:
         stored = round(np.sqrt(self.first.scene.gaussians.sh.shape[1])) - 1
         return stored if self.first.scene.sh_degree is None else self.first.scene.sh_degree
 
+    def without_gradients(self) -> dict[str, np.ndarray | None]:
+        """Return the quaternions and scales of a call with covariances, which go before them: others, or None."""
+        n = self.shape[2]
+        if not self.overruled:
+            return {"quats": None, "scales": None}
+        entries = (*self.batch, n)
+        return {"quats": np.full((*entries, 4), 0.5), "scales": np.full((*entries, 3), 2.0**-6)}
+
     def described(self) -> list[str]:
         """Name the arguments that are not at gsplat's defaults, each with its value."""
         stored, used = self.first.scene.gaussians.sh.shape[1], self.sh_degree
@@ -188,7 +198,8 @@ class Call:
             f"render_mode={self.render_mode!r}": self.render_mode != "RGB",
             "backgrounds": not self.no_background,
             "rasterize_mode='antialiased'": self.antialiased,
-            "covars": self.covars,
+            "covars": self.covars and not self.overruled,
+            "covars, quats and scales": self.overruled,
             f"radius_clip={self.radius_clip:g}": self.radius_clip > 0.0,
             **{f"{name}={value:g}": True for name, value in self.planes.items()},
             f"tile_size={self.tile_size}": self.tile_size != 16,
@@ -225,9 +236,12 @@ def simpler_calls(call: Call) -> Iterator[Call]:
     if call.first.colors is not None:
         behind = np.zeros(3) if call.no_background else np.array([0.25, 0.5, 0.75])
         yield _each_frame(call, lambda f: Frame(f.scene.with_overrides(background=behind), None, f.blind))
-    for name, default in (("packed", False), ("render_mode", "RGB"), ("covars", False), ("radius_clip", 0.0),
-                          ("sparse_grad", False), ("dominance", False), ("absgrad", False)):  # fmt: skip
-        if getattr(call, name) != default and not (name == "packed" and call.sparse_grad):
+    for name, default in (("packed", False), ("render_mode", "RGB"), ("overruled", False), ("covars", False),
+                          ("radius_clip", 0.0), ("sparse_grad", False), ("dominance", False),
+                          ("absgrad", False)):  # fmt: skip
+        if getattr(call, name) != default and not (
+            (name == "packed" and call.sparse_grad) or (name == "covars" and call.overruled)
+        ):
             yield replace(call, **{name: default})  # type: ignore[arg-type]
     if not call.no_background:
         yield without_backgrounds(call)

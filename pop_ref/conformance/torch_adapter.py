@@ -320,7 +320,7 @@ class TorchAdapter(Adapter):
         pulls, (B, C, _), camera = v_images is not None, call.shape, call.first.scene.camera
         leaves = {name: self._tensor(value).requires_grad_(pulls) for name, value in call.tensors().items()}
         images, alphas, meta = self._rasterization(
-            **{"quats": None, "scales": None} | leaves,
+            **{name: self._tensor(value) for name, value in call.without_gradients().items()} | leaves,
             Ks=self._tensor(call.intrinsics()),
             width=(W := camera.width),
             height=(H := camera.height),

@@ -59,6 +59,11 @@ def test_covariances_draw_what_their_quaternions_and_scales_draw(backend):
         assert_call_is_the_oracles(backend, Call((frames(backend, seed),), covars=True))
 
 
+@law("signature", *JUDGED, COVARS)
+def test_covariances_go_before_quaternions_and_scales(backend):
+    assert_call_is_the_oracles(backend, Call((frames(backend, 3),), covars=True, overruled=True))
+
+
 @law("signature", *JUDGED, PLANES)
 def test_the_near_and_the_far_plane_are_where_the_call_says(backend):
     for planes in ({"near_plane": 2.0}, {"far_plane": 4.0}, {"near_plane": 1.5, "far_plane": 4.5}):

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from pop_ref.conformance.calls import Call
+import numpy as np
+
+from pop_ref.conformance.calls import Call, Frame
 from pop_ref.conformance.capabilities import (
     BATCHES,
     CAMERA_COLORS,
     CAMERAS,
+    COLORS,
     PACKED,
     SIGNATURE,
 )
 from pop_ref.conformance.law import law
 from pop_ref.conformance.meta import assert_rows
-from pop_ref.conformance.signature import assert_call_is_the_oracles
+from pop_ref.conformance.signature import assert_call_is_the_oracles, expectations
 from pop_ref.conformance.views import frames
 
 JUDGED = (SIGNATURE,)
@@ -29,6 +32,15 @@ def test_every_camera_has_the_colours_and_harmonics_that_were_given_for_it(backe
     for channels in (0, 3):
         row = frames(backend, 3, 3, channels=channels, camera_colors=True)
         assert_call_is_the_oracles(backend, Call((row,), camera_colors=True))
+
+
+@law("signature", *JUDGED, CAMERAS, COLORS)
+def test_where_there_are_as_many_gaussians_as_cameras_a_colour_is_a_gaussians(backend):
+    row = frames(backend, 0, 3, channels=3)
+    visible = [wanted.render.splats.visible for wanted in expectations(backend, Call((row,)))[0]]
+    seen = np.flatnonzero(np.all(visible, axis=0))[:3]
+    few = tuple(Frame(frame.scene.rows(seen), frame.colors[seen]) for frame in row)
+    assert_call_is_the_oracles(backend, Call((few,)))
 
 
 @law("signature", *JUDGED, CAMERAS, BATCHES)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -53,6 +55,27 @@ def test_meta_says_what_was_asked(backend):
 @law("signature", *JUDGED, CAMERAS)
 def test_the_splats_that_meta_shows_are_the_oracles(backend):
     assert_rows(backend, _made(backend, (*ROWS, "radii")))
+
+
+@law("signature", *JUDGED, CAMERAS)
+def test_the_splats_that_meta_shows_where_nothing_requires_a_gradient_are_the_oracles(backend):
+    of = _made(backend, (*ROWS, "radii"))
+    assert_rows(backend, dataclasses.replace(of, called=backend.call(of.call)))
+
+
+@law("signature", *JUDGED, EXTENTS)
+def test_extents_that_sixteen_bits_do_not_hold_are_told_as_they_are(backend):
+    (frame,) = frames(backend, 1)
+    huge = frame.scene.with_overrides(scales=frame.scene.gaussians.scales * 2.0**13)
+    of = made(backend, Call(((Frame(backend.sees(huge), None),),)))
+    if "radii" not in of.called.meta:
+        pytest.skip(f"{backend.name} has no meta radii")
+    ((wanted,),) = of.wanted
+    extents, found = wanted.render.splats.radii, of.called.meta["radii"].reshape(-1, 2)
+    assert np.any(extents > 2**15), "no splat is as large as that"
+    # an extent is rounded up, and rounding decides to what
+    off = np.abs(found - extents) > 1.0 + 2.0**10 * np.finfo(backend.dtype).eps * extents
+    assert not np.any(off), f"meta radii are {found[off][0]:g}, expected {extents[off][0]:g}"
 
 
 @law("signature", *JUDGED, CAMERAS)

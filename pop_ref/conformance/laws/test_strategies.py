@@ -84,6 +84,13 @@ def test_a_reset_at_step_zero_happens_where_it_is_asked_for(backend):
 
 
 @law("training", "scripted_steps", "method_settings")
+def test_no_reset_happens_where_refinement_ends(backend):
+    settings = {"refine_stop_iter": RESETS["reset_every"]}
+    happened = _assert_the_oracles(backend, script_of("gsplat", settings=settings, steps=(4, 11, 12, 13)))
+    assert "reset" not in happened
+
+
+@law("training", "scripted_steps", "method_settings")
 def test_the_prior_begins_and_ends_where_it_is_told_and_is_as_heavy_as_it_is_told(backend):
     steps = (0, 4, 5, 6, 14, 15, 16)
     for weight in (0.5, 2.0**-10):

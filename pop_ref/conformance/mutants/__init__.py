@@ -14,11 +14,13 @@ from pop_ref.conformance.mutants.seams import SEAMS
 from pop_ref.conformance.mutants.strangers import STRANGERS, STRANGERS_BOXES
 from pop_ref.conformance.mutants.trainers import TRAINERS, TRAINERS_BOXES
 from pop_ref.conformance.mutants.training import TRAINING
+from pop_ref.conformance.mutants.unseen import UNSEEN
+from pop_ref.conformance.mutants.unseen_boxes import UNSEEN_BOXES
 
 # of the oracle, and of the program that trains
 MUTANTS = (*GEOMETRY, *PIXELS, *TRAINING, *BASELINES, *METHOD_MUTANTS)
-PROGRAM = (*LINES, *TRAINERS, *COLLECTED, *STRANGERS)
+PROGRAM = (*LINES, *TRAINERS, *COLLECTED, *STRANGERS, *UNSEEN)
 # behind gsplat's signature: one argument broken, several together; autograd, memory, size
-BLACK_BOXES = (*SINGLE, *COMBINED, *SEAMS, *TRAINERS_BOXES, *STRANGERS_BOXES)
+BLACK_BOXES = (*SINGLE, *COMBINED, *SEAMS, *TRAINERS_BOXES, *STRANGERS_BOXES, *UNSEEN_BOXES)
 
 __all__ = ["BLACK_BOXES", "MUTANTS", "PROGRAM", "BlackBox", "Mutant", "living"]
