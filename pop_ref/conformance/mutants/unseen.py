@@ -1,4 +1,4 @@
-"""Fourteen mutants after slips of training programs, written in one go and tried on the laws that there were.
+"""Twelve mutants after slips of training programs, written in one go and tried on the laws that there were.
 
 `docs/kit.md` says how many were killed at first sight.
 """
@@ -92,14 +92,6 @@ _LINES: Final = (
         "test_optimizer:rates_rewind_and_fall_in_rounds_as_the_rules_say",
     ),
     (
-        "opacities_stop_a_step_late",
-        "opacities move once more at the step at which they should stand still",
-        "train/schedule.py",
-        "moved[rules.opacities_stop_iter :,",
-        "moved[rules.opacities_stop_iter + 1 :,",
-        "test_optimizer:adam_counts_the_updates_that_the_rules_leave_each_parameter",
-    ),
-    (
         "prior_begins_a_step_late",
         "the first step of the prior has none",
         "density/control.py",
@@ -114,14 +106,6 @@ _LINES: Final = (
         "(at / max_steps)",
         "(at / max(max_steps - 1, 1))",
         "test_strategies:a_training_by_pop_is_the_oracles_at_every_step",
-    ),
-    (
-        "prior_over_the_window_alone",
-        "with a window the Gaussians that this view is dominated by are not important",
-        "density/control.py",
-        'mask = mask | importance_mask(state["dominant_sum"])',
-        'mask = importance_mask(state["dominant_sum"])',
-        "test_strategies:a_training_is_the_oracles_under_every_reading",
     ),
 )
 

@@ -46,12 +46,6 @@ def _middle(given: Given) -> Given:
     return {"Ks": Ks}
 
 
-def _square(given: Given) -> Given:
-    Ks = given["Ks"].clone()
-    Ks[..., 1, 1] = Ks[..., 0, 0]
-    return {"Ks": Ks}
-
-
 def _rounded(value: Any, levels: float) -> Any:
     """Round, and let gradients pass."""
     return value + ((value * levels).round() / levels - value).detach()
@@ -178,12 +172,6 @@ _BOXES: Final = (
         "principal_point_in_the_middle",
         "cx and cy are not read (viewers draw about the centre)",
         _given(_middle),
-        "test_agreement:the_image_is_one_of_the_oracles_outcomes",
-    ),
-    (
-        "one_focal_length",
-        "fy is not read (pixels of viewers are square)",
-        _given(_square),
         "test_agreement:the_image_is_one_of_the_oracles_outcomes",
     ),
     (
