@@ -93,6 +93,29 @@ def test_the_low_pass_is_as_wide_as_the_call_says(backend):
         assert_call_is_the_oracles(backend, call)
 
 
+def _in_units(frame, unit):
+    """Return a frame of the same world, whose lengths are told in a unit: its picture is the same."""
+    scene = frame.scene
+    viewmat = scene.camera.viewmat.copy()
+    viewmat[:3, 3] *= unit
+    g = scene.gaussians
+    lengths = {"means": g.means * unit, "scales": g.scales * unit}
+    return dataclasses.replace(frame, scene=scene.with_overrides(**lengths, viewmat=viewmat))
+
+
+@law("signature", *JUDGED, PLANES)
+def test_a_world_told_in_other_units_is_drawn_alike(backend):
+    # where a coordinate is a millimetre or a light-year: no length may be compared with a constant of the renderer
+    drawn = []
+    for power in (0, -12, 12):
+        (frame,) = frames(backend, 5)
+        near, far = (plane * 2.0**power for plane in (0.0078125, 1e9))
+        call = Call(((_in_units(frame, 2.0**power),),), planes={"near_plane": near, "far_plane": far})
+        drawn.append(expectations(backend, call)[0][0].render.image)
+        assert_call_is_the_oracles(backend, call)
+    assert all(np.array_equal(image, drawn[0]) for image in drawn[1:]), "the oracle knows a length"
+
+
 @law("signature", *JUDGED, EXTENTS, RADIUS_CLIP)
 def test_what_is_no_larger_than_radius_clip_is_culled(backend):
     for seed, clip in ((7, 6.0), (8, 5.5)):

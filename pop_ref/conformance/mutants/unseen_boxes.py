@@ -184,13 +184,13 @@ _BOXES: Final = (
         "no_axis_under_a_thousandth",
         "scales are at least 0.001 (flat Gaussians blow up some solvers)",
         _through(lambda s: s.clamp(min=1e-3), "scales"),
-        "test_agreement:dominant_weights_are_the_oracles",
+        "test_signature_arguments:a_world_told_in_other_units_is_drawn_alike",
     ),
     (
         "no_axis_over_fifty",
         "scales are at most 50 (sky of SuperSplat's scenes)",
         _through(lambda s: s.clamp(max=50.0), "scales"),
-        "test_agreement:the_image_is_one_of_the_oracles_outcomes",
+        "test_signature_arguments:a_world_told_in_other_units_is_drawn_alike",
     ),
     (
         "opacities_at_most_99_percent",
