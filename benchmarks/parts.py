@@ -42,6 +42,10 @@ SPLAT, SEEN, LISTED, CHUNK = 64, 64, 12, TILE * TILE * 4 + TILE * 2
 SHORT: Final = 14  # numbers of a Gaussian without the bands beyond the first
 
 
+# a part in less than this of its floor is not possible: clocks differ by less between two measurements
+POSSIBLE: Final = 0.8
+
+
 @dataclass(frozen=True)
 class Work:
     """What a part has to do: operations on vectors of sixteen floats, and bytes moved."""
@@ -85,7 +89,11 @@ def works(row: Mapping[str, Any]) -> dict[str, Work]:
 
 
 def floors(row: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return each part's time, its floor, what bounds that, and their ratio."""
+    """Return each part's time, its floor, what bounds that, and their ratio.
+
+    Raises:
+        SystemExit: a part took far less than its floor, so that the peaks are not what this processor can do.
+    """
     found = {}
     for part, work in works(row).items():
         by = {
@@ -95,6 +103,8 @@ def floors(row: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         bound = max(by, key=lambda name: by[name])
         ms = row["parts_ms"][part]
         found[part] = {"ms": ms, "floor_ms": by[bound], "bound": bound, "ratio": ms / by[bound]}
+        if ms < POSSIBLE * by[bound]:
+            raise SystemExit(f"{part} took {ms:.2f} ms, and {bound} alone need {by[bound]:.2f}: peak.py measures too little")
     return found
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from cuda_ext.compiler import find_compiler, no_compiler
 
-LANES = 16  # floats of a vector
+LANES = 16  # floats of an operation as it is counted, whatever this processor's vectors are
 SOURCE = Path(__file__).resolve().with_suffix(".cpp")
 ROUNDS, REPEATS = 2_000_000, 9
 # bytes of the arrays that a bandwidth is measured on, and how many are moved at least: starting threads is little of it
@@ -24,10 +24,10 @@ SMALLEST, LARGEST, MOVED = 1 << 17, 1 << 28, 1 << 28
 
 @cache
 def vector_ops_per_s(threads: int) -> float:
-    """Return how many multiply-adds of sixteen floats so many threads do in a second: the best of a few runs."""
+    """Return how many times sixteen multiply-adds so many threads do in a second: the best of a few runs."""
     library = _library()
     seconds = _best([lambda: library.multiply_adds(ROUNDS, 0.5, 1.0)] * threads)
-    return threads * ROUNDS * int(library.chains()) / seconds
+    return threads * ROUNDS * int(library.a_round()) / LANES / seconds
 
 
 def bytes_per_s(moved: float, threads: int) -> float:

@@ -282,7 +282,7 @@ def speed() -> str:
             what = f"blend and backward alone, {_size(case)}, {blend['tile']} px tiles"
             rows.append([what, ns["fast"], ns["compiled"], f"{ratio:.2f}"])
     made.append(_table(["", "`fast`", "`compiled`", "ratio of times"], rows))
-    made.append(f"{machine['cpu']}, {machine['threads']} threads, torch {machine['torch']}.")
+    made.append(f"{machine['cpu']}, {machine['capability']}, {machine['threads']} threads, torch {machine['torch']}.")
     return "\n\n".join(made)
 
 

@@ -135,7 +135,7 @@ def test_the_readme_takes_the_steps_with_the_renders(monkeypatch: pytest.MonkeyP
 
 def test_floors_follow_the_counts_and_the_machine(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     parts = script("parts")
-    monkeypatch.setattr(parts, "vector_ops_per_s", lambda threads: 1e6 * threads)
+    monkeypatch.setattr(parts, "vector_ops_per_s", lambda threads: 2e7 * threads)
     monkeypatch.setattr(parts, "bytes_per_s", lambda moved, threads: 1e9)
     row = case("64x32-100")
     found = parts.floors(row)
@@ -143,13 +143,22 @@ def test_floors_follow_the_counts_and_the_machine(script: Any, monkeypatch: pyte
     assert found["list"]["bound"] == "bytes"
     # 128 strips of 28 operations, 40 chunks of 346 and 8 a number of the picture, by two threads
     assert found["blend"]["bound"] == "operations"
-    assert found["blend"]["floor_ms"] == pytest.approx((128 * 28 + 40 * 346 + 8 * 3 * 64 * 32 / 16) / 2e3)
+    assert found["blend"]["floor_ms"] == pytest.approx((128 * 28 + 40 * 346 + 8 * 3 * 64 * 32 / 16) / 4e4)
     assert found["blend"]["ratio"] == pytest.approx(1.5 / found["blend"]["floor_ms"])
     # eight more strips change a pixel, of 37 operations
     more = parts.floors({**row, "counts": {**COUNTS, "reached": 72}})
-    assert more["transpose"]["floor_ms"] - found["transpose"]["floor_ms"] == pytest.approx(8 * 37 / 2e3)
+    assert more["transpose"]["floor_ms"] - found["transpose"]["floor_ms"] == pytest.approx(8 * 37 / 4e4)
     # one band has fewer numbers than four
     assert parts.works({**row, "degree": 0})["update"].bytes < parts.works(row)["update"].bytes
+
+
+def test_peaks_that_a_step_surpasses_are_no_peaks(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = script("parts")
+    # the projection of this case alone would then need 3.68 ms
+    monkeypatch.setattr(parts, "vector_ops_per_s", lambda threads: 5e5 * threads)
+    monkeypatch.setattr(parts, "bytes_per_s", lambda moved, threads: 1e12)
+    with pytest.raises(SystemExit, match=r"project took 1.50 ms, and operations alone need .*: peak.py measures too little"):
+        parts.floors(case("64x32-100"))
 
 
 def test_steps_on_more_cores_are_simulated_from_what_their_parts_take(script: Any) -> None:
