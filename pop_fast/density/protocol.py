@@ -142,14 +142,6 @@ class Strategy(Protocol):
         ...
 
 
-class Regularized(Protocol):
-    """A strategy that adds a term to the loss; trainers that know it call it before the backward pass."""
-
-    def regularizer(self, opacities: Tensor, state: State, step: int, info: Info) -> Tensor | None:
-        """Return the weighted term, or None when it is off at this step."""
-        ...
-
-
 def check_layout(params: Params, optimizers: Optimizers, needed: tuple[str, ...]) -> None:
     """Raise ValueError when keys, optimizers or row counts do not fit the protocol."""
     missing = [key for key in needed if key not in params]

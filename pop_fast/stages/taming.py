@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
 from pop_fast.stages.contributions import Contributions
-from pop_fast.stages.losses import photometric_3dgs
-from pop_fast.stages.stage_set import PassInput, Stages, view_of
-from pop_fast.stages.types import Camera, Gaussians
-from pop_ref.constants import INRIA, Profile
 
 # weights of the nine terms, of the view and of the two halves of the pixel map
 GRAD, OPACITY, DEPTH, RADIUS, SCALE = 25.0, 100.0, 5.0, 10.0, 25.0
@@ -96,33 +90,6 @@ def view_score(
         + scaled_to_median(BLEND, found.weight_sum)
     )
     return torch.where(visible, VIEW * float(photometric) * terms, 0.0)
-
-
-def taming_scores(
-    gaussians: Gaussians,
-    views: Sequence[tuple[Camera, Tensor]],
-    grads: Tensor,
-    background: Tensor | None = None,
-    sh_degree: int | None = None,
-    profile: Profile = INRIA,
-    *,
-    stages: Stages | None = None,
-) -> Tensor:
-    """See `pop_ref.taming.taming_scores`. [N] float64
-
-    Optimizations: the backend's stages, torch's by default.
-    """
-    degree = round(gaussians.sh.shape[1] ** 0.5) - 1 if sh_degree is None else sh_degree
-    black = gaussians.means.new_zeros(3) if background is None else background
-    scores = torch.zeros(len(gaussians.means), dtype=torch.float64)
-    for camera, photo in views:
-        view = view_of(PassInput(gaussians, camera, degree, black, profile, antialiased=False), stages or Stages())
-        seen = view.seen()
-        found = view.contributions(pixel_weights(seen.image, photo))
-        target = photo.to(seen.image.dtype) / 255.0
-        photometric = photometric_3dgs(seen.image, target, padding="same")
-        scores += view_score(photometric, grads, gaussians.opacities, gaussians.scales, seen.depths, seen.radii, found)
-    return scores
 
 
 def quotas(budget: int, n: int, n_clone: int, n_split: int) -> tuple[int, int]:
