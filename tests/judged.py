@@ -49,7 +49,9 @@ def judge_own_backends(metafunc: pytest.Metafunc) -> None:
         left_out |= {"fast64", "compiled32"}
     everywhere, compiled = ([b for b in of if b.name not in left_out] for of in (everywhere, compiled))
     concerned = [b for b in compiled if isinstance(b, Absent) or not (stated and missing(b, stated.needs))]
-    parametrize_backends(metafunc, [*everywhere, *concerned])
+    # `make test` judges what is not left out in one precision, too
+    second = {"compiled64"} if name == "TestSignaturePairs" else {"fast32", "compiled64"}
+    parametrize_backends(metafunc, [*everywhere, *concerned], dict.fromkeys(second, pytest.mark.slow))
 
 
 @functools.cache

@@ -12,7 +12,7 @@ import os
 import re
 import time
 import traceback
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -126,8 +126,16 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
         parametrize_backends(metafunc, _chosen_backends(metafunc.config))
 
 
-def parametrize_backends(metafunc: pytest.Metafunc, backends: list[Any]) -> None:
-    """Run a test that takes `backend` once for each; a law whose needs a backend lacks is skipped by name."""
+def parametrize_backends(
+    metafunc: pytest.Metafunc, backends: list[Any], marked: Mapping[str, pytest.MarkDecorator] | None = None
+) -> None:
+    """Run a test that takes `backend` once for each; a law whose needs a backend lacks is skipped by name.
+
+    Args:
+        metafunc: of the test.
+        backends: adapters.
+        marked: a mark of the tests on a backend, by its name.
+    """
     from pop_ref.conformance.law import missing
 
     if "backend" not in metafunc.fixturenames:
@@ -139,6 +147,7 @@ def parametrize_backends(metafunc: pytest.Metafunc, backends: list[Any]) -> None
 
         reason = getattr(backend, "reason", None) or f"{backend.name} has no {', '.join(_in_words(backend, lacks))}"
         marks = [pytest.mark.skip(reason=reason)] if lacks or hasattr(backend, "reason") else []
+        marks += [marked[backend.name]] if marked and backend.name in marked else []
         cases.append(pytest.param(backend, id=backend.name, marks=marks))
     metafunc.parametrize("backend", cases)
 

@@ -99,6 +99,7 @@ def compiler(folder: Path, script: str, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setenv("CXX", str(path))
 
 
+@pytest.mark.slow  # it compiles the kernels
 @needs_compiler
 def test_it_is_compiled_once_and_older_versions_go(fresh: Path, pop: Pop) -> None:
     assert "run `pop build-cpu`" in (compiled.why_not() or "")

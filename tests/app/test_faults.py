@@ -35,6 +35,7 @@ def tried(made_once: Callable[..., Path]) -> dict[str, Any]:
     return json.loads((made_once("faults", make) / "faults.json").read_text())
 
 
+@pytest.mark.slow  # every reader in processes of its own
 @pytest.mark.parametrize("reader", READERS)
 def test_a_damaged_file_is_read_or_refused_in_a_line(tried: dict[str, Any], reader: str) -> None:
     found = tried["fuzz"]["readers"][reader]

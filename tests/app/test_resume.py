@@ -132,6 +132,7 @@ def wait_for(condition, process, seconds=300.0):
         time.sleep(0.005)
 
 
+@pytest.mark.slow  # a training that is begun many times
 def test_sigkill_at_random_moments_changes_nothing(tmp_path_factory, tmp_path):
     reference = tmp_path_factory.mktemp("reference")
     run_to(reference)
@@ -257,6 +258,7 @@ def same(ours: Path, theirs: Path) -> None:
         assert equal, name
 
 
+@pytest.mark.slow  # four trainings by two processes
 @needs_gloo
 @pytest.mark.parametrize("method", RUNS)
 def test_two_processes_train_to_the_bits_of_one(together: Path, tmp_path: Path, method: str) -> None:

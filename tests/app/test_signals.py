@@ -153,6 +153,7 @@ def test_sigterm_while_a_capture_is_read_is_one_line_and_the_end(shared_capture:
     assert process.returncode == 143
 
 
+@pytest.mark.slow  # photographs of 12 megapixels
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_training_on_photographs_of_12_megapixels_is_gone_after_less_than_two_seconds_of_work(

@@ -313,6 +313,7 @@ def of_one_profile(profile: Profile) -> Any:
     return TorchAdapter(profile.name, rasterization, dtype="float32", profile=profile)
 
 
+@pytest.mark.slow  # all laws of the signature
 @pytest.mark.parametrize("profile", [GSPLAT_1_6, INRIA], ids=lambda profile: profile.name)
 def test_the_laws_of_the_signature_and_of_scale_judge_constants_of_any_profile(profile: Profile) -> None:
     backend, judged = of_one_profile(profile), 0

@@ -272,7 +272,7 @@ def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, 
 """
 
 
-@pytest.mark.parametrize("shift", [0.0, 0.5])
+@pytest.mark.parametrize("shift", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
 def test_a_stranger_with_gsplats_signature_is_judged_by_what_it_offers(
     tmp_path: Path, shift: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:

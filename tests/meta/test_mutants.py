@@ -45,6 +45,7 @@ def test_the_named_law_kills_the_mutant_in_either_precision(mutant: Mutant | Bla
 DRAWING = sorted({mutant.law for mutant in OUTSIDE if law_named(mutant.law).strategies})
 
 
+@pytest.mark.slow  # together they are
 @pytest.mark.parametrize("law", DRAWING)
 def test_the_program_itself_obeys_what_its_mutants_break(law: str) -> None:
     assert obeys(law_named(law), shipped("fast32")) is None

@@ -62,6 +62,7 @@ CAUSES = {
 }
 
 
+@pytest.mark.slow  # a run of the kit for each of twelve
 @pytest.mark.parametrize("name", CAUSES)
 def test_the_report_of_a_broken_rasterizer_names_its_cause(name: str) -> None:
     text = report(BOXES[name].law, BOXES[name].adapter())
@@ -144,6 +145,7 @@ def test_every_pair_of_levels_meets_in_some_row_and_every_level_moves_something(
     assert any(np.any(~e.render.splats.visible) for _, _, e in first.each())
 
 
+@pytest.mark.slow  # all pairs of arguments
 def test_pairs_that_only_failing_calls_hold_are_named_and_count_as_not_judged() -> None:
     backend = BOXES["packed_fails_with_backgrounds"].adapter()
     assert judged_pairs(backend) == {}
@@ -181,6 +183,7 @@ def no_camera_ids(*args: Any, **options: Any) -> Any:
     return images, alphas, {key: meta[key] for key in meta if key not in ("camera_ids", "batch_ids")}
 
 
+@pytest.mark.slow  # all laws of the signature
 @pytest.mark.parametrize("rasterization", [no_tile_size, no_camera_ids])
 def test_a_sound_rasterizer_without_tile_size_or_camera_ids_breaks_no_law_of_the_signature(
     rasterization: Callable[..., Any],

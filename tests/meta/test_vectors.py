@@ -26,7 +26,9 @@ def folder(made_once: Callable[..., Path]) -> Path:
     return made_once("vectors", lambda folder: export(folder / "vectors")) / "vectors"
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize(
+    "name", [name if name == "fast64" else pytest.param(name, marks=pytest.mark.slow) for name in SHIPPED]
+)
 def test_a_sound_port_passes_every_vector(folder: Path, tmp_path: Path, name: str) -> None:
     backend = shipped(name)
     unanswered = answer(folder, tmp_path / "results", backend)
@@ -47,6 +49,7 @@ def test_a_sound_port_passes_every_vector(folder: Path, tmp_path: Path, name: st
     assert len(found.verdicts) > 400
 
 
+@pytest.mark.slow  # all vectors, several times
 def test_a_broken_port_is_told_which_vector_and_array(folder: Path, tmp_path: Path) -> None:
     by_name = {mutant.name: mutant for mutant in MUTANTS}
     with living(by_name["conic_off_diagonal_twice"]) as backend:
@@ -107,6 +110,7 @@ def _assert_rules_name_arrays(arrays: dict[str, dict[str, Any]]) -> None:
                 assert entry["dtype"] == expected["dtype"] == "int64"
 
 
+@pytest.mark.slow  # the large scenes
 def test_one_wrong_pixel_of_thousands_is_found_by_the_sums(folder: Path, tmp_path: Path) -> None:
     backend = shipped("fast32")
     answer(folder, tmp_path / "results", backend)

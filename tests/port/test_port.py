@@ -61,6 +61,7 @@ def judged(folder: Path, *options: str, profile: str = "dev") -> subprocess.Comp
     )
 
 
+@pytest.mark.slow  # it compiles a port
 def test_a_port_in_cpp_obeys_the_laws_of_images_and_gradients(port: Path, tmp_path: Path) -> None:
     stages = ("alpha", "compositing", "dominance", "gradients", "whole")
     done = judged(tmp_path, "--program", str(port), *(word for stage in stages for word in ("--stage", stage)))
@@ -96,6 +97,7 @@ def oracle_port(*broken: str) -> str:
     return shlex.join([sys.executable, str(HERE / "oracle_port.py"), *broken])
 
 
+@pytest.mark.slow  # most laws, through a pipe
 def test_losses_density_control_adam_and_calls_with_several_cameras_cross_a_pipe_without_loss(tmp_path: Path) -> None:
     stages = ("losses", "density", "optimizer", "signature", "gradients")
     words = (word for stage in stages for word in ("--stage", stage))
@@ -163,6 +165,7 @@ def test_a_port_says_how_large_its_error_is(port: Path) -> None:
     assert backend.plainly(scene).dominant_ids is None
 
 
+@pytest.mark.slow  # most laws, through a pipe
 def test_a_black_port_breaks_laws_and_is_skipped_by_name_for_what_it_lacks(tmp_path: Path) -> None:
     command = f"{sys.executable} -S -E {HERE / 'bad_port.py'} black"
     words = ("--program", command, "--stage", "compositing", "--stage", "gradients", "-rs")

@@ -195,6 +195,7 @@ def queued(tmp_path_factory):
     return folder, said, left
 
 
+@pytest.mark.slow  # a queue that trains
 def test_a_queue_stops_at_sigterm_with_a_checkpoint(queued):
     _, ((text, status), _), left = queued
     assert status == 130
