@@ -104,7 +104,9 @@ def floors(row: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         ms = row["parts_ms"][part]
         found[part] = {"ms": ms, "floor_ms": by[bound], "bound": bound, "ratio": ms / by[bound]}
         if ms < POSSIBLE * by[bound]:
-            raise SystemExit(f"{part} took {ms:.2f} ms, and {bound} alone need {by[bound]:.2f}: peak.py measures too little")
+            raise SystemExit(
+                f"{part} took {ms:.2f} ms, and {bound} alone need {by[bound]:.2f}: peak.py measures too little"
+            )
     return found
 
 

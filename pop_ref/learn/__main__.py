@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from pop_ref.learn import needs_of_judging
-from pop_ref.learn.course import BY_NAME, COURSE, stage_named
+from pop_ref.learn.course import BY_NAME, COURSE, Stage, stage_named
 from pop_ref.learn.progress import asked_before, course_map, note_passed, passed_stages, picture
 from pop_ref.learn.splat import write_png
 from pop_ref.learn.stubs import answer, start
-from pop_ref.learn.student import read_work
+from pop_ref.learn.student import Work, read_work
 from pop_ref.learn.training import Subject, the_toy, train
 
 
@@ -29,6 +29,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit status: 0; 1 for a stage that has not passed yet; 2, with one line on stderr, for what cannot be done.
     """
     given = _parser().parse_args(arguments)
+    if given.action == "check" and given.all:
+        # the only name is the folder's
+        given.folder = Path(given.stage or given.folder)
     actions = {
         "start": lambda: write_stubs(given.folder),
         "check": lambda: (
@@ -51,9 +54,10 @@ def _parser() -> argparse.ArgumentParser:
     checking = actions.add_parser("check", help="judge one of them, in seconds")
     mapping = actions.add_parser("map", help="the pipeline, and the picture that it draws as it stands")
     training = actions.add_parser("train", help="when all is written: train with your own code")
-    what = checking.add_mutually_exclusive_group(required=True)
-    what.add_argument("stage", nargs="?", default="", help="a file's name without .py: alpha, covariance, ...")
-    what.add_argument("--all", action="store_true", help="judge every stage, and count the functions that are right")
+    checking.add_argument("stage", nargs="?", default="", help="a file's name without .py: alpha, ...; not with --all")
+    checking.add_argument(
+        "--all", action="store_true", help="judge every stage, and count the functions that are right"
+    )
     checking.add_argument("--json", action="store_true", help="with --all: print one object for a program to read")
     checking.add_argument("--answer", action="store_true", help="show the oracle's code, asked for twice or passed")
     training.add_argument("--steps", type=int, default=120, help="default 120")
@@ -68,7 +72,10 @@ def write_stubs(folder: Path) -> int:
     """Write the modules that are not there yet, and return the exit status 0."""
     written = start(folder)
     print(f"{len(written)} new files -> {folder}" if written else f"{folder} has all files already")
-    print(f"next: open {folder / 'alpha.py'}, write a function, and 'pop-learn check alpha {folder}'")
+    print(
+        f"next: open {folder / 'alpha.py'}, which chapter 1 explains, write a function, and 'pop-learn check alpha"
+        f" {folder}'; any order will do, the stages' numbers are those of the pipeline"
+    )
     return 0
 
 
@@ -86,7 +93,7 @@ def check(name: str, folder: Path, wants_answer: bool) -> int:
 
     verdict = judge(work, stage)
     print(told(stage, verdict))
-    counterexample = folder / f"counterexample_{stage.name}.png"
+    counterexample = _counterexample(folder, stage)
     image = drawn_counterexample(verdict)
     if image is None:
         # an earlier one is not of this file
@@ -104,6 +111,10 @@ def check(name: str, folder: Path, wants_answer: bool) -> int:
     return 0 if verdict.passed else 1
 
 
+def _counterexample(folder: Path, stage: Stage) -> Path:
+    return folder / f"counterexample_{stage.name}.png"
+
+
 def check_all(folder: Path, as_json: bool) -> int:
     """Judge every stage, print the score, and return 0 when all have passed, 1 when not yet.
 
@@ -116,6 +127,8 @@ def check_all(folder: Path, as_json: bool) -> int:
     grade = graded(read_work(folder))
     for name in grade["passed"]:
         note_passed(folder, BY_NAME[name])
+        # of an earlier try
+        _counterexample(folder, BY_NAME[name]).unlink(missing_ok=True)
     print(json.dumps(grade) if as_json else told_in_lines(grade))
     if grade["passed"] and not as_json:
         _tell_of_the_pages(folder)
@@ -135,8 +148,11 @@ def show_map(folder: Path, out: Path | None) -> int:
     for line in complaints:
         print(line)
     out = out or folder / "picture.png"
-    _write(out, image)
-    print(f"the picture as it stands -> {out}")
+    oracles = picture(Work(work.folder, dict.fromkeys(work.written, ())))[0]
+    _write(out, np.concatenate([image, oracles], axis=1))
+    difference = float(np.max(np.abs(image - oracles)))
+    agree = "they are the same" if difference < 1e-9 else f"they differ by up to {difference:.3g}"
+    print(f"the picture as it stands, and the oracle's on its right -> {out}; {agree}")
     return 0
 
 
@@ -146,7 +162,9 @@ def train_work(folder: Path, subject: Subject, steps: int, out: Path | None) -> 
 
     out, frames = out or folder / "trained.png", []
     for told in train(read_work(folder), subject, steps):
-        print(f"step {told.step:3d}   loss {told.loss:.5f}   {told.psnr:.2f} dB   {told.n} Gaussians", flush=True)
+        # before the first step there is none
+        loss = f"{told.loss:.5f}" if np.isfinite(told.loss) else "-".ljust(7)
+        print(f"step {told.step:3d}   loss {loss}   {told.psnr:.2f} dB   {told.n} Gaussians", flush=True)
         frames.append(told.picture.repeat(4, axis=0).repeat(4, axis=1))
         _write(out, told.picture)
         if len(told.psnrs) > 1:

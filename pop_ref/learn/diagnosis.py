@@ -19,9 +19,22 @@ from pop_ref.learn.probes import oracle
 from pop_ref.learn.student import Call, numbers, said, same, where
 
 Pair = tuple[np.ndarray, np.ndarray]
+# what is wrong, the hint, the call that shows it
+Diagnosis = tuple[str, str, Call]
 _ORDINALS: Final = ("first", "second", "third", "fourth", "fifth", "sixth")
 _AXES: Final = {2: "xy", 3: "xyz", 4: "wxyz"}
-_LETTERS: Final = {"conics_from_covars2d": ("xx", "xy", "yy"), "tile_rects": ("x0", "y0", "x1", "y1")}
+_LETTERS: Final = {
+    "conics_from_covars2d": ("xx", "xy", "yy"),
+    "tile_rects": ("x0", "y0", "x1", "y1"),
+    "colors_from_sh": ("red", "green", "blue"),
+    "conic": ("A", "B", "C"),
+    "sh": ("red", "green", "blue"),
+}
+# at which something of this course is held
+_LIMITS: Final = (0.0, 0.999, 1.0)
+_ALL_BUT: Final = "all but "
+# functions of parameters that make matrices
+_OF_STACKS: Final = ("rotmats_from_quats", "covars_from_quats_scales", "rotmats_from_quats_vjp")
 _FACTORS: Final = {
     2.0: "a 2 is one too many, or a half is missing",
     0.5: "a 2 is missing, or a half is one too many",
@@ -34,7 +47,7 @@ _FACTORS: Final = {
 }
 
 
-def diagnose(calls: Sequence[Call], folder: Path) -> tuple[str, str]:
+def diagnose(calls: Sequence[Call], folder: Path) -> Diagnosis:
     """Say what is wrong with a function.
 
     Args:
@@ -42,30 +55,51 @@ def diagnose(calls: Sequence[Call], folder: Path) -> tuple[str, str]:
         folder: of the student.
 
     Returns:
-        The sentence; a hint, empty if there is none but the formula.
+        The sentence; a hint, empty if there is none but the formula; the call that the sentence speaks of.
     """
     wrong = [call for call in calls if not call.is_right]
     name = wrong[0].function
-    error = next((call.error for call in wrong if call.error), None)
-    if error is not None:
-        return f"{where(error, folder)}: it stops with {said(error)}.", "Call it by hand with these numbers."
+    stopped = next((call for call in wrong if call.error), None)
+    if stopped is not None and stopped.error is not None:
+        sentence = f"{where(stopped.error, folder)}: it stops with {said(stopped.error)}."
+        return sentence, _of_shapes(stopped) or "Call it by hand with these numbers.", stopped
     plainly = _misused(name, wrong)
     if plainly:
-        return plainly, ""
+        return plainly, "", wrong[0]
     mistake = explained_by(calls, oracle())
     if mistake:
-        return mistake.sentence, mistake.hint
+        return mistake.sentence, mistake.hint, wrong[0]
+    goes_on = next((call for call in wrong if call.raises), None)
+    if goes_on is not None and all(call.raises for call in wrong):
+        return f"{name} gives a result where {goes_on.words}: it must stop with a ValueError.", "", goes_on
+    wrong = [call for call in wrong if not call.raises]
     special = sorted({call.words for call in wrong})
     right_plain = any(call.is_right and not call.words for call in calls)
     if "" not in special and right_plain:
-        return f"{name} is right on plain inputs and wrong where {', or where '.join(special[:3])}.", ""
-    return _compared(name, wrong, right_plain), ""
+        return f"{name} is right on plain inputs and wrong where {', or where '.join(special[:3])}.", "", wrong[0]
+    # those of plain inputs, if one of them is wrong
+    wrong = [call for call in wrong if not call.words] or wrong
+    return _compared(name, wrong, any(call.is_right for call in calls)), "", wrong[0]
+
+
+def _of_shapes(call: Call) -> str:
+    """Say what the commonest slip with a stack of matrices is, where NumPy says that shapes do not fit."""
+    stacks = any(isinstance(each, np.ndarray) and each.ndim == 3 for each in call.given) or call.function in _OF_STACKS
+    if (
+        isinstance(call.error, ValueError)
+        and stacks
+        and ("broadcast" in str(call.error) or "matmul" in str(call.error))
+    ):
+        return "`.T` of a stack of matrices turns all of its axes round; of each matrix it is `np.swapaxes(M, 1, 2)`."
+    return ""
 
 
 def _misused(name: str, wrong: Sequence[Call]) -> str:
     """Name what no number shows: nothing returned, an argument changed, or one that is not."""
     for call in wrong:
         (found, changed), (expected, meant) = call.found, call.expected
+        if isinstance(expected, np.ndarray) and isinstance(found, np.ndarray) and expected.dtype == bool != found.dtype:
+            return f"{name} gives numbers, and truth values are asked for: compare, as in x > 0."
         if found is None and expected is not None:
             return f"{name} returns nothing: is a return missing?"
         if changed and not meant:
@@ -76,15 +110,20 @@ def _misused(name: str, wrong: Sequence[Call]) -> str:
 
 
 def _compared(name: str, wrong: Sequence[Call], some_right: bool) -> str:
-    """Compare results part by part, then entry by entry; those of plain inputs, if one of them is wrong."""
-    wrong = [call for call in wrong if not call.words] or wrong
+    """Compare results part by part, then entry by entry."""
     parts: dict[str, list[Pair]] = {}
+    truths = all(_is_truth(call.expected) for call in wrong)
     for call in wrong:
         found, expected = leaves(call.found), leaves(call.expected)
         if len(found) != len(expected):
             many = "result is" if len(expected) == 1 else "results are"
             return f"{name} gives {len(found)} results where {len(expected)} {many} asked for."
-        for part, (_, a), (_, b) in zip(_parts_named(name, call), found, expected, strict=True):
+        shapes = [[each.shape for _, each in made] for made in (found, expected)]
+        if shapes[0] != shapes[1] and shapes[0] == shapes[1][::-1]:
+            return f"{name} gives its results in the wrong order: they are exchanged."
+        for part, (_, a), (_, b) in zip(parts_named(name, call), found, expected, strict=True):
+            if a.shape != b.shape and _of_lists(call.expected[0]):
+                return _lists_of_another_length(name, call)
             if a.shape != b.shape:
                 of = "" if len(expected) == 1 else f"{part} of "
                 return f"{of}{name} has shape {list(a.shape)} where {list(b.shape)} is asked for{_where_of(call)}."
@@ -103,8 +142,9 @@ def _compared(name: str, wrong: Sequence[Call], some_right: bool) -> str:
     subject = name if of_all else f"{' and '.join(named)} {'of' if 'result' in named[0] else 'in'} {name}"
     pairs = [pair for each in bad.values() for pair in each]
     sizes = [max((each.size for each in call.given if isinstance(each, np.ndarray)), default=1) for call in wrong]
-    letters = _LETTERS.get(name.removesuffix("_vjp"), ())
-    what = _as_a_whole(pairs, sizes, some_right) or _in_places(pairs, letters) or _off_by(pairs)
+    part = "" if of_all else re.sub("the cotangent of |`", "", named[0]).removeprefix("v_").rstrip("s")
+    letters = _LETTERS.get(part, _LETTERS.get(name.removesuffix("_vjp"), ()) if of_all else ())
+    what = _as_a_whole(pairs, sizes, some_right, truths) or _in_places(pairs, letters) or _off_by(pairs)
     if not of_all and len(named) > 1:
         what = re.sub("^(is|has|goes) ", lambda verb: {"is": "are ", "has": "have ", "goes": "go "}[verb[1]], what)
     rest = "" if of_all else "; the rest is right"
@@ -126,19 +166,55 @@ def _exchanged(parts: dict[str, list[Pair]]) -> bool:
 
 def _together(parts: list[str]) -> list[str]:
     """Name at most three parts, by what they have in common if there are more."""
+    results = {part.rpartition("` of ")[2] for part in parts}
+    if len(parts) > 1 and len(results) == 1:
+        return list(results)
     if len(parts) <= 3:
         return parts
-    return list(dict.fromkeys(f"`{part.strip('`').partition('.')[0]}`" for part in parts))[:3]
+    return list(dict.fromkeys(re.sub(r"`([^.`]*)[^`]*`", r"`\1`", part) for part in parts))[:3]
 
 
-def _parts_named(name: str, call: Call) -> list[str]:
-    """Name the leaves of a result: by its fields, by what the docstring's "Returns" quotes, or by number."""
+def parts_named(name: str, call: Call) -> list[str]:
+    """Name the leaves of a result: by its place and fields, by what the docstring's "Returns" quotes, or by place."""
     parts = leaves(call.expected)
     stated = re.search(r"Returns:\n(.*?)(?:\n\n|\Z)", oracle()[name].__doc__ or "", re.DOTALL)
     quoted = re.findall(r"`(\w+)`", stated[1]) if stated else []
-    if len(quoted) == len(parts) > 1:
-        return [f"the cotangent of `{each}`" for each in quoted]
-    return [f"`{label}`" if label else f"the {_ORDINALS[min(k, 5)]} result" for k, (label, _) in enumerate(parts)]
+    if len(quoted) >= len(parts) > 1 and name.endswith("_vjp"):
+        return [f"the cotangent of `{each}`" for each in quoted[: len(parts)]]
+    returned = call.expected[0]
+    each = returned if type(returned) is tuple else (returned,)
+    places = [k for k, result in enumerate(each) for _ in leaves(result, depth=1)]
+    places += [len(each)] * (len(parts) - len(places))
+    named = [f"the {_ORDINALS[min(k, 5)]} result" for k in places]
+    labels = [label for label, _ in parts]
+    return [
+        f"`{label}`{f' of {place}' if labels.count(label) > 1 else ''}" if label else place
+        for place, label in zip(named, labels, strict=True)
+    ]
+
+
+def _is_truth(value: Any) -> bool:
+    """Tell that a result, or a part of it, is made of truth values alone."""
+    if isinstance(value, tuple | list):
+        kept = [each for each in value if not (isinstance(each, tuple) and not each)]
+        return bool(kept) and all(map(_is_truth, kept))
+    return isinstance(value, bool | np.bool_) or (isinstance(value, np.ndarray) and value.dtype == bool)
+
+
+def _of_lists(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and all(isinstance(each, list) for each in value)
+
+
+def _lists_of_another_length(name: str, call: Call) -> str:
+    """Compare lists of one tile each, which are flattened to be compared."""
+    found, expected = call.found[0], call.expected[0]
+    if not _of_lists(found) or len(found) != len(expected):
+        n = len(found) if hasattr(found, "__len__") else "no"
+        return f"{name} gives {n} lists where {len(expected)} are asked for, one a tile{_where_of(call)}."
+    if len(found) > 1 and all(each is found[0] for each in found):
+        return f"In {name} all lists are one and the same list: [[]] * n repeats it; write [[] for _ in range(n)]."
+    k = next(k for k, (a, b) in enumerate(zip(found, expected, strict=True)) if len(a) != len(b))
+    return f"{name} lists {len(found[k])} splats in tile {k} where {len(expected[k])} are asked for{_where_of(call)}."
 
 
 def leaves(value: Any, label: str = "", depth: int = 0) -> list[tuple[str, np.ndarray]]:
@@ -157,7 +233,9 @@ def leaves(value: Any, label: str = "", depth: int = 0) -> list[tuple[str, np.nd
     return [(label, numbers(value) if isinstance(value, list) else np.asarray(value, dtype=np.float64))]
 
 
-def _as_a_whole(pairs: Sequence[Pair], sizes: Sequence[int] = (), some_right: bool = False) -> str:
+def _as_a_whole(
+    pairs: Sequence[Pair], sizes: Sequence[int] = (), some_right: bool = False, truths: bool = False
+) -> str:
     """Say what is the same about every wrong result, of found and expected; empty if nothing is."""
 
     def always(made: Any) -> bool:
@@ -165,7 +243,7 @@ def _as_a_whole(pairs: Sequence[Pair], sizes: Sequence[int] = (), some_right: bo
             return all(a.shape == np.shape(made(b)) and same(a, made(b)) for a, b in pairs)
 
     found, expected = (np.concatenate([np.ravel(pair[k]) for pair in pairs]) for k in (0, 1))
-    if set(np.unique(expected)) <= {0.0, 1.0} and set(np.unique(found)) <= {0.0, 1.0}:
+    if truths and set(np.unique(found)) <= {0.0, 1.0}:
         return _of_a_mask(found, expected, some_right)
     if not np.any(found) and np.any(expected):
         return "is always 0: it is not filled, or a term is missing"
@@ -176,8 +254,11 @@ def _as_a_whole(pairs: Sequence[Pair], sizes: Sequence[int] = (), some_right: bo
         return factor
     if np.ptp(found - expected) < 1e-9 * max(1.0, np.max(np.abs(expected))) and len(found) > 1:
         return _offset(float(np.mean(found - expected)))
-    if all(b.ndim >= 2 and b.shape[-1] == b.shape[-2] for _, b in pairs) and always(lambda b: np.swapaxes(b, -1, -2)):
-        return "is transposed: rows stand for columns"
+    if all(b.ndim >= 2 and b.shape[-1] == b.shape[-2] for _, b in pairs):
+        if always(lambda b: np.swapaxes(b, -1, -2)):
+            return "is transposed: rows stand for columns"
+        if all(b.shape == (4, 4) for _, b in pairs) and always(_with_turned_rotation):
+            return "has its rotation, the first three rows and columns, transposed"
     if all(b.ndim >= 1 and b.shape[-1] > 1 for _, b in pairs):
         if always(lambda b: b[..., ::-1]):
             return "has its numbers in the opposite order: x and y, or first and last, are exchanged"
@@ -196,8 +277,15 @@ def _as_a_whole(pairs: Sequence[Pair], sizes: Sequence[int] = (), some_right: bo
     return _of_rounding(found, expected) or _per_input(pairs, sizes)
 
 
+def _with_turned_rotation(viewmat: np.ndarray) -> np.ndarray:
+    turned = viewmat.copy()
+    turned[:3, :3] = viewmat[:3, :3].T
+    return turned
+
+
 def _of_a_mask(found: np.ndarray, expected: np.ndarray, some_right: bool) -> str:
-    if np.array_equal(found, 1.0 - expected) and not some_right:
+    both = len(np.unique(expected)) == 2 or not some_right
+    if np.array_equal(found, 1.0 - expected) and both:
         return "is the wrong way round: yes stands for no"
     if np.all(found >= expected):
         return "says yes too often; is a condition missing, or its bound too wide or inclusive?"
@@ -267,13 +355,26 @@ def _per_input(pairs: Sequence[Pair], sizes: Sequence[int]) -> str:
 
 def _in_places(pairs: Sequence[Pair], letters: Sequence[str]) -> str:
     """Say which entries are wrong, if it is the same ones in every result, and what is wrong with those."""
+    held = _clamped(pairs)
+    if held:
+        return held
     for places, label in _places(pairs, letters):
         only = [(a[place], b[place]) for (a, b), place in zip(pairs, places, strict=True)]
         others = [(a[~place], b[~place]) for (a, b), place in zip(pairs, places, strict=True)]
         if all(same(*pair) for pair in others) and any(len(b) for _, b in others):
             what = _as_a_whole(only) or _off_by(only)
-            return f"is wrong in {label}{'' if label.startswith('all') else ' only'}, which {what}"
-    return _clamped(pairs)
+            if label.startswith(_ALL_BUT):
+                if _mostly_right(pairs, places):
+                    continue
+                return f"is right in {label.removeprefix(_ALL_BUT)} only; elsewhere it {what}"
+            return f"is wrong in {label} only, which {what}"
+    return ""
+
+
+def _mostly_right(pairs: Sequence[Pair], places: Sequence[np.ndarray]) -> bool:
+    """Tell that more than a tenth of the entries at some places are right: it is not the place that is wrong."""
+    wrong = [np.abs(a - b)[place] > 1e-9 for (a, b), place in zip(pairs, places, strict=True)]
+    return float(np.mean(np.concatenate(wrong))) < 0.9
 
 
 def _places(pairs: Sequence[Pair], letters: Sequence[str]) -> Iterator[tuple[list[np.ndarray], str]]:
@@ -291,7 +392,7 @@ def _places(pairs: Sequence[Pair], letters: Sequence[str]) -> Iterator[tuple[lis
             yield [_at(shape, (..., k)) for shape in shapes], f"column {k} of each matrix" if least == 3 else label
         for k in range(last if last in (3, 4) else 0):
             label = f"the {names[k]}" if names else f"number {k}"
-            yield [~_at(shape, (..., k)) for shape in shapes], f"all but {label}"
+            yield [~_at(shape, (..., k)) for shape in shapes], f"{_ALL_BUT}{label}"
     if least == 3 and all(shape[-1] == shape[-2] for shape in shapes):
         eye = [np.broadcast_to(np.eye(shape[-1], dtype=bool), shape) for shape in shapes]
         yield [~each for each in eye], "the entries off the diagonal"
@@ -300,7 +401,7 @@ def _places(pairs: Sequence[Pair], letters: Sequence[str]) -> Iterator[tuple[lis
         for k in range(shapes[0][-2]):
             yield [_at(shape, (..., k, slice(None))) for shape in shapes], f"row {k} of each matrix"
     if all(shape[0] > 1 for shape in shapes):
-        yield [~_at(shape, 0) for shape in shapes], "all rows but the first"
+        yield [~_at(shape, 0) for shape in shapes], f"{_ALL_BUT}the first row"
 
 
 def _at(shape: tuple[int, ...], where: Any) -> np.ndarray:
@@ -310,17 +411,21 @@ def _at(shape: tuple[int, ...], where: Any) -> np.ndarray:
 
 
 def _clamped(pairs: Sequence[Pair]) -> str:
-    """See that what is wrong should all be one number, and goes past it to one side."""
+    """See that what is wrong should all be one number and goes past it to one side, or is one and should go past it."""
     off = [(a[np.abs(a - b) > 1e-9], b[np.abs(a - b) > 1e-9]) for a, b in pairs if a.shape == b.shape]
     found, expected = (np.concatenate([np.ravel(pair[k]) for pair in off]) for k in (0, 1))
-    if len(expected) and np.ptp(expected) < 1e-12 and (np.all(found > expected) or np.all(found < expected)):
+    one = len(expected) and np.ptp(expected) < 1e-12 and float(expected[0]) in _LIMITS
+    if one and (np.all(found > expected) or np.all(found < expected)):
         side = "above" if np.all(found > expected) else "below"
         return f"goes {side} {expected[0]:.4g}, where it must be held: a limit (min or max) is missing"
+    held = len(found) > 1 and np.all(found == 1.0) and np.any(expected != np.round(expected))
+    if held and np.all(expected > found):
+        return "is held at 1 where it should go above it: a limit (min or max) is one too many"
     return ""
 
 
 def _off_by(pairs: Sequence[Pair]) -> str:
-    k = int(np.argmax([np.max(np.abs(a - b)) / (np.max(np.abs(b)) + 1e-12) if a.size else 0.0 for a, b in pairs]))
-    a, b = (np.ravel(each) for each in pairs[k])
+    # of the call that is shown
+    a, b = (np.ravel(each) for each in next(pair for pair in pairs if pair[0].size))
     at = int(np.argmax(np.abs(a - b)))
     return f"is not right yet: {a[at]:.4g} where {b[at]:.4g} is asked for"

@@ -34,7 +34,7 @@ EXAMPLES: Final = 12
 # a broken law is made smaller for so long, then told as it is
 PATIENCE_S: Final = 1.0
 _EXAMPLE: Final = "the example in its docstring"
-_INPUT: Final = "it gives what the oracle gives on this input"
+INPUT: Final = "on this input it gives something else than the oracle"
 
 
 @dataclass(frozen=True)
@@ -96,9 +96,9 @@ def _function_tried(work: Work, stage: Stage, borrowed: Borrowed, name: str) -> 
         return None
     if not wrong:
         return Verdict(broken=_EXAMPLE, sentence=f"{name} fails {_EXAMPLE}: {example}", hint=_formula(stage, name))
-    sentence, hint = diagnose(calls, work.folder)
-    broken = f"{_EXAMPLE}: {example}" if example else _INPUT
-    return Verdict(broken=broken.rstrip("."), sentence=sentence, hint=hint or _formula(stage, name), call=wrong[0])
+    sentence, hint, shown = diagnose(calls, work.folder)
+    broken = f"{_EXAMPLE}: {example}" if example else INPUT
+    return Verdict(broken=broken.rstrip("."), sentence=sentence, hint=hint or _formula(stage, name), call=shown)
 
 
 def _broken_example(borrowed: Borrowed, home: str, name: str) -> str:
@@ -281,10 +281,10 @@ def _told(
     first, least = (_wrong_calls(borrowed, backend, law, drawn) for drawn in (failure.first, failure.least))
     if not least and not first:
         return replace(plain, sentence=f"This law does not hold: {plain.broken}.", hint=_own_words(error))
-    call = (least or first)[0]
-    sentence, hint = diagnose([each for each in (*least, *first) if each.function == call.function], work.folder)
-    plain = replace(plain, right=tuple(name for name in plain.right if name != call.function))
-    return replace(plain, sentence=sentence, hint=hint or _formula(stage, call.function), call=call)
+    called = (least or first)[0].function
+    sentence, hint, call = diagnose([each for each in (*least, *first) if each.function == called], work.folder)
+    plain = replace(plain, right=tuple(name for name in plain.right if name != called))
+    return replace(plain, sentence=sentence, hint=hint or _formula(stage, called), call=call)
 
 
 def _wrong_calls(borrowed: Borrowed, backend: _Judged, law: Law, drawn: dict[str, Any]) -> list[Call]:

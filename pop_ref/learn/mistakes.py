@@ -13,8 +13,8 @@ from typing import Any, Final
 import numpy as np
 
 from pop_ref.learn.mistakes_geometry import GEOMETRY, Mistake, Oracle
+from pop_ref.learn.mistakes_training import TRAINING
 from pop_ref.learn.student import Call, same
-from pop_ref.optimizer import BETAS, EPS
 
 
 def _sigma(squares: float = 0.5, cross: float = 1.0, right: float = 0.0, down: float = 0.0) -> Callable[..., Any]:
@@ -36,22 +36,24 @@ def _shifted(right: float, down: float) -> Mistake:
     )
 
 
-def _pixel_vjp(tail: bool, background_seen: bool = False, dims: bool = True) -> Callable[..., Any]:
-    """Make `composite_pixel_vjp` without what is behind a splat, without the background, or with splats that do not dim
-    what is behind them."""
+def _pixel_vjp(
+    tail: bool, background_seen: bool = False, dims: bool = True, forwards: bool = False, early: bool = False
+) -> Callable[..., Any]:
+    """Make `composite_pixel_vjp` without what is behind a splat, without the background, with splats that do not dim
+    what is behind them, from front to back, or with what is behind a splat updated before it is read."""
 
     def made(o: Oracle, pixel: Any, rows: Any, px: float, py: float, background: Any, v_color: Any, v_T_final: float,
              totals: Any, *profile: Any) -> None:  # fmt: skip
         behind = v_T_final if tail else 0.0
         behind += float(np.dot(background, v_color)) if background_seen else 0.0
         totals.v_background[:] += pixel.T_final * np.array(v_color)
-        for i, alpha, T in zip(
-            reversed(pixel.ids), reversed(pixel.alphas), reversed(pixel.transmittances), strict=True
-        ):
+        blended = list(zip(pixel.ids, pixel.alphas, pixel.transmittances, strict=True))
+        for i, alpha, T in blended if forwards else reversed(blended):
             color_dot_grad = float(np.dot(rows.colors[i], v_color))
             totals.v_colors[i] += T * alpha * np.array(v_color)
-            v_alpha = T * (color_dot_grad - behind)
+            before = behind
             behind += alpha * (color_dot_grad - (behind if dims else 0.0)) if tail else 0.0
+            v_alpha = T * (color_dot_grad - (behind if early else before))
             sigma = o["sigma_at_pixel"](rows.means2d[i], rows.conics[i], px, py)
             v_sigma, v_opacity = o["alpha_from_sigma_vjp"](sigma, rows.opacities[i], v_alpha, *profile)
             v_mean2d, v_conic = o["sigma_at_pixel_vjp"](rows.means2d[i], rows.conics[i], px, py, v_sigma)
@@ -59,24 +61,6 @@ def _pixel_vjp(tail: bool, background_seen: bool = False, dims: bool = True) -> 
             totals.v_means2d[i] += v_mean2d
             totals.v_means2d_abs[i] += np.abs(v_mean2d)
             totals.v_conics[i] += v_conic
-
-    return made
-
-
-def _adam(first: bool = True, second: bool = True, sign: float = -1.0) -> Callable[..., Any]:
-    """Make `adam_step` without the division by 1 - beta1^t or by 1 - beta2^t, or uphill."""
-
-    def made(o: Oracle, params: Any, grads: Any, m: Any, v: Any, step: Any, lr: Any,
-             betas: Any = BETAS, eps: float = EPS) -> Any:  # fmt: skip
-        params, m, v = dict(params), dict(m), dict(v)
-        for name, g in grads.items():
-            t = step if isinstance(step, int) else step[name]
-            m[name] = betas[0] * m[name] + (1.0 - betas[0]) * g
-            v[name] = betas[1] * v[name] + (1.0 - betas[1]) * g * g
-            mean = m[name] / (1.0 - betas[0] ** t if first else 1.0)
-            size = np.sqrt(v[name] / (1.0 - betas[1] ** t if second else 1.0)) + eps
-            params[name] = params[name] + sign * lr[name] * mean / size
-        return params, m, v
 
     return made
 
@@ -90,58 +74,42 @@ def _pixel_by_alpha(o: Oracle, ids: Any, rows: Any, px: float, py: float, backgr
     return pixel._replace(color=color)
 
 
-def _split_beside(o: Oracle, rows: Any, mask: Any, normals: Any, *revised: Any) -> Any:
-    """Make `split_rows` that keeps the parents."""
-    kept = o["split_rows"](rows, mask, normals, *revised)
-    n = int(np.sum(~mask))
+def _pixel_forward(dims: str = "1 - alpha", last: bool = False, after: bool = False) -> Callable[..., Any]:
+    """Make `composite_pixel` that dims by alpha, blends the splat at which it stops, or keeps T behind each splat."""
 
-    def both(old: Any, new: Any) -> Any:
-        return {name: np.concatenate([old[name], new[name][n:]]) for name in old}
-
-    return type(kept)(both(rows.params, kept.params), both(rows.m, kept.m), both(rows.v, kept.v))
-
-
-def _split_otherwise(name: str, change: Callable[[Any], Any], to: str) -> Callable[..., Any]:
-    """Make `split_rows` that reads a parameter changed, and takes another parameter of the children from that."""
-
-    def made(o: Oracle, rows: Any, mask: Any, normals: Any, *revised: Any) -> Any:
-        changed = type(rows)({**rows.params, name: change(rows.params[name])}, rows.m, rows.v)
-        split, other = (o["split_rows"](each, mask, normals, *revised) for each in (rows, changed))
-        n = int(np.sum(~mask))
-        taken = np.concatenate([split.params[to][:n], other.params[to][n:]])
-        return type(split)({**split.params, to: taken}, split.m, split.v)
+    def made(o: Oracle, ids: Any, rows: Any, px: float, py: float, background: Any, *profile: Any) -> Any:
+        color, T, kept, n = np.zeros(len(background)), 1.0, list[tuple[int, float, float]](), 0
+        for i in ids:
+            n += 1
+            sigma = o["sigma_at_pixel"](rows.means2d[i], rows.conics[i], px, py)
+            alpha, skipped = o["alpha_from_sigma"](sigma, rows.opacities[i], *profile)
+            if skipped:
+                continue
+            next_T = T * (alpha if dims == "alpha" else 1.0 - alpha)
+            ends = o["stops"](next_T, *profile)
+            if ends and not last:
+                break
+            color += T * alpha * np.array(rows.colors[i])
+            kept.append((i, alpha, next_T if after else T))
+            T = next_T
+            if ends:
+                break
+        color += T * np.array(background)
+        blended, alphas, transmittances = (list(each) for each in zip(*kept, strict=True)) if kept else ([], [], [])
+        return (color.tolist(), T, blended, alphas, transmittances, n)
 
     return made
-
-
-def _unturned(o: Oracle, rows: Any, mask: Any, normals: Any, *revised: Any) -> Any:
-    """Make `split_rows` that draws children along the world's axes."""
-    upright = {**rows.params, "quats": np.tile([1.0, 0.0, 0.0, 0.0], (len(mask), 1))}
-    split = o["split_rows"](type(rows)(upright, rows.m, rows.v), mask, normals, *revised)
-    quats = o["split_rows"](rows, mask, normals, *revised).params["quats"]
-    return type(split)({**split.params, "quats": quats}, split.m, split.v)
 
 
 def _pixel(o: Oracle, ids: Any, rows: Any, px: float, py: float, background: Any, *profile: Any) -> Any:
     return o["composite_pixel"](ids, rows, px, py, [0.0] * len(background), *profile)
 
 
-def _clone_with_moments(o: Oracle, rows: Any, mask: Any) -> Any:
-    """Make `clone_rows` whose copies have the moments of their sources."""
-    both = ({name: np.concatenate([x, x[mask]]) for name, x in each.items()} for each in (rows.m, rows.v))
-    return type(rows)(o["clone_rows"](rows, mask).params, *both)
-
-
-def _over_all(o: Oracle, opacities: Any, mask: Any, v_loss: float, visible: Any = None) -> Any:
-    """Make `pop_loss_vjp` whose sides are both divided by the number of all Gaussians."""
-    part = np.ones(len(mask), dtype=bool) if visible is None else visible
-    return v_loss * np.where(part, np.where(mask, -1.0, 1.0), 0.0) / len(mask)
-
-
 _HALF: Final = "The exponent of a Gaussian is half of d^T Q d: exp(-x^2 / 2) has a 2 under its square."
 
 MISTAKES: Final = (
     *GEOMETRY,
+    *TRAINING,
     Mistake(
         "sigma_at_pixel",
         _sigma(1.0, 1.0),
@@ -193,22 +161,17 @@ MISTAKES: Final = (
         "Before the walk from back to front, behind is background . v_color + v_T_final.",
     ),
     Mistake(
-        "adam_step",
-        _adam(first=False, second=False),
-        "The two running means are not corrected: both start at 0, so that the first steps have the wrong length.",
-        "Divide m by 1 - beta1^t and v by 1 - beta2^t before the quotient; keep m and v themselves as they are.",
+        "composite_pixel_vjp",
+        _pixel_vjp(tail=True, background_seen=True, forwards=True),
+        "You walk from front to back; the way back begins with the last splat, since what is behind a splat must be"
+        " known before the splat is reached.",
+        "Go through reversed(pixel.ids), with alphas and transmittances reversed alike.",
     ),
     Mistake(
-        "prune_rows",
-        lambda o, rows, mask: o["prune_rows"](rows, ~mask),
-        "You keep the rows that are to be removed: the mask selects what goes.",
-        "rows[~mask] are the survivors, in every parameter and both moments.",
-    ),
-    Mistake(
-        "l2_vjp",
-        lambda o, *given: 0.5 * o["l2_vjp"](*given),
-        "A two is missing: the derivative of a square is twice its base.",
-        "l2 is a mean of squares, without a half in front.",
+        "composite_pixel_vjp",
+        _pixel_vjp(tail=True, background_seen=True, early=True),
+        "You add a splat to what is behind it before its own cotangent is taken.",
+        "First v_alpha = T (color_dot_grad - behind), then behind += alpha (color_dot_grad - behind).",
     ),
     _shifted(0.5, 0.5),
     _shifted(-0.5, -0.5),
@@ -247,79 +210,34 @@ MISTAKES: Final = (
         "Go through ids as they come: T starts at 1 at the eye.",
     ),
     Mistake(
-        "adam_step",
-        _adam(sign=1.0),
-        "You go up the loss: the gradient points to where the loss rises, so a step is taken against it.",
-        "x - lr m / sqrt(v), with a minus.",
+        "composite_pixel",
+        _pixel_forward(dims="alpha"),
+        "You keep the share alpha of the light; a splat takes that share away, and 1 - alpha is left.",
+        "T starts at 1, and behind a splat it is T (1 - alpha).",
     ),
     Mistake(
-        "adam_step",
-        _adam(first=False),
-        "The running mean m is not divided by 1 - beta1^t: it starts at 0, so that the first steps are too short.",
-        "Divide for the quotient only; what is kept and returned is m itself.",
+        "composite_pixel",
+        _pixel_forward(last=True),
+        "You blend the splat at which the pixel stops; the pixel ends before it.",
+        "Ask stops(T (1 - alpha)) before the splat's colour is added.",
     ),
     Mistake(
-        "adam_step",
-        _adam(second=False),
-        "The running mean v is not divided by 1 - beta2^t: it starts at 0, so that the first steps are too long.",
-        "Divide for the quotient only; what is kept and returned is v itself.",
+        "composite_pixel",
+        _pixel_forward(after=True),
+        "You keep the light that is left behind each splat; the light before it is asked for.",
+        "Append T to the transmittances before T becomes T (1 - alpha).",
     ),
     Mistake(
-        "split_rows",
-        _split_beside,
-        "The parents stay; a split puts two children in the place of one parent.",
-        "Keep the rows that were not selected, rows[~mask], and append both kinds of children.",
-    ),
-    Mistake(
-        "split_rows",
-        _unturned,
-        "The draws are not turned: the children must lie along the parent's own axes.",
-        "mean + R(q) (s * eps): scale each draw first, then turn it.",
+        "sigma_at_pixel",
+        lambda o, mean2d, conic, px, py: o["sigma_at_pixel"](mean2d, (conic[0], conic[2], conic[1]), px, py),
+        "The conic is read in another order: it is (A, B, C), the cross term in the middle.",
+        "A, B, C = conic; sigma = (A dx dx + C dy dy) / 2 + B dx dy.",
     ),
     Mistake(
         "composite_pixel_vjp",
         _pixel_vjp(tail=True, background_seen=True, dims=False),
         "A splat hides what is behind it: the light behind must lose the share alpha before the splat's own is added.",
         "behind += alpha (color_dot_grad - behind), the same as alpha color_dot_grad + (1 - alpha) behind.",
-    ),
-    Mistake(
-        "pop_loss_vjp",
-        _over_all,
-        "Both sides are divided by the number of all Gaussians: the important have a mean of their own, and so have the"
-        " others.",
-        "Divide the first sum by N_imp and the second by N - N_imp.",
-    ),
-    Mistake(
-        "clone_rows",
-        _clone_with_moments,
-        "The copies have Adam's moments of their sources: newcomers start with moments of 0.",
-        "Append copies to the parameters, and zeros to m and v.",
-    ),
-    Mistake(
-        "split_rows",
-        _split_otherwise("scales", lambda x: x + np.log(1.6) - 1.6, "scales"),
-        "You subtract 1.6 from the logarithms of the widths: to divide a width by 1.6, subtract log 1.6.",
-        "params['scales'] holds logarithms.",
-    ),
-    Mistake(
-        "split_rows",
-        _split_otherwise("scales", np.zeros_like, "means"),
-        "The draws are not scaled: a child lies as far from its parent's centre as the parent is wide.",
-        "mean + R(q) (s * eps): scale each draw first, then turn it.",
-    ),
-    Mistake(
-        "grow_masks",
-        lambda o, window, scales, *given: o["grow_masks"](
-            window, np.repeat(scales.mean(axis=1, keepdims=True), 3, axis=1), *given
-        ),
-        "You compare the mean of the three widths: a Gaussian is small if its largest one is.",
-        "scales.max(axis=1).",
-    ),
-    Mistake(
-        "params_vjp",
-        lambda o, params, gradients, v_opacities: o["params_vjp"](params, gradients, np.zeros_like(v_opacities)),
-        "The prior's pull is missing: v_opacities is added to the gradient of the render's opacities.",
-        "gradients.opacities + v_opacities, then back through the sigmoid.",
     ),
 )
 
@@ -331,6 +249,8 @@ def explained_by(calls: Sequence[Call], oracle: Oracle) -> Mistake | None:
         calls: of one function.
         oracle: the oracle's functions by name.
     """
+    # where a ValueError is asked for, a mistake computes nothing
+    calls = [call for call in calls if not call.raises]
     for mistake in MISTAKES:
         if calls and mistake.function == calls[0].function and all(_explains(mistake, c, oracle) for c in calls):
             return mistake
@@ -340,7 +260,8 @@ def explained_by(calls: Sequence[Call], oracle: Oracle) -> Mistake | None:
 def _explains(mistake: Mistake, call: Call, oracle: Oracle) -> bool:
     given = copy.deepcopy(call.given)
     try:
-        made = mistake.made(oracle, *given, *call.named.values())
+        with np.errstate(all="ignore"):
+            made = mistake.made(oracle, *given, *call.named.values())
     except Exception:
         # a mistake that does not fit these arguments explains nothing
         return False

@@ -98,6 +98,29 @@ def _lists(order: Callable[..., Any], by_column: bool = False) -> Callable[..., 
     return made
 
 
+def _reach(squared: bool, k: float = 0.0) -> Callable[..., Any]:
+    """Make `radii_from_covars2d` without the 2 under its root, or with one reach for every opacity."""
+
+    def made(o: Oracle, covars2d: Any, opacities: Any, *profile: Any) -> Any:
+        taken = o["radii_from_covars2d"](covars2d, opacities, *profile) > 0
+        with np.errstate(all="ignore"):
+            reach = np.sqrt((2.0 if squared else 1.0) * np.log(255.0 * np.maximum(opacities, 1e-9)))
+            reach = np.minimum(np.nan_to_num(reach), 3.33) if k == 0.0 else np.full(len(opacities), k)
+            sides = reach[:, None] * np.sqrt(np.einsum("nii->ni", covars2d))
+        return np.where(taken, np.ceil(sides), 0).astype(np.int64)
+
+    return made
+
+
+def _without_z_of_the_diagonal(
+    o: Oracle, means_cam: Any, K: Any, width: int, height: int, v: Any, *profile: Any
+) -> Any:
+    """Make `projection_jacobians_vjp` that forgets that fx / z and fy / z depend on z."""
+    back = o["projection_jacobians_vjp"](means_cam, K, width, height, v, *profile).copy()
+    back[:, 2] += (K[0, 0] * v[:, 0, 0] + K[1, 1] * v[:, 1, 1]) / means_cam[:, 2] ** 2
+    return back
+
+
 _TRANSPOSED: Final = (
     "It turns the world into the Gaussian's own frame, and what is wanted turns the Gaussian's axes into the world."
 )
@@ -301,6 +324,78 @@ GEOMETRY: Final = (
         lambda o, means_cam, K, *given: o["project_means"](means_cam, K[[1, 0, 2]][:, [1, 0, 2]], *given),
         "The numbers of K for x and for y are exchanged: x goes with fx and cx, y with fy and cy.",
         "fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2].",
+    ),
+    Mistake(
+        "unit_quats_from_quats",
+        lambda o, quats: quats / np.linalg.norm(quats),
+        "You divide all rows by one length, that of the whole array; each quaternion has a length of its own.",
+        "np.linalg.norm(quats, axis=1, keepdims=True).",
+    ),
+    Mistake(
+        "opacities_from_logits",
+        lambda o, logits: o["opacities_from_logits"](-logits),
+        "The sign of the exponent is wrong: a large logit must give an opacity near 1, and yours goes to 0.",
+        "o = 1 / (1 + exp(-x)).",
+    ),
+    Mistake(
+        "opacities_from_logits_vjp",
+        lambda o, logits, v: o["opacities_from_logits"](logits) * v,
+        "A part of the sigmoid's slope is missing: o (1 - o), and yours is o.",
+        "Near o = 1 the sigmoid is flat, so that the gradient must vanish there, too.",
+    ),
+    Mistake(
+        "scales_from_log_scales_vjp",
+        lambda o, log_scales, v: v / np.exp(log_scales),
+        "You divide by the slope; a cotangent is multiplied by it on the way back.",
+        "v_scales times the scales themselves.",
+    ),
+    Mistake(
+        "unit_quats_from_quats_vjp",
+        lambda o, quats, v: o["unit_quats_from_quats_vjp"](quats, v) * np.linalg.norm(quats, axis=1, keepdims=True),
+        "The division by the length is missing: twice as long a q turns half as fast.",
+        "v_q = (v - u (u . v)) / |q|.",
+    ),
+    Mistake(
+        "means_cam_from_means",
+        lambda o, means, viewmat: means @ viewmat[:3, :3].T,
+        "You turn the points and do not move them: t is missing.",
+        "p = R mean + t, with t = viewmat[:3, 3].",
+    ),
+    Mistake(
+        "covars_cam_from_covars",
+        lambda o, covars, viewmat: viewmat[:3, :3] @ covars,
+        "You turn one side of the covariance only; a matrix of second moments is turned on both.",
+        "A linear map A turns a covariance S into A S A^T; here A is R = viewmat[:3, :3].",
+    ),
+    Mistake(
+        "projection_jacobians_vjp",
+        _without_z_of_the_diagonal,
+        "Two terms of z are missing: fx / z and fy / z on the Jacobian's diagonal depend on z, too.",
+        "Add -(fx v_xx + fy v_yy) / z^2 to the cotangent of z.",
+    ),
+    Mistake(
+        "radii_from_covars2d",
+        _reach(squared=False),
+        "A 2 is missing under the root: alpha is o exp(-d^2 / 2), so that it falls to 1/255 at d^2 = 2 ln(255 o).",
+        "The reach is min(3.33, sqrt(2 ln(255 o))) standard deviations.",
+    ),
+    Mistake(
+        "radii_from_covars2d",
+        _reach(squared=True, k=3.0),
+        "Your reach is three standard deviations whatever the opacity; it ends where alpha falls to 1/255.",
+        "The reach is min(3.33, sqrt(2 ln(255 o))) standard deviations: a faint splat ends sooner.",
+    ),
+    Mistake(
+        "radii_from_covars2d",
+        _reach(squared=True, k=3.33),
+        "Your reach is 3.33 standard deviations whatever the opacity; that is its upper bound only.",
+        "The reach is min(3.33, sqrt(2 ln(255 o))) standard deviations: a faint splat ends sooner.",
+    ),
+    Mistake(
+        "tile_lists",
+        _lists(lambda depth, i: (-depth, -i)),
+        "Your lists run from back to front; the nearest splat comes first.",
+        "Sort by (depth, index), the smaller depth first.",
     ),
     Mistake(
         "radii_from_covars2d",

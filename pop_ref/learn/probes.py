@@ -84,6 +84,8 @@ def _alphas(rng: np.random.Generator) -> Iterator[Probe]:
     yield "alpha is under the floor of 1/255, where the splat is skipped", (6.0, 0.5)
     yield "alpha is under the floor of 1/255, where the splat is skipped", (0.0, 0.0035)
     yield "sigma is negative, where the splat is skipped", (-0.25, 0.5)
+    yield "alpha is exactly the floor of 1/255, where the splat is still drawn", (0.0, 1.0 / 255.0)
+    yield "alpha is exactly the ceiling of 0.999, which is not over it", (0.0, 0.999)
 
 
 def _alphas_back(rng: np.random.Generator) -> Iterator[Probe]:
@@ -198,6 +200,12 @@ def _adam(rng: np.random.Generator) -> Iterator[Probe]:
     yield "gradients are tiny, and eps decides", (*state(1e-13), 3, lr)
     yield "a parameter has no gradient and stays as it is", (params, {"a": grads["a"]}, m, v, 3, lr)
     yield "other betas and another eps are given", (params, grads, m, v, 3, lr, (0.8, 0.95), 0.5)
+    by_name = {"a": 3, "b": 9}
+    yield (
+        "parameters have had different numbers of updates, and step has one for each",
+        (params, grads, m, v, by_name, lr),
+    )
+    yield "the step is 0, and updates count from 1", (params, grads, m, v, 0, lr)
 
 
 def _rows(rng: np.random.Generator, n: int) -> Rows:
@@ -223,7 +231,7 @@ def _growing(rng: np.random.Generator) -> Iterator[Probe]:
         sums = np.array(grads) * np.maximum(counts, 1)
         return Statistics(sums, counts, 4, np.zeros(len(grads), dtype=np.int64), np.array(blurred))
 
-    sizes = np.array([[0.001, 0.02, 0.003], [0.5, 0.1, 0.2], [0.004, 0.003, 0.001], [0.3, 0.6, 0.1]])
+    sizes = np.array([[0.001, 0.02, 0.003], [0.5, 0.005, 0.2], [0.004, 0.003, 0.001], [0.3, 0.6, 0.1]])
     none, hard = [False] * 4, [1e-3, 1e-3, 1.5e-4, 1e-5]
     for scale in (1.0, 4.0):
         yield "", (window(hard, [1, 2, 3, 1], none), sizes, scale, 600, POP)
@@ -291,7 +299,9 @@ def _zeros(n: int) -> np.ndarray:
 
 
 def _steps(rng: np.random.Generator) -> Iterator[Probe]:
-    camera, target = Camera(*orbit(0.4, 12)), rng.uniform(0.0, 1.0, (12, 12, 3))
+    viewmat, K, _, height = orbit(0.4, 12)
+    # wider than high: x is not y
+    camera, target = Camera(viewmat, K, 16, height), rng.uniform(0.0, 1.0, (height, 16, 3))
     recipe = RECIPES["POP"]
     for n in (2, 4):
         yield "", (start(_params(rng, n)), camera, target, 1.0, _zeros, recipe)

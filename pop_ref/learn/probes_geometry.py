@@ -7,6 +7,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from pop_ref.harmonics import sh_basis
+
 # what is special, empty for a plain input; the arguments
 Probe = tuple[str, tuple[Any, ...]]
 
@@ -55,6 +57,8 @@ def _colors(rng: np.random.Generator) -> Iterator[Probe]:
     dark = 0.1 * rng.standard_normal((2, 4, 3))
     dark[0, 0, :2] = -4.0
     yield "a colour would be negative", (dark, _units(rng, 2), 1)
+    black = np.full((1, 1, 3), -0.5 / float(sh_basis(_units(rng, 1), 0)[0, 0]))
+    yield "a colour is exactly 0, which is not under it", (black, _units(rng, 1), 0)
 
 
 def _viewmat(rng: np.random.Generator) -> np.ndarray:
@@ -96,6 +100,7 @@ def _depths(rng: np.random.Generator) -> Iterator[Probe]:
     yield "a Gaussian is nearer than the near plane", (np.array([0.005, 1.0]),)
     yield "a depth is the near plane's, which still counts as in front", (np.array([0.01, 2.0]),)
     yield "a Gaussian is beyond the far plane", (np.array([1e11, 2.0]),)
+    yield "a depth is the far plane's, which still counts as in front", (np.array([1e10, 2.0]),)
 
 
 _K: Final = np.array([[20.0, 0.0, 9.0], [0.0, 24.0, 5.0], [0.0, 0.0, 1.0]])
@@ -178,6 +183,7 @@ def _grid(rng: np.random.Generator) -> Iterator[Probe]:
     yield "", (64, 48, 16)
     yield "the picture is not a multiple of the tile, and a part of a tile is left over", (33, 17, 16)
     yield "the picture is not a multiple of the tile, and a part of a tile is left over", (5, 30, 4)
+    yield "the tile size is under 1", (32, 16, 0)
 
 
 def _span(rng: np.random.Generator) -> Iterator[Probe]:

@@ -35,15 +35,47 @@ _SETTINGS: Final = {
         " `blur_stop_iter` (3000 and 7000), between which, both included, the flags `statistics.blurred` count too."
     },
     "prune_mask": {"config": "of its fields you need one: `prune_opa` (0.005). POP prunes by opacity alone."},
+    "composite_pixel_vjp": {
+        "totals": "the sums over pixels, added to. `v_means2d_abs` sums the absolute values of what each pixel adds to"
+        " `v_means2d`."
+    },
     "train_step": {
-        "recipe": "what is minimised: `objective` reads it, `learning_rates` takes its `max_steps` and `lr`,"
-        " `accumulate` and `control` take its `density`. Adam's first step is number 1, `state.step` counts from 0. The"
-        " course draws harmonics of degree 0; `waiting` belongs to another method.",
+        "recipe": "what is minimised: `objective` and `update` read it, `accumulate` and `control` take its `density`."
+        " `state.step` counts from 0. The course draws harmonics of degree 0. `waiting` is what `update` gives beside"
+        " the rows; it goes into the new `Training`.",
         "points": "not in this course; leave it out.",
     },
 }
+# where a docstring's formulas are of other programs, too, or stand in its module's text
+_FORMULAS: Final = {
+    "in_front": ["near <= z <= far"],
+    "prune_mask": ["o < prune_opa"],
+    "alpha_from_sigma_vjp": ["v_sigma = -o exp(-sigma) v_alpha", "v_o = exp(-sigma) v_alpha, both 0 over the ceiling"],
+    "low_pass": ["Sigma2d + eps2d [[1, 0], [0, 1]]"],
+    "projection_jacobians_vjp": [
+        "v_x = -(fx/z^2) v_xz and v_z = -(fx/z^2) v_xx + (2 fx x/z^3) v_xz where x/z is not clamped",
+        "v_z = -(fx/z^2) v_xx + (fx tx/z^3) v_xz where it is",
+        "y likewise",
+    ],
+    "tile_span": ["first = floor((u - r) / t)", "last = ceil((u + r) / t)", "both in 0 to n_tiles"],
+    "tile_lists": ["sort by (depth, index)", "tile (x, y) is number y tiles_x + x"],
+    "composite_pixel_vjp": [
+        "behind = background . v_color + v_T_final, and from the last splat to the first q = c_i . v_color, v_alpha ="
+        " T_i (q - behind), v_c = T_i alpha_i v_color, then behind += alpha_i (q - behind)"
+    ],
+    "pop_loss": ["mean of 1 - o where the mask is true + mean of o where it is not"],
+    "pop_loss_vjp": ["-v_loss / N_imp where the mask is true", "v_loss / (N - N_imp) where it is not"],
+    "adam_step": [
+        "m = beta1 m + (1 - beta1) g",
+        "v = beta2 v + (1 - beta2) g^2",
+        "x = x - lr (m / (1 - beta1^t)) / (sqrt(v / (1 - beta2^t)) + eps)",
+    ],
+    "clone_rows": ["params = rows, then copies of rows[mask]", "m, v = rows, then zeros"],
+    "prune_rows": ["params, m, v = rows[~mask]"],
+    "grow_masks": ["small = max scale <= grow_scale3d scene_scale"],
+}
 # what the oracle's loop does for other methods; a stub does not speak of it
-_OF_OTHER_METHODS: Final = re.compile(r"opacity_entropy|depth_samples|sparse_depth_loss")
+_OF_OTHER_METHODS: Final = re.compile(r"opacity_entropy|depth_samples|sparse_depth_loss|tile_rects")
 _QUOTED: Final = re.compile(r"`([^`]*)`")
 _HEAD: Final = '''"""Stage {number} of {count}, {name}: {does}.
 
@@ -104,14 +136,14 @@ def answer(stage: Stage) -> str:
 
 
 def formulas(module: str, name: str) -> list[str]:
-    """Return the formulas that a function's docstring states.
+    """Return the formulas of a function: those that its docstring states, unless the course has its own.
 
     Example:
         >>> formulas("alpha", "falloff")
         ['G = exp(-sigma)']
     """
     text = (ast.get_docstring(_functions(module)[name]) or "").partition("\nSource:")[0]
-    return _formulas_in(text)
+    return _FORMULAS.get(name) or _formulas_in(text)
 
 
 @functools.cache
@@ -155,11 +187,19 @@ def _of_the_course(name: str, docstring: str) -> str:
     docstring = docstring.replace("gsplat's option of that name.", "not in this course; leave it out, or False.")
     for setting, about in _SETTINGS.get(name, {}).items():
         docstring = re.sub(f"    {setting}: .*", f"    {setting}: {about}", docstring)
-    return "\n".join(_wrapped(line) for line in docstring.split("\n"))
+    about, example, rest = docstring.partition("\n\nSource:")
+    about = "\n\n".join(_filled(paragraph) for paragraph in about.split("\n\n"))
+    return "\n".join(_wrapped(line) for line in f"{about}{example}{rest}".split("\n"))
+
+
+def _filled(paragraph: str) -> str:
+    """Break the lines of a paragraph anew, from which labels were taken or in which they are words now."""
+    return paragraph if ">>>" in paragraph else textwrap.fill(" ".join(paragraph.split()), _WIDTH)
 
 
 def _labels_in_words(text: str) -> str:
-    text = re.sub(r" \((?:A\d+(?:, )?)+(?::[^()]*)?\)", "", text)
+    # in brackets a label is a reference, which leads nowhere here
+    text = re.sub(r"\s\((?:[ABD]\d+(?:, )?)+(?::[^()]*)?\)", "", text)
     return re.sub(r"\b[DB]\d\b", lambda label: _LABELS[label[0]], text)
 
 
@@ -177,8 +217,15 @@ def _without_formulas(docstring: str) -> str:
     about, source, rest = docstring.partition("Source:")
     first, *others = about.strip().split("\n\n")
     first = first.partition("`")[0].rstrip(" :,") if _formulas_in(first) else first
-    kept = [first if first.endswith(".") else f"{first}.", *(p for p in others if not _formulas_in(p))]
+    others = [each if not _formulas_in(each) else _plain_sentences(each) for each in others]
+    kept = [first if first.endswith(".") else f"{first}.", *filter(None, others)]
     return "\n\n".join([*kept, f"{source}{rest}"])
+
+
+def _plain_sentences(paragraph: str) -> str:
+    """Keep of a paragraph the sentences that give no formula away: what holds at a limit is asked for."""
+    sentences = re.split(r"(?<=\.)\s+(?=[A-Z])", " ".join(paragraph.split()))
+    return " ".join(each for each in sentences if "`" not in each)
 
 
 def _formulas_in(text: str) -> list[str]:
@@ -203,14 +250,23 @@ def _at_hand(imported: list[str]) -> str:
 
 
 def _told_of(called: str, value: Any) -> list[str]:
-    """Write how a class is made or a function called, and the first line of its docstring."""
-    first = _labels_in_words((value.__doc__ or "").strip().split("\n")[0])
-    return textwrap.wrap(f"{called}: {first}", 116, initial_indent="    ", subsequent_indent="        ")
+    """Write how a class is made or a function called, what it is for, and what it returns."""
+    about = inspect.getdoc(value) or ""
+    if inspect.isclass(value):
+        paragraphs = about.split("\n\n")
+        told = paragraphs[0] if len(paragraphs) == 1 or ":\n" in paragraphs[1] else " ".join(paragraphs[:2])
+        made = [f"`{name}`" for name, each in vars(value).items() if isinstance(each, property)]
+        told += f" It has {', '.join(made)}, too." if made else ""
+    else:
+        returned = re.search(r"Returns:\n(.*?)(?:\n\n|\Z)", about, re.DOTALL)
+        told = about.split("\n")[0] + (f" Returns: {returned[1].strip()}" if returned else "")
+    told = " ".join(_labels_in_words(told).split())
+    return textwrap.wrap(f"{called}: {told}", 116, initial_indent="    ", subsequent_indent="        ")
 
 
 def _imports(stage: Stage, used: set[str]) -> list[str]:
-    """Import what the oracle's functions use of their module: types, and what other stages ask for, in any case."""
-    own, asked = set(stage.names), {name for each in COURSE for name in each.names}
+    """Import what the oracle's functions use."""
+    own = set(stage.names)
     plain, ours = {"import math", "import numpy as np"}, dict[str, list[str]]()
     for module in stage.functions:
         for node in ast.parse(_source(module)).body:
@@ -220,9 +276,7 @@ def _imports(stage: Stage, used: set[str]) -> list[str]:
                 origin, names = str(node.module), [alias.name for alias in node.names]
             else:
                 continue
-            # a type is needed where a result is made of it
-            fresh = [name for name in names if name in used | asked or re.match("[A-Z]+[a-z]", name)]
-            fresh = [name for name in fresh if name not in own and not _OF_OTHER_METHODS.match(name)]
+            fresh = [name for name in names if name in used - own and not _OF_OTHER_METHODS.match(name)]
             if fresh:
                 ours.setdefault(origin, []).extend(fresh)
     lines, seen = list[str](), set[str]()

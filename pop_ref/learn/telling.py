@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -12,15 +12,16 @@ from pop_ref.conformance.scenes import Scene
 from pop_ref.constants import PAPER
 from pop_ref.density import POP
 from pop_ref.learn.course import Stage
-from pop_ref.learn.diagnosis import leaves
-from pop_ref.learn.judge import Verdict
+from pop_ref.learn.diagnosis import leaves, parts_named
+from pop_ref.learn.judge import INPUT, Verdict
 from pop_ref.learn.student import Call, same
 from pop_ref.recipes import RECIPES
 
 _SHADES: Final = " .:-=+*#%@"
 _LONGEST: Final = 12
-# of an input, of what came out, and of what should
-_MOST_LINES: Final = 9
+# of an input; of what came out, and of what should
+_MOST_LINES: Final = 14
+_MOST_RESULTS: Final = 5
 
 
 def told(stage: Stage, verdict: Verdict) -> str:
@@ -29,7 +30,8 @@ def told(stage: Stage, verdict: Verdict) -> str:
     if verdict.sentence:
         lines += [f"{stage.name}: not yet.", "", verdict.sentence, ""]
         lines += _counterexample(verdict)
-        lines += [f"hint: {verdict.hint}", "", f"{_held(stage, verdict)}. What does not hold: {verdict.broken}."]
+        broken = verdict.broken if verdict.broken == INPUT else f"what does not hold: {verdict.broken}"
+        lines += [f"hint: {verdict.hint}", "", f"{_held(stage, verdict)}; {broken}."]
     elif not verdict.unwritten:
         lines += [f"{stage.name}: passed. {_held(stage, verdict)}."]
     elif verdict.right:
@@ -41,6 +43,8 @@ def told(stage: Stage, verdict: Verdict) -> str:
 
 def _held(stage: Stage, verdict: Verdict) -> str:
     functions = f"{len(verdict.right)} of {len(stage.names)} functions give what the oracle gives"
+    if len(stage.names) - len(verdict.right) - len(verdict.unwritten) > 1:
+        functions += " (one that calls a wrong one is wrong with it)"
     laws = {0: "", 1: ", and 1 law holds"}.get(verdict.n_held, f", and {verdict.n_held} laws hold")
     return functions + laws
 
@@ -50,20 +54,20 @@ def _counterexample(verdict: Verdict) -> Iterator[str]:
         yield from _call_told(verdict.call)
     elif verdict.drawn:
         yield "the smallest input that was found:"
-        yield from _capped([line for name, value in verdict.drawn.items() for line in _named(name, value)])
+        yield from _capped([_named(name, value) for name, value in verdict.drawn.items()])
         yield ""
 
 
 def _call_told(call: Call) -> Iterator[str]:
     yield f"{call.function} of"
     given = (*zip(call.parameters, call.given, strict=False), *call.named.items())
-    yield from _capped([line for name, value in given for line in _named(name, value)])
+    yield from _capped([_named(name, value) for name, value in given])
     if call.error is None:
         found, expected = _results(call)
         yield "gives"
-        yield from _capped(found)
-        yield "and should give"
-        yield from _capped(expected)
+        yield from _capped([found], _MOST_RESULTS)
+        yield "and should stop with a ValueError" if call.raises else "and should give"
+        yield from _capped([] if call.raises else [expected], _MOST_RESULTS)
     yield ""
 
 
@@ -73,20 +77,34 @@ def _results(call: Call) -> tuple[list[str], list[str]]:
     both = leaves(call.found), leaves(call.expected)
     if len(both[0]) == len(both[1]) > 3:
         differ = [k for k in range(len(both[0])) if not same(both[0][k][1], both[1][k][1])]
+        labels = parts_named(call.function, call)
         return (
-            [f"  {both[0][k][0]} = {_numbers(both[0][k][1], _LONGEST)}" for k in differ],
-            [f"  {both[1][k][0]} = {_numbers(both[1][k][1], _LONGEST)}" for k in differ],
+            [f"  {labels[k]} = {_numbers(both[0][k][1], _LONGEST)}" for k in differ],
+            [f"  {labels[k]} = {_numbers(both[1][k][1], _LONGEST)}" for k in differ],
         )
     return _shown(found, changed), _shown(expected, meant)
 
 
 def _shown(returned: Any, changed: tuple[Any, ...]) -> list[str]:
     values = [*([] if returned is None and changed else [returned]), *changed]
+    # several results, each by itself
+    values = [each for value in values for each in (value if type(value) is tuple else (value,))]
     return [line for value in values for line in _named("", value)]
 
 
-def _capped(lines: list[str]) -> list[str]:
-    return lines if len(lines) <= _MOST_LINES else [*lines[: _MOST_LINES - 1], "  ..."]
+def _capped(parts: Sequence[Iterable[str]], at_most: int = _MOST_LINES) -> Iterator[str]:
+    """Leave lines out where there are too many, of the longest parts: every argument is named."""
+    each = [list(part) for part in parts]
+    most = at_most
+    while most > 1 and sum(min(len(lines), most) for lines in each) > at_most:
+        most -= 1
+    for lines in each:
+        if len(lines) <= most:
+            yield from lines
+        elif most == 1:
+            yield f"{lines[0]} ..."
+        else:
+            yield from [*lines[: most - 1], "    ..."]
 
 
 def _named(name: str, value: Any) -> Iterator[str]:
@@ -123,7 +141,10 @@ def _fields(value: Any) -> dict[str, Any] | None:
         return None
     parts = {name: getattr(value, name) for name in value.__dataclass_fields__}
     usual = {"DensityConfig": POP, "Recipe": RECIPES["POP"], "Profile": PAPER}.get(type(value).__name__)
-    return parts if usual is None else {name: x for name, x in parts.items() if x != getattr(usual, name)}
+    if usual is None:
+        return parts
+    # what a profile is called is of no account, and the course has one size of tile
+    return {name: x for name, x in parts.items() if name != "name" and x != getattr(usual, name)}
 
 
 def drawn(image: np.ndarray) -> list[str]:

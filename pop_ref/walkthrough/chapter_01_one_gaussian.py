@@ -120,8 +120,10 @@ for j, i in np.ndindex(HEIGHT, WIDTH):
 
 # %% [markdown]
 # The floor gives the splat an edge. Alpha is at least 1/255 where $\sigma \le \ln(255\, o)$, that is inside the ellipse
-# of $k = \sqrt{2 \ln(255\, o)}$ standard deviations. Even a fully opaque splat ends at $k = 3.33$. The rectangle around
-# that ellipse tells a renderer which pixels to visit at all.
+# of $k = \sqrt{2 \ln(255\, o)}$ standard deviations. Even a fully opaque splat ends at $k = 3.33$, which is the
+# most that $k$ may be. The rectangle around that ellipse tells a renderer which pixels to visit at all. It reaches
+# $\lceil k \sqrt{a} \rceil$ px from the centre along x and $\lceil k \sqrt{c} \rceil$ along y, where $a$ and $c$ are
+# the covariance's entries on the diagonal: the ellipse of any covariance is as wide as these two alone say.
 
 # %%
 k = math.sqrt(2 * math.log(255 * opacity))

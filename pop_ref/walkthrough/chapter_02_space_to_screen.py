@@ -16,8 +16,14 @@
 # $$\Sigma = R S S^\top R^\top, \qquad R = R(q), \quad S = \operatorname{diag}(s)$$
 #
 # This is 3DGS, eq. 6. Whatever numbers are put in, $\Sigma$ is a covariance. The quaternion is divided by its norm
-# first, so its length does not matter, and $q$ and $-q$ are the same rotation. (What training moves are the logarithms
-# of $s$, chapter 1b.)
+# first, so its length does not matter, and $q$ and $-q$ are the same rotation. With the unit quaternion $(w, x, y, z) =
+# q / \lvert q \rvert$ the matrix is
+#
+# $$R(q) = \begin{pmatrix} 1 - 2(y^2 + z^2) & 2(xy - wz) & 2(xz + wy) \\
+# 2(xy + wz) & 1 - 2(x^2 + z^2) & 2(yz - wx) \\
+# 2(xz - wy) & 2(yz + wx) & 1 - 2(x^2 + y^2) \end{pmatrix}$$
+#
+# (What training moves are the logarithms of $s$, chapter 1b.)
 #
 # {{source: pop_ref.covariance.covars_from_quats_scales}}
 
@@ -214,8 +220,13 @@ picture(
 
 # %% [markdown]
 # Far outside the image the linearisation is worse than poor: $x/z$ grows without bound and with it the ellipse.
-# Rasterizers therefore evaluate $J$ no farther out than 15 % of the image's width (and height) beyond its border. The
-# papers do not print this (kink B1 of the oracle).
+# Rasterizers therefore evaluate $J$ no farther out than 15 % of the image's width $W$ (and height) beyond its border:
+# in $J$, $x$ is replaced by
+#
+# $$t_x = z\,\mathrm{clamp}\left(\frac{x}{z}, -\frac{c_x + 0.15\,W}{f_x}, \frac{W - c_x + 0.15\,W}{f_x}\right),$$
+#
+# and $y$ alike. The profile's `frustum_margin` is 0.3, twice 0.15, because it counts in halves of the image. The papers
+# do not print this (kink B1 of the oracle).
 
 # %%
 aside = np.array([[20.0, 0.0, 1.0]])

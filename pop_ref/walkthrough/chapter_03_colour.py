@@ -21,8 +21,16 @@
 #
 # {{source: pop_ref.harmonics._basis_one}}
 #
-# with `_C0` = $\sqrt{1/4\pi} \approx 0.2821$, `_C1` = $\sqrt{3/4\pi} \approx 0.4886$, and so on: constants that make
-# the mean of each square over the sphere the same. Mind the signs of degree 1, $(-y, z, -x)$: programs that leave them
+# with these constants, which make the mean of each square over the sphere the same:
+#
+# | constant | | | constant | | |
+# |---|---|---|---|---|---|
+# | `_C0` | $\sqrt{1/4\pi}$ | 0.2821 | `_C3_3` | $\sqrt{35/32\pi}$ | 0.5900 |
+# | `_C1` | $\sqrt{3/4\pi}$ | 0.4886 | `_C3_2` | $\sqrt{105/4\pi}$ | 2.8906 |
+# | `_C2` | $\sqrt{15/4\pi}$ | 1.0925 | `_C3_1` | $\sqrt{21/32\pi}$ | 0.4570 |
+# | `_C2_Z` | $\sqrt{5/16\pi}$ | 0.3154 | `_C3_0` | $\sqrt{7/16\pi}$ | 0.3732 |
+#
+# Mind the signs of degree 1, $(-y, z, -x)$: programs that leave them
 # out make scenes whose highlights wander to the wrong side in every other program. The colour is then
 #
 # {{source: pop_ref.harmonics.colors_from_sh}}
@@ -32,6 +40,7 @@ import math
 
 import numpy as np
 
+from pop_ref import harmonics
 from pop_ref.harmonics import colors_from_sh, sh_basis
 from pop_ref.optimizer import sh_degree_at
 from pop_ref.records import Camera, Gaussians
@@ -49,6 +58,10 @@ from pop_ref.walkthrough.style import (
     show_image,
 )
 
+squares = {"_C0": 1 / 4, "_C1": 3 / 4, "_C2": 15 / 4, "_C2_Z": 5 / 16}
+squares |= {"_C3_3": 35 / 32, "_C3_2": 105 / 4, "_C3_1": 21 / 32, "_C3_0": 7 / 16}
+for name, over_pi in squares.items():
+    assert math.isclose(getattr(harmonics, name), math.sqrt(over_pi / math.pi))
 for degree in range(4):
     assert sh_basis(np.eye(3)[:1], degree).shape == (1, (degree + 1) ** 2)
 grey = colors_from_sh(np.zeros((1, 16, 3)), np.array([[1.0, 2.0, 3.0]]), degree=3)

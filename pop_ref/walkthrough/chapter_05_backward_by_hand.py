@@ -80,7 +80,10 @@ assert v_alphas_of(three, 0.0).tolist() == [1 / 8, -1 / 8, 1 / 4]
 #
 # So one scalar, walked from back to front, is all that the backward pass of a pixel carries, however many channels it
 # has. In the oracle $q_i$ is `color_dot_grad` and the scalar $\beta_i$ is `suffix_dot_grad`. It starts with the
-# background; the last lines belong to the next section:
+# background. Where a loss reads the remaining light $T_{\mathrm{final}}$ itself, as one of the opacity does, its
+# cotangent is light behind the last splat like any other: $\beta_n = b \cdot g + v_{T_{\mathrm{final}}}$. The last
+# lines belong to the next section. `v_means2d_abs` there is no cotangent: it adds up, over pixels, the *sizes* of what
+# each pixel gives to a centre, so that two pixels that pull in opposite directions do not cancel (AbsGS).
 #
 # {{source: pop_ref.pixel.composite_pixel_vjp}}
 
@@ -158,7 +161,7 @@ assert (four[3], four[0]) == (1 / 8, 0.0)
 #
 # Note that the gradient of the centre has $\alpha$, and so $o$, as a factor: a faint splat is moved only a little (POP
 # paper, eq. 10; chapter 8 comes back to it). Two decisions cut the chain: a splat under the floor 1/255 is skipped
-# (D5), and one at the ceiling 0.999 passes nothing, because the clamped alpha does not move (kink B3).
+# (D5), and one over the ceiling 0.999 passes nothing, because the clamped alpha does not move (kink B3).
 #
 # {{source: pop_ref.alpha.alpha_from_sigma_vjp}}
 #

@@ -166,7 +166,8 @@ assert np.allclose(v_covar2d, v_covars2d[i], rtol=1e-9)
 #
 # {{source: pop_ref.projection._offset_vjp}}
 #
-# The helper handles one entry $-f_x t / z^2$, where $t = z\,\mathrm{clamp}(x / z)$ (kink B1). Where it is clamped, $t /
+# The helper handles one entry $-f_x t / z^2$, where $t = z\,\mathrm{clamp}(x / z)$ (kink B1). At exactly the limit the
+# derivative from inside is taken. Where it is clamped, $t /
 # z$ is a constant: moving sideways changes nothing, and only one factor $1/z$ is left to differentiate.
 
 # %%
@@ -203,6 +204,12 @@ assert np.allclose(
 # Both steps are linear. A point is turned and moved, $p = R_c\, \mu + t$, so its cotangent is turned back, $v_\mu =
 # R_c^\top v_p$. A covariance is turned on both sides, so by the first rule
 # $v_\Sigma = R_c^\top v_{\Sigma_{\mathrm{cam}}} R_c$.
+#
+# A camera can be learnt, too, and every one of these maps has a cotangent of its own. Summed over Gaussians, $p$ gives
+# $v_{R_c} = \sum v_p\, \mu^\top$ and $v_t = \sum v_p$. The covariance, in which $R_c$ stands twice, gives by the
+# second rule $v_{R_c} = \sum (V R_c \Sigma^\top + V^\top R_c \Sigma)$ with $V = v_{\Sigma_{\mathrm{cam}}}$. The
+# camera's centre is $e = -R_c^\top t$, so $v_{R_c} = -t\, v_e^\top$ and $v_t = -R_c\, v_e$; and since the direction of
+# view is $d = \mu - e$, $v_e = -\sum v_d$.
 
 # %%
 R_cam = viewmat[:3, :3]
@@ -247,8 +254,9 @@ assert np.allclose(
 # %% [markdown]
 # ## Colour: coefficients and direction
 #
-# $c = \max(\frac12 + \sum_k Y_k(d / \lvert d \rvert)\, h_k, 0)$ (chapter 3). Where the maximum is 0, nothing passes
-# (kink B2). Else the sum is linear in the coefficients, $v_{h_k} = Y_k\, v_c$; and it depends on the direction,
+# $c = \max(\frac12 + \sum_k Y_k(d / \lvert d \rvert)\, h_k, 0)$ (chapter 3). Where the sum is under 0, nothing passes;
+# at exactly 0 the derivative from above is taken (kink B2). Else the sum is linear in the coefficients,
+# $v_{h_k} = Y_k\, v_c$; and it depends on the direction,
 # $v_{Y_k} = h_k \cdot v_c$, so $v_u = \sum_k v_{Y_k} \nabla Y_k$, and $v_d$ follows by the division by the length, as
 # for the quaternion.
 #

@@ -104,8 +104,11 @@ print("pull: too short {:.4f}, too wide {:.4f}, right {:.4f}, faint {:.4f}".form
 # small: **clone**, a copy on top of the original. Selected and large: **split**, two children drawn from the parent's
 # own distribution, 1.6 times smaller, in its place. Small means that the largest scale is at most 0.01 of the scene's.
 # Then **prune**: what has an opacity under 0.005 is removed; 3DGS also removes what is far too large, once opacities
-# have been reset, and POP, which has no resets, does not. (A child's place is drawn at random; here two draws are
-# picked that make a clear picture.)
+# have been reset, and POP, which has no resets, does not.
+#
+# A child's place is drawn at random: with three standard normal draws $\epsilon$ it is $\mu' = \mu + R(q)\,(s \odot
+# \epsilon)$, each draw scaled along the parent's axis and then turned with it. Its widths are $s' = s / 1.6$, and
+# what is stored are their logarithms. (Here two draws are picked that make a clear picture.)
 #
 # {{source: pop_ref.density.grow_masks}}
 #

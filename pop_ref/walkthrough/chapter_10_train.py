@@ -13,7 +13,8 @@
 #
 # {{source: pop_ref.training.train_step}}
 #
-# Raw parameters become Gaussians (1b), whose harmonics grow with the step (3). The view is **rendered** (2 to 4b). The
+# Raw parameters become Gaussians (1b), whose harmonics grow with the step where there are any (3). The view is
+# **rendered** (2 to 4b). The
 # **objective** (6, 8) gives the loss, its gradient with respect to the image, and what the prior adds to the opacities;
 # who is important is read off this very render (7). The gradient goes **back** (5, 5b) to the raw parameters (1b).
 # `update` is **Adam** (1b). Then **density control** (9): `accumulate` counts what this view shows, and `control`

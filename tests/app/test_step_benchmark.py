@@ -157,7 +157,8 @@ def test_peaks_that_a_step_surpasses_are_no_peaks(script: Any, monkeypatch: pyte
     # the projection of this case alone would then need 3.68 ms
     monkeypatch.setattr(parts, "vector_ops_per_s", lambda threads: 5e5 * threads)
     monkeypatch.setattr(parts, "bytes_per_s", lambda moved, threads: 1e12)
-    with pytest.raises(SystemExit, match=r"project took 1.50 ms, and operations alone need .*: peak.py measures too little"):
+    too_little = r"project took 1.50 ms, and operations alone need .*: peak.py measures too little"
+    with pytest.raises(SystemExit, match=too_little):
         parts.floors(case("64x32-100"))
 
 

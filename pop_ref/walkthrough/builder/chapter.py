@@ -221,7 +221,8 @@ def _expanded(name: str, argument: str, whole: str, marked: bool) -> str:
         return whole
     if name in ("source", "bug"):
         code, file = source_of(argument) if name == "source" else broken_function(argument)
-        stage = _stage_of(argument) if name == "source" and marked else ""
+        written = argument if name == "source" else code.partition("def ")[2].partition("(")[0]
+        stage = _stage_of(written) if marked else ""
         # a page folds what is marked so (`layout`)
         yours = f", yours to write first in `pop learn check {stage}`" if stage else ""
         return f"`{file}`{yours}:\n\n```python\n{as_wide_as_a_page(code)}\n```"

@@ -56,7 +56,7 @@ _PUNCTUATED: Final = re.compile(r'<span class="math inline">((?:(?!</math>).)*</
 _LABEL: Final = re.compile(r"(<(pre|code|a|math|h\d)\b.*?</\2>)|\b([DB][1-8])\b", re.DOTALL)
 # a printed function that the course asks the reader to write
 _YOURS: Final = re.compile(
-    r"<p>(<code>[\w/.]+</code>), yours to write first in <code>pop learn check (\w+)</code>:</p>\s*(<pre>.*?</pre>)",
+    r"<p>(<code>[\w/., ]+</code>), yours to write first in <code>pop learn check (\w+)</code>:</p>\s*(<pre>.*?</pre>)",
     re.DOTALL,
 )
 _WIDGET: Final = re.compile(r"<p>\{\{widget: (\w+)\}\}</p>")

@@ -1,0 +1,254 @@
+"""Mistakes that everyone makes once, of the stages from losses to the loop; see `mistakes`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+
+from pop_ref.learn.mistakes_geometry import Mistake, Oracle
+from pop_ref.optimizer import BETAS, EPS
+
+
+def _adam(
+    first: bool = True, second: bool = True, sign: float = -1.0, late: int = 0, squared: bool = True, root: bool = True,
+    turned: bool = False,
+) -> Callable[..., Any]:  # fmt: skip
+    """Make `adam_step` without the division by 1 - beta1^t or by 1 - beta2^t, uphill, with another number of the
+    update, with g for g^2, without the root, or with its betas exchanged."""
+
+    def made(o: Oracle, params: Any, grads: Any, m: Any, v: Any, step: Any, lr: Any,
+             betas: Any = BETAS, eps: float = EPS) -> Any:  # fmt: skip
+        params, m, v = dict(params), dict(m), dict(v)
+        betas = betas[::-1] if turned else betas
+        for name, g in grads.items():
+            t = (step if isinstance(step, int) else step[name]) + late
+            m[name] = betas[0] * m[name] + (1.0 - betas[0]) * g
+            v[name] = betas[1] * v[name] + (1.0 - betas[1]) * (g * g if squared else g)
+            mean = m[name] / (1.0 - betas[0] ** t if first else 1.0)
+            size = v[name] / (1.0 - betas[1] ** t if second else 1.0)
+            size = (np.sqrt(size) if root else size) + eps
+            params[name] = params[name] + sign * lr[name] * mean / size
+        return params, m, v
+
+    return made
+
+
+def _means(of_all: bool = False, turned: bool = False) -> Callable[..., Any]:
+    """Make `pop_loss` with both sums divided by the number of all, or with its poles exchanged."""
+
+    def made(o: Oracle, opacities: Any, mask: Any, visible: Any = None) -> float:
+        part = np.ones(len(mask), dtype=bool) if visible is None else visible
+        total = 0.0
+        for important, side in ((True, part & mask), (False, part & ~mask)):
+            apart = 1.0 - opacities if important != turned else opacities
+            total += float(np.sum(apart[side])) / max(len(mask) if of_all else int(np.sum(side)), 1)
+        return total
+
+    return made
+
+
+def _split_beside(o: Oracle, rows: Any, mask: Any, normals: Any, *revised: Any) -> Any:
+    """Make `split_rows` that keeps the parents."""
+    kept = o["split_rows"](rows, mask, normals, *revised)
+    n = int(np.sum(~mask))
+
+    def both(old: Any, new: Any) -> Any:
+        return {name: np.concatenate([old[name], new[name][n:]]) for name in old}
+
+    return type(kept)(both(rows.params, kept.params), both(rows.m, kept.m), both(rows.v, kept.v))
+
+
+def _split_otherwise(name: str, change: Callable[[Any], Any], to: str) -> Callable[..., Any]:
+    """Make `split_rows` that reads a parameter changed, and takes another parameter of the children from that."""
+
+    def made(o: Oracle, rows: Any, mask: Any, normals: Any, *revised: Any) -> Any:
+        changed = type(rows)({**rows.params, name: change(rows.params[name])}, rows.m, rows.v)
+        split, other = (o["split_rows"](each, mask, normals, *revised) for each in (rows, changed))
+        n = int(np.sum(~mask))
+        taken = np.concatenate([split.params[to][:n], other.params[to][n:]])
+        return type(split)({**split.params, to: taken}, split.m, split.v)
+
+    return made
+
+
+def _unturned(o: Oracle, rows: Any, mask: Any, normals: Any, *revised: Any) -> Any:
+    """Make `split_rows` that draws children along the world's axes."""
+    upright = {**rows.params, "quats": np.tile([1.0, 0.0, 0.0, 0.0], (len(mask), 1))}
+    split = o["split_rows"](type(rows)(upright, rows.m, rows.v), mask, normals, *revised)
+    quats = o["split_rows"](rows, mask, normals, *revised).params["quats"]
+    return type(split)({**split.params, "quats": quats}, split.m, split.v)
+
+
+def _clone_with_moments(o: Oracle, rows: Any, mask: Any) -> Any:
+    """Make `clone_rows` whose copies have the moments of their sources."""
+    both = ({name: np.concatenate([x, x[mask]]) for name, x in each.items()} for each in (rows.m, rows.v))
+    return type(rows)(o["clone_rows"](rows, mask).params, *both)
+
+
+def _over_all(o: Oracle, opacities: Any, mask: Any, v_loss: float, visible: Any = None) -> Any:
+    """Make `pop_loss_vjp` whose sides are both divided by the number of all Gaussians."""
+    part = np.ones(len(mask), dtype=bool) if visible is None else visible
+    return v_loss * np.where(part, np.where(mask, -1.0, 1.0), 0.0) / len(mask)
+
+
+TRAINING: Final = (
+    Mistake(
+        "adam_step",
+        _adam(first=False, second=False),
+        "The two running means are not corrected: both start at 0, so that the first steps have the wrong length.",
+        "Divide m by 1 - beta1^t and v by 1 - beta2^t before the quotient; keep m and v themselves as they are.",
+    ),
+    Mistake(
+        "prune_rows",
+        lambda o, rows, mask: o["prune_rows"](rows, ~mask),
+        "You keep the rows that are to be removed: the mask selects what goes.",
+        "rows[~mask] are the survivors, in every parameter and both moments.",
+    ),
+    Mistake(
+        "l2_vjp",
+        lambda o, *given: 0.5 * o["l2_vjp"](*given),
+        "A two is missing: the derivative of a square is twice its base.",
+        "l2 is a mean of squares, without a half in front.",
+    ),
+    Mistake(
+        "pop_loss",
+        _means(turned=True),
+        "The poles are exchanged: important Gaussians are drawn to opacity 1, the others to 0.",
+        "The mean of 1 - o where the mask is true, plus the mean of o where it is not.",
+    ),
+    Mistake(
+        "pop_loss",
+        _means(of_all=True),
+        "Both sides are divided by the number of all Gaussians: the important have a mean of their own, and so have the"
+        " others.",
+        "Divide the first sum by N_imp and the second by N - N_imp.",
+    ),
+    Mistake(
+        "pop_loss_vjp",
+        lambda o, opacities, mask, v_loss, *visible: -o["pop_loss_vjp"](opacities, mask, v_loss, *visible),
+        "The poles are exchanged: the loss falls where important opacities rise and the others fall.",
+        "-v_loss / N_imp where the mask is true, v_loss / (N - N_imp) where it is not.",
+    ),
+    Mistake(
+        "adam_step",
+        _adam(late=1),
+        "The number of the update is one too many: `step` is 1 for the first one already.",
+        "Correct with beta^step.",
+    ),
+    Mistake(
+        "adam_step",
+        _adam(late=-1),
+        "The number of the update is one too few: `step` is 1 for the first one already.",
+        "Correct with beta^step.",
+    ),
+    Mistake(
+        "adam_step",
+        _adam(turned=True),
+        "The two betas are exchanged: the first decays the mean of gradients, the second that of their squares.",
+        "m = beta1 m + (1 - beta1) g, v = beta2 v + (1 - beta2) g^2.",
+    ),
+    Mistake(
+        "adam_step",
+        _adam(squared=False),
+        "v averages the gradient itself; it is the running mean of its square.",
+        "v = beta2 v + (1 - beta2) g^2.",
+    ),
+    Mistake(
+        "adam_step",
+        _adam(root=False),
+        "The root is missing: v is a mean of squares, and the step is divided by a length.",
+        "x - lr m / (sqrt(v) + eps), both corrected.",
+    ),
+    Mistake(
+        "adam_step",
+        _adam(sign=1.0),
+        "You go up the loss: the gradient points to where the loss rises, so a step is taken against it.",
+        "x - lr m / sqrt(v), with a minus.",
+    ),
+    Mistake(
+        "adam_step",
+        _adam(first=False),
+        "The running mean m is not divided by 1 - beta1^t: it starts at 0, so that the first steps are too short.",
+        "Divide for the quotient only; what is kept and returned is m itself.",
+    ),
+    Mistake(
+        "adam_step",
+        _adam(second=False),
+        "The running mean v is not divided by 1 - beta2^t: it starts at 0, so that the first steps are too long.",
+        "Divide for the quotient only; what is kept and returned is v itself.",
+    ),
+    Mistake(
+        "split_rows",
+        _split_beside,
+        "The parents stay; a split puts two children in the place of one parent.",
+        "Keep the rows that were not selected, rows[~mask], and append both kinds of children.",
+    ),
+    Mistake(
+        "split_rows",
+        _unturned,
+        "The draws are not turned: the children must lie along the parent's own axes.",
+        "mean + R(q) (s * eps): scale each draw first, then turn it.",
+    ),
+    Mistake(
+        "pop_loss_vjp",
+        _over_all,
+        "Both sides are divided by the number of all Gaussians: the important have a mean of their own, and so have the"
+        " others.",
+        "Divide the first sum by N_imp and the second by N - N_imp.",
+    ),
+    Mistake(
+        "clone_rows",
+        _clone_with_moments,
+        "The copies have Adam's moments of their sources: newcomers start with moments of 0.",
+        "Append copies to the parameters, and zeros to m and v.",
+    ),
+    Mistake(
+        "split_rows",
+        _split_otherwise("scales", lambda x: x + np.log(1.6) - 1.6, "scales"),
+        "You subtract 1.6 from the logarithms of the widths: to divide a width by 1.6, subtract log 1.6.",
+        "params['scales'] holds logarithms.",
+    ),
+    Mistake(
+        "split_rows",
+        _split_otherwise("scales", np.zeros_like, "means"),
+        "The draws are not scaled: a child lies as far from its parent's centre as the parent is wide.",
+        "mean + R(q) (s * eps): scale each draw first, then turn it.",
+    ),
+    Mistake(
+        "grow_masks",
+        lambda o, window, scales, *given: o["grow_masks"](
+            window, np.repeat(scales.min(axis=1, keepdims=True), 3, axis=1), *given
+        ),
+        "You compare the smallest of the three widths: a Gaussian is small if its largest one is.",
+        "scales.max(axis=1).",
+    ),
+    Mistake(
+        "grow_masks",
+        lambda o, window, *given: o["grow_masks"](replace(window, n_visible=np.minimum(window.n_visible, 1)), *given),
+        "You compare the sum of the gradients; their average over the views that showed the Gaussian is asked for.",
+        "average_grads(statistics) divides, and knows what no view showed.",
+    ),
+    Mistake(
+        "grow_masks",
+        lambda o, window, scales, scene_scale, *given: o["grow_masks"](window, scales, 1.0, *given),
+        "The scale of the scene is missing: small is at most grow_scale3d times scene_scale.",
+        "scales.max(axis=1) <= config.grow_scale3d * scene_scale.",
+    ),
+    Mistake(
+        "grow_masks",
+        lambda o, window, scales, *given: o["grow_masks"](
+            window, np.repeat(scales.mean(axis=1, keepdims=True), 3, axis=1), *given
+        ),
+        "You compare the mean of the three widths: a Gaussian is small if its largest one is.",
+        "scales.max(axis=1).",
+    ),
+    Mistake(
+        "params_vjp",
+        lambda o, params, gradients, v_opacities: o["params_vjp"](params, gradients, np.zeros_like(v_opacities)),
+        "The prior's pull is missing: v_opacities is added to the gradient of the render's opacities.",
+        "gradients.opacities + v_opacities, then back through the sigmoid.",
+    ),
+)
