@@ -213,7 +213,7 @@ def test_the_faint_are_pruned_and_later_the_far_too_large(backend, opacity, scen
             assert_same_bits(f"pruned at step {step}, prune_too_big {by_size}", pruned[clear], expected[clear])
     # a threshold that every precision has: what lies at it stays
     at_it, sizes = np.array([0.25, 0.125, 0.5]), np.full((3, 3), 0.0625 * scene_scale)
-    config = replace(POP, prune_opa=0.25)
+    config = DensityConfig(prune_opa=0.25)
     pruned = backend.stage("prune_mask")(at_it, sizes, scene_scale, 600, config)
     assert_same_bits("pruned at the threshold", pruned, [False, True, False])
 

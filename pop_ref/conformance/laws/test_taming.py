@@ -44,6 +44,10 @@ def test_edges_are_eight_times_the_grey_less_its_neighbours_and_the_frame_is_gre
             around = sum(int(grey[y + j, x + i]) for i in (-1, 0, 1) for j in (-1, 0, 1)) - int(grey[y, x])
             expected[y, x] = min(max(8 * int(grey[y, x]) - around, 0), 255)
     assert_same_bits("edges", backend.stage("edge_map")(photo), expected)
+    # a picture of two rows is all frame: eight thousand colours, some of which a rounded weight would turn
+    colours = np.random.default_rng(1).integers(0, 256, (2, 4096, 3)).astype(np.uint8)
+    grey = (colours.astype(np.int64) @ np.array([19595, 38470, 7471]) + 2**15) // 2**16
+    assert_same_bits("grey", backend.stage("edge_map")(colours), grey.astype(np.float64))
 
 
 @law("taming", "pixel_weights", "edge_map", photo=photos, image=arrays_of((6, 5, 3), 0.0, 1.0))
