@@ -58,10 +58,10 @@ from pop_ref.walkthrough.style import (
     show_image,
 )
 
-squares = {"_C0": 1 / 4, "_C1": 3 / 4, "_C2": 15 / 4, "_C2_Z": 5 / 16}
-squares |= {"_C3_3": 35 / 32, "_C3_2": 105 / 4, "_C3_1": 21 / 32, "_C3_0": 7 / 16}
-for name, over_pi in squares.items():
-    assert math.isclose(getattr(harmonics, name), math.sqrt(over_pi / math.pi))
+names = ("_C0", "_C1", "_C2", "_C2_Z", "_C3_3", "_C3_2", "_C3_1", "_C3_0")
+over_pi = (1 / 4, 3 / 4, 15 / 4, 5 / 16, 35 / 32, 105 / 4, 21 / 32, 7 / 16)
+for name, square in zip(names, over_pi, strict=True):
+    assert math.isclose(getattr(harmonics, name), math.sqrt(square / math.pi))
 for degree in range(4):
     assert sh_basis(np.eye(3)[:1], degree).shape == (1, (degree + 1) ** 2)
 grey = colors_from_sh(np.zeros((1, 16, 3)), np.array([[1.0, 2.0, 3.0]]), degree=3)
