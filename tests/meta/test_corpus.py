@@ -45,6 +45,7 @@ def drawn_of(name: str) -> Any:
     return OracleAdapter().full_render(corpus_scene(name))
 
 
+@pytest.mark.slow  # the oracle draws large scenes
 @pytest.mark.parametrize("name", QUICK)
 def test_the_answers_are_the_oracles(name: str) -> None:
     kept, again = answers(name), answer(name)

@@ -229,6 +229,7 @@ def _waiting_for(path: Path, process: subprocess.Popen, seconds: float = 120.0) 
         time.sleep(0.05)
 
 
+@pytest.mark.slow  # a row is trained twice
 def test_sigterm_leaves_a_checkpoint_and_the_same_command_goes_on(made, tmp_path):
     how, job = options(tmp_path), toy("pop")
     words = ["run", "pop", "demo", "--scale", "toy", "--results", str(how.results), "--work", str(how.work)]

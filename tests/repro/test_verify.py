@@ -56,6 +56,7 @@ def verify(folder: Path, work: Path, *words: str) -> int:
     return main(["verify", "pop", "demo", "--scale", "toy", *where, *words])
 
 
+@pytest.mark.slow  # a row is trained several times
 def test_a_result_comes_out_again_to_the_last_bit_on_the_same_machine(trained, tmp_path, capsys):
     assert verify(trained, tmp_path) == 0
     told = capsys.readouterr().out.splitlines()

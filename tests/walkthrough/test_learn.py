@@ -381,6 +381,7 @@ def _written(folder: Path) -> None:
         write(folder, stage.name)
 
 
+@pytest.mark.slow  # it trains in NumPy
 def test_who_has_written_all_trains_on_a_picture_of_ones_own_above_20_db_and_gets_a_film(
     mine: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
