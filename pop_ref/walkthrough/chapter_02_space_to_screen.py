@@ -55,6 +55,16 @@ scales = np.array([[0.25, 0.1, 0.05], [0.15, 0.12, 0.42]])
 
 covars = covars_from_quats_scales(quats, scales)
 R = rotmats_from_quats(quats)[0]
+unit = quats[0] / np.linalg.norm(quats[0])
+w, x, y, z = unit
+assert np.allclose(
+    R,
+    [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ],
+)
 assert np.allclose(covars[0], R @ np.diag(scales[0] ** 2) @ R.T)
 assert np.allclose(np.linalg.eigvalsh(covars[0]), np.sort(scales[0] ** 2))
 assert np.array_equal(covars, covars_from_quats_scales(-quats, scales))
@@ -233,6 +243,16 @@ aside = np.array([[20.0, 0.0, 1.0]])
 limit = (width / 2 + 0.15 * width) / f
 assert PAPER.frustum_margin == 2 * 0.15
 assert np.isclose(projection_jacobians(aside, K, width, height)[0, 0, 2], -f * limit)
+# and where the principal point is not in the middle
+K_off = np.array([[f, 0.0, 20.0], [0.0, f, 30.0], [0.0, 0.0, 1.0]])
+for point, over in (
+    (aside, (width - 20.0 + 0.15 * width) / f),
+    (-aside, -(20.0 + 0.15 * width) / f),
+):
+    entry = projection_jacobians(
+        np.abs(point) * [np.sign(over), 1.0, 1.0], K_off, width, height
+    )[0, 0, 2]
+    assert np.isclose(entry, -f * over)
 
 # %% [markdown]
 # A Gaussian to walk around. Its points go through the true pinhole, its ellipse through $J$.

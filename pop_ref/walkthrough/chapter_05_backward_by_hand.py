@@ -102,6 +102,11 @@ v_alphas = T * (q - beta)
 print("light behind", beta.round(3))
 print("derivatives ", v_alphas.round(3))
 np.testing.assert_allclose(v_alphas, v_alphas_of(ray, 0.3), rtol=1e-12)
+# a cotangent of the remaining light is light behind the last splat, as the background is
+totals = [zero_gradients(n, 1) for _ in range(2)]
+for total, behind, v_T in zip(totals, (0.25, 0.75), (0.5, 0.0), strict=True):
+    composite_pixel_vjp(pixel, ray, 0.5, 0.5, [behind], [1.0], v_T, total)
+np.testing.assert_allclose(totals[0].v_opacities, totals[1].v_opacities, rtol=1e-12)
 # the pixel grows with a splat's alpha exactly where the splat is brighter than what it covers
 assert np.array_equal(v_alphas > 0.0, q > beta)
 

@@ -36,9 +36,13 @@ import math
 import numpy as np
 
 from pop_ref.camera import (
+    camera_center_vjp,
     covars_cam_from_covars,
+    covars_cam_from_covars_vjp,
     means_cam_from_means,
+    means_cam_from_means_vjp,
     view_dirs,
+    view_dirs_vjp,
 )
 from pop_ref.compositing import composite_vjp
 from pop_ref.constants import PAPER
@@ -215,6 +219,22 @@ assert np.allclose(
 R_cam = viewmat[:3, :3]
 v_covars = np.array([R_cam.T @ v @ R_cam for v in v_covars_cam])
 v_means = (through_center + through_J) @ R_cam
+# what the camera gets, by each of the four maps
+v_p, V_cam = through_center + through_J, v_covars_cam
+_, v_view = means_cam_from_means_vjp(scene.means, viewmat, v_p)
+assert np.allclose(v_view[:3], np.column_stack([v_p.T @ scene.means, v_p.sum(axis=0)]))
+_, v_view = covars_cam_from_covars_vjp(covars, viewmat, V_cam)
+turned = (
+    V_cam @ R_cam @ np.swapaxes(covars, 1, 2) + np.swapaxes(V_cam, 1, 2) @ R_cam @ covars
+)
+assert np.allclose(v_view[:3, :3], turned.sum(axis=0))
+v_e = np.array([1.0, -2.0, 0.5])
+v_view = camera_center_vjp(viewmat, v_e)
+assert np.allclose(
+    v_view[:3], np.column_stack([-np.outer(viewmat[:3, 3], v_e), -R_cam @ v_e])
+)
+_, v_view = view_dirs_vjp(scene.means, viewmat, v_p)
+assert np.allclose(v_view, camera_center_vjp(viewmat, -v_p.sum(axis=0)))
 
 # %% [markdown]
 # ## From the covariance to widths and rotation
