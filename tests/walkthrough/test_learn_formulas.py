@@ -35,7 +35,7 @@ def value_of(formula: str, **values: Any) -> Any:
     for before, token in zip(["(", *tokens], tokens, strict=False):
         operand = before not in _FUNCTIONS and re.fullmatch(r"[\w.]+|[)\]]", before)
         written += " * " if operand and re.fullmatch(r"[\w.]+|[(\[]", token) else ""
-        written += {"^": "**"}.get(token, token)
+        written += "**" if token == "^" else token
     if "[[" in written:
         written = re.sub(r"(\[\[.*\]\])", r"array(\1)", written)
     return eval(written, {"__builtins__": {}, "array": np.array, **_FUNCTIONS}, values)
