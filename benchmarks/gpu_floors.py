@@ -1,9 +1,10 @@
 """What each kernel of a training step has to do at least: bytes, instructions, and the time that a card needs for them.
 
 The blend's instructions are counted in its machine code for sm_90 (`results/sass.json`), the loss's are estimated from
-its loops there. A floor is the largest of four times: for the bytes, at the bandwidth that this card copies with; for
+its loops there. A floor is the largest of five times: for the bytes, at the bandwidth that this card copies with; for
 the instructions, at its full issue rate; for comparisons, selections and integers of the blend, which go through a pipe
-of half that rate; and for the longest list, whose warp issues one instruction a cycle when the others are done.
+of half that rate; for its accesses of shared memory, 128 bytes a cycle; and for the longest list, whose warp issues one
+instruction a cycle when the others are done.
 """
 
 from __future__ import annotations
@@ -18,14 +19,20 @@ from typing import Any
 import torch
 
 LANES_PER_SM = 128
+TILE_PIXELS = 128
 ROW = 48  # bytes of a packed splat, and of a gradient slot
 PARAMETERS = 59  # floats of a Gaussian
 GEOMETRY = 11  # of these, what a culled Gaussian is read for
 HALF_RATE = ("compare", "integer")  # classes of instructions, by the tables of arithmetic throughput for sm_90
-LANE_PIXELS = 4  # pixels that a lane of the blend evaluates a splat at
+WARP, SCHEDULERS = 32, 4
 SASS = json.loads((Path(__file__).resolve().parent / "results" / "sass.json").read_text(encoding="utf-8"))
 # what a POP step launches
 FORWARD, BACKWARD = "blend_forward_kernel<3, 1, false>", "columns_kernel<3, false, false, false>"
+BLENDS = {"blend_forward": FORWARD, "blend_backward": BACKWARD}
+# cycles of shared memory: of a visit, three pieces of 16 bytes for each of four quarters, and going back a lane's 24
+# bytes of sums; of eight visits, these again and a row of 48 bytes, read and written; of a batch, 48 bytes a lane in
+# and, going back, 96 cleared and 96 read
+SHARED = {"blend_forward": (12, 0, 12), "blend_backward": (18, 72, 60)}
 
 
 @dataclass(frozen=True)
@@ -40,6 +47,7 @@ class Loads:
         contributing: of these, those that are blended.
         pixels: of the image.
         longest: entries of one tile's list up to where its last pixel stops, at most.
+        visits, eights, batches: of the blend's warps, as `gpu_visits` counts them.
     """
 
     gaussians: int
@@ -48,7 +56,10 @@ class Loads:
     evaluated: int
     contributing: int
     pixels: int
-    longest: int = 0
+    longest: int
+    visits: int
+    eights: int
+    batches: int
 
 
 @dataclass(frozen=True)
@@ -86,23 +97,29 @@ def _clock_hz() -> float:
     return 1e6 * float(printed[0]) if printed else 1e9
 
 
-def instructions_a_record(kernel: str, arch: str = "sm_90") -> tuple[float, float]:
-    """Return what a warp issues for a record, by the count of the kernel's loop, and how much of it at half rate."""
+def issued_per(kernel: str, unit: str, arch: str = "sm_90") -> tuple[float, float]:
+    """Return what a warp issues for a unit of a kernel's loop, without the loops in it, and how much at half rate."""
     (entry,) = (entry for entry in SASS["kernels"] if (entry["kernel"], entry["arch"]) == (kernel, arch))
-    (loop,) = (loop for loop in entry["loops"] if loop["per"] == "record")
+    (loop,) = (loop for loop in entry["loops"] if loop["per"] == unit)
     half = sum(loop["always_by_class"].get(name, 0) for name in HALF_RATE)
     return loop["all"] / loop["iterations"], half / loop["iterations"]
 
 
-def instructions_a_pair(kernel: str) -> float:
-    """Return what a lane issues for one splat at one pixel."""
-    return instructions_a_record(kernel)[0] / LANE_PIXELS
+def blend_work(name: str, loads: Loads) -> tuple[float, float, float]:
+    """Return what a blend's warps issue altogether, how much of it at half rate, and their cycles of shared memory."""
+    parts = {"visit": loads.visits, "8 visits": loads.eights, "32 records": loads.batches}
+    issued = half = 0.0
+    for unit, times in parts.items():
+        if unit == "8 visits" and name == "blend_forward":
+            continue
+        one, at_half = issued_per(BLENDS[name], unit)
+        issued, half = issued + times * one, half + times * at_half
+    return issued, half, float(sum(cycles * times for cycles, times in zip(SHARED[name], parts.values(), strict=True)))
 
 
 def work(loads: Loads) -> dict[str, tuple[float, float]]:
     """Return bytes and lane instructions of every kernel of a step, by the kernel's name."""
     n, seen, entries, pixels = loads.gaussians, loads.visible, loads.instances, loads.pixels
-    evaluated = loads.evaluated
     adam = 4 * 3 * PARAMETERS * 2  # parameter and both moments, read and written
     return {
         # 36 bytes for the lists, and a packed splat where one is seen
@@ -111,25 +128,28 @@ def work(loads: Loads) -> dict[str, tuple[float, float]]:
         "count_instances": ((4 * 16 + ROW + 8) * n, 0.0),
         # emitted once, two passes of a 6-byte pair over 16-bit tiles, ids and slots written
         "make_tile_lists": ((6 + 2 * 12 + 12) * entries, 0.0),
-        "blend_forward": ((ROW + 4) * entries + 20 * pixels, instructions_a_pair(FORWARD) * evaluated),
+        "blend_forward": ((ROW + 4) * entries + 20 * pixels, WARP * blend_work("blend_forward", loads)[0]),
         # a pixel and channel: 215 for its window, 162 for its gradient
         "photometric": (8 * 12 * pixels, (215.0 + 162.0) * 3 * pixels),
         # a slot an entry, written once and read once
-        "blend_backward": ((3 * ROW + 8) * entries + 20 * pixels, instructions_a_pair(BACKWARD) * evaluated),
+        "blend_backward": ((3 * ROW + 8) * entries + 20 * pixels, WARP * blend_work("blend_backward", loads)[0]),
         "update": ((adam + ROW) * n, 0.0),
     }
 
 
 def floors(loads: Loads, card: Card) -> dict[str, dict[str, Any]]:
     """Return bytes, instructions, the floor in ms and what it is of, for every kernel."""
-    blends = {"blend_forward": FORWARD, "blend_backward": BACKWARD}
     found: dict[str, dict[str, Any]] = {}
     for name, (moved, issued) in work(loads).items():
         times = {"memory": moved / card.bytes_per_s, "issue": issued / card.instructions_per_s}
-        if name in blends:
-            record, half = instructions_a_record(blends[name])
-            times["half rate"] = 2.0 * half / LANE_PIXELS * loads.evaluated / card.instructions_per_s
-            times["longest list"] = record * loads.longest / card.clock_hz
+        if name in BLENDS:
+            of_warps, half, shared = blend_work(name, loads)
+            times["half rate"] = 2.0 * WARP * half / card.instructions_per_s
+            # lanes issue on four schedulers of a processor, which has one path to its shared memory
+            times["shared memory"] = SCHEDULERS * WARP * shared / card.instructions_per_s
+            # an entry of the longest list costs what an entry costs in the mean
+            a_list = of_warps * TILE_PIXELS / max(loads.evaluated, 1)
+            times["longest list"] = a_list * loads.longest / card.clock_hz
         bound = max(times, key=lambda name: times[name])
         found[name] = {
             "bytes": float(moved),

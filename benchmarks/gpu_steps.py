@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from gpu_floors import Loads
 from gpu_profile import kernel_sums
+from gpu_visits import count_visits
 from torch import Tensor
 
 from cuda_ext.training import step_program
@@ -87,6 +88,7 @@ def step_loads(trainer: FusedTrainer) -> Loads:
         int(stats["n_blended"].long().sum()),
         width * height,
         int(longest.max()),
+        *count_visits(trainer.lists()[size], trainer.splats, stats["n_traversed"]),
     )
 
 

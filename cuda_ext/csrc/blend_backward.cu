@@ -1,7 +1,7 @@
 // Blending transposed, in moment form, by two families that give the same sums.
 //
-// columns: one warp a tile of 16 x 8 pixels, back to front; a lane owns four pixels, and a splat's sums are added over the
-//     lanes by a transposed butterfly, about one shuffle a value.
+// columns: one warp a tile of 16 x 8 pixels, back to front; a lane owns four pixels, eight lanes a quarter of the tile,
+//     which leaves out what does not reach it. A splat's sums are added over the lanes through shared memory.
 // splats: one warp a bucket of 32 list entries, back to front; a lane owns a splat and keeps its sums in registers, and
 //     the tile's pixels travel through the lanes. Needs the forward pass's checkpoints.
 //
@@ -13,7 +13,7 @@
 // memory, a few rows a splat. Counts: benchmarks/NOTES.md, `make sass`.
 
 #include "cuda_check.h"
-#include "kernel_tools.cuh"
+#include "warp_sums.cuh"
 
 namespace pop {
 
@@ -48,49 +48,11 @@ __device__ __forceinline__ void clear_unused(const TileLists& lists, const Blend
     }
 }
 
-constexpr int HALF_WARP = WARP / 2;
-static_assert(HALF_WARP == WARP_TILE_W, "lanes half a warp apart share a column, and so dx");
-
-// Sums of two records at a time: first a lane adds its column's other half, of one record each; then a half warp adds up
-// its columns, with the moments along x made once a column.
-template <int CH, bool ABS>
-__device__ __forceinline__ float sum_of_pair(const ColumnSums<float, CH> (&pair)[2], const float (&dx)[2], int lane) {
-    constexpr int N = SumsOf<CH, ABS>::count;
-    const bool upper = lane & HALF_WARP;
-    const auto joined = [upper](float first, float second) {
-        return (upper ? second : first) + __shfl_xor_sync(FULL_WARP, upper ? first : second, HALF_WARP);
-    };
-    ColumnSums<float, CH> column;
-#pragma unroll
-    for (int c = 0; c < CH; ++c) column.v_color[c] = joined(pair[0].v_color[c], pair[1].v_color[c]);
-    column.m0 = joined(pair[0].m0, pair[1].m0);
-    column.my = joined(pair[0].my, pair[1].my);
-    column.myy = joined(pair[0].myy, pair[1].myy);
-    if (ABS) {
-        column.abs_x = joined(pair[0].abs_x, pair[1].abs_x);
-        column.abs_y = joined(pair[0].abs_y, pair[1].abs_y);
-    }
-    float sums[N];
-    sums_of_column<ABS>(column, upper ? dx[1] : dx[0], sums);
-    return TransposedSum<N, HALF_WARP / 2>::of(sums, lane);
-}
-
-template <int CH, bool ABS, bool PASS, bool ATOMIC>
-__global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK, CH < 4 && !ABS ? 7 : 0)
-    columns_kernel(TileLists lists, BlendBackward blend, BlendConstants<float> constants, int n_warp_tiles) {
-    constexpr int N = SumsOf<CH, ABS>::count;
-    __shared__ float4 staged[WARPS_PER_BLOCK][WARP][RECORD / 4];
-    __shared__ unsigned staged_rows[WARPS_PER_BLOCK][WARP];
-    const int lane = threadIdx.x & (WARP - 1), warp = threadIdx.x / WARP;
-    const int index = blockIdx.x * WARPS_PER_BLOCK + warp;
-    if (index >= n_warp_tiles) return;
-    const WarpTile tile = warp_tile(lists, index);
-    const int x = tile.x + lane_x(lane), y = tile.y + lane_y(lane);
+// Read what a lane's pixels start from; returns the end of the list for them.
+template <int CH>
+__device__ __forceinline__ int load_column(const TileLists& lists, const BlendBackward& blend, int x, int y,
+                                           BackwardColumn<float, CH, COLUMN_ROWS>& column) {
     const int rows = x < lists.grid.width ? min(COLUMN_ROWS, lists.grid.height - y) : 0;
-    const float px = float(x) + 0.5f, py = float(y) + 0.5f;
-    const int begin = lists.tile_begin[tile.list], end = lists.tile_end[tile.list];
-
-    BackwardColumn<float, CH, COLUMN_ROWS> column;
     int last = 0;
 #pragma unroll
     for (int k = 0; k < COLUMN_ROWS; ++k) {
@@ -104,52 +66,105 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK, CH < 4 && !ABS ? 7 : 0)
         column.suffix_dot_grad[k] = background_dot_grad<CH>(blend, column.v_color[k], v_T);
         last = max(last, column.last[k]);
     }
-    last = begin + warp_max(last);
-    if (!ATOMIC) clear_unused(lists, blend, tile, last, end, lane);
+    return last;
+}
 
-    // of a pair of records the first is summed by the lower half of the lanes, the other by the upper half
-    const int place_in_warp = opaque_lane(), half = place_in_warp / HALF_WARP;
-    const int own_sum = sum_index<N, HALF_WARP / 2>(place_in_warp);
-    for (int top = last; top > begin; top -= WARP) {  // per 32 records
-        const int count = min(WARP, top - begin);
-        __syncwarp();
-        // a batch that is not full ends in a splat of zeros, which reaches nothing
-        Record record = {};
-        if (lane < count) {
-            const int entry = top - 1 - lane;
-            const unsigned splat = lists.listed[entry];
-            record = load_record(blend.records, splat);
-            staged_rows[warp][lane] = ATOMIC ? splat : lists.slots[1][entry] * tile.parts + tile.part;
-        }
-        staged[warp][lane][0] = record.a;
-        staged[warp][lane][1] = record.b;
-        staged[warp][lane][2] = record.c;
-        __syncwarp();
-        // lanes without a sum of their own, or without a second splat, store nothing
-        const int stored = own_sum < 0 ? 0 : count - half;
-        for (int j = 0; j < count; j += 2) {  // per record
-            ColumnSums<float, CH> sums[2];
-            float dx[2];
-            bool any[2];
+// two warps a block: what a warp keeps in shared memory leaves room for twenty on a multiprocessor of sm_90
+constexpr int SUM_WARPS = 2;
+
+// the end of the list for a quarter's pixels: behind the last splat that one of them blends
+struct QuarterEnds {
+    int last[QUARTERS];
+
+    // all lanes must come, each with its pixels' own
+    __device__ __forceinline__ explicit QuarterEnds(int own) {
 #pragma unroll
-            for (int g = 0; g < 2; ++g) {
-                const Record record = {staged[warp][j + g][0], staged[warp][j + g][1], staged[warp][j + g][2]};
-                float color[CH];
-                record.color<CH>(color);
-                dx[g] = add(record.a.x, -px);
-                any[g] = blend_backward<ABS, PASS>(column, record.splat(), color, dx[g], py, top - 1 - j - g - begin,
-                                                   constants, sums[g]);
-            }
-            // nearly every pair of splats reaches some pixel: asking costs more than it saves, but for atomics
-            if (ATOMIC && !__any_sync(FULL_WARP, any[0] || any[1])) continue;
-            const float total = sum_of_pair<CH, ABS>(sums, dx, place_in_warp);
-            if (j >= stored) continue;
-            float* const place = (ATOMIC ? blend.sums : blend.rows) + size_t(RECORD) * staged_rows[warp][j + half] + own_sum;
-            if (ATOMIC)
-                atomicAdd(place, total);
-            else
-                *place = total;
+        for (int mask = QUARTER_LANES / 2; mask > 0; mask /= 2) own = max(own, __shfl_xor_sync(FULL_WARP, own, mask));
+#pragma unroll
+        for (int q = 0; q < QUARTERS; ++q) last[q] = __shfl_sync(FULL_WARP, own, q * QUARTER_LANES);
+    }
+    __device__ __forceinline__ int of_tile() const { return max(max(last[0], last[1]), max(last[2], last[3])); }
+    __device__ __forceinline__ unsigned quarters_behind(int position) const {
+        unsigned found = 0;
+#pragma unroll
+        for (int q = 0; q < QUARTERS; ++q) found |= position < last[q] ? 1u << q : 0u;
+        return found;
+    }
+};
+
+// a splat's sums over the tile: into the slot's row, or added to the splat's
+template <bool ATOMIC, int CH, bool ABS>
+__device__ __forceinline__ void put_row(const WarpSums<CH, ABS>& sums, int place, float* row) {
+    constexpr int N = WarpSums<CH, ABS>::N;
+#pragma unroll
+    for (int k = 0; k < WarpSums<CH, ABS>::ROW; ++k) {
+        const float4 total = sums.total(place, k);
+        if (!ATOMIC) {
+            reinterpret_cast<float4*>(row)[k] = total;
+            continue;
         }
+        const float values[4] = {total.x, total.y, total.z, total.w};
+#pragma unroll
+        for (int j = 0; j < 4; ++j)
+            // most splats that reach a tile but none of its pixels have none
+            if (4 * k + j < N && values[j] != 0.0f) atomicAdd(row + 4 * k + j, values[j]);
+    }
+}
+
+template <int CH, bool ABS, bool PASS, bool ATOMIC>
+__global__ void __launch_bounds__(WARP* SUM_WARPS, CH < 4 && !ABS ? 10 : 0)
+    columns_kernel(TileLists lists, BlendBackward blend, BlendConstants<float> constants, int n_warp_tiles) {
+    using Sums = WarpSums<CH, ABS>;
+    __shared__ Sums sums_of_warps[SUM_WARPS];
+    const int lane = threadIdx.x & (WARP - 1), warp = threadIdx.x / WARP;
+    const int index = blockIdx.x * SUM_WARPS + warp;
+    if (index >= n_warp_tiles) return;
+    Sums& sums = sums_of_warps[warp];
+    const WarpTile tile = warp_tile(lists, index);
+    const int x = tile.x + lane_x(lane), y = tile.y + lane_y(lane);
+    const float px = float(x) + 0.5f, py = float(y) + 0.5f;
+    const int begin = lists.tile_begin[tile.list], end = lists.tile_end[tile.list];
+    BackwardColumn<float, CH, COLUMN_ROWS> column;
+    const QuarterEnds ends(load_column(lists, blend, x, y, column));
+    const int last = begin + ends.of_tile();
+    if (!ATOMIC) clear_unused(lists, blend, tile, last, end, lane);
+    if (lane == 0) sums.batch.put(WARP, Record{});
+
+    const unsigned* queue = sums.queues.words + Queues::WORDS * quarter_of(lane);
+    for (int top = last; top > begin; top -= WARP) {  // per 32 records
+        const int entry = top - 1 - lane;
+        unsigned quarters = 0;
+        float* row = nullptr;
+        __syncwarp();
+        if (entry >= begin) {
+            const unsigned splat = lists.listed[entry];
+            const Record record = load_record(blend.records, splat);
+            sums.batch.put(lane, record);
+            row = ATOMIC ? blend.sums + size_t(RECORD) * splat : row_of(lists, blend, tile, entry);
+            quarters = ends.quarters_behind(entry - begin) &
+                       quarters_reached(record.splat(), float(tile.x) + 0.5f, float(tile.y) + 0.5f);
+        }
+        sums.clear_rows(lane);
+        const int visits = make_queues(quarters, lane, sums.queues);
+        for (int first = 0; first < visits; first += Sums::VISITS) {  // per 8 visits
+            for (int j = 0; j < Sums::VISITS && first + j < visits; j += Queues::A_WORD) {  // per visit
+                const unsigned places = queue[(first + j) / Queues::A_WORD];
+#pragma unroll
+                for (int g = 0; g < Queues::A_WORD; ++g) {
+                    const int at = Queues::place(places, g);
+                    const Record record = sums.batch.at(at);
+                    float color[CH];
+                    record.color<CH>(color);
+                    ColumnSums<float, CH> of_column;
+                    blend_backward<ABS, PASS>(column, record.splat(), color, add(record.a.x, -px), py,
+                                              top - 1 - at - begin, constants, of_column);
+                    sums.put(of_column, j + g, lane);
+                }
+            }
+            __syncwarp();
+            sums.add_up(first, lane, px - float(lane % QUARTER_LANES));
+        }
+        if (entry >= begin) put_row<ATOMIC>(sums, lane, row);
     }
 }
 
@@ -276,7 +291,7 @@ void launch(const TileLists& lists, const BlendBackward& blend, const BlendConst
     if (blend.backward == Backward::pixel_parallel) {
         const int tiles = n_warp_tiles(lists.grid);
         columns_kernel<CH, ABS, PASS, ATOMIC>
-            <<<blocks_for(tiles, WARPS_PER_BLOCK), threads, 0, stream>>>(lists, blend, constants, tiles);
+            <<<blocks_for(tiles, SUM_WARPS), WARP * SUM_WARPS, 0, stream>>>(lists, blend, constants, tiles);
         POP_LAUNCHED("columns_kernel");
     } else {
         const int buckets = lists.capacity / WARP + lists.n_tiles;

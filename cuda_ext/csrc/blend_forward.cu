@@ -1,19 +1,19 @@
-// Blending, front to back: one warp a tile of 16 x 8 pixels, a lane owns a column of four. No barrier crosses a warp.
+// Blending, front to back: one warp a tile of 16 x 8 pixels, a lane owns a column of four, and eight lanes a quarter of
+// the tile, which leaves out what does not reach it. No barrier crosses a warp.
 //
-// Bounded by the issue of instructions: a record is read from shared memory by all lanes at once, and what is left is
+// Bounded by the issue of instructions: a record is read from shared memory by eight lanes at once, and what is left is
 // arithmetic on registers, half of it multiplications and additions. Next to it stands the special function unit, which
 // takes eight cycles for the exponentials of a warp. Counts: benchmarks/NOTES.md, `make sass`.
 
 #include "cuda_check.h"
-#include "kernel_tools.cuh"
+#include "quarters.cuh"
 
 namespace pop {
 
 namespace {
 
-// records that are blended between two looks at whether any pixel of the warp still takes splats
-constexpr int GROUP = 4;
-static_assert(WARP % GROUP == 0, "groups fill a batch");
+// visits between two looks at whether any pixel of the warp still takes splats
+constexpr int GROUP = Queues::A_WORD;
 
 // Where a lane's pixels keep what the gaussian_parallel backward reads of a bucket: T before it, then the colour that later buckets
 // blended. Until the list is done, the colour is what this bucket blended.
@@ -45,14 +45,14 @@ __device__ __forceinline__ void sum_from_the_back(const TileLists& lists, const 
 
 // blocks that must fit a multiprocessor at a time: as many as leave every value its register
 constexpr int least_blocks(int channels, Collect collect, bool checkpoint) {
-    const int wide = channels == MAX_CHANNELS, most = collect == Collect::everything;
-    return collect == Collect::nothing ? 8 - checkpoint - wide : 7 - checkpoint - most - 2 * wide;
+    return (collect == Collect::nothing ? 7 : 6) - checkpoint - (channels == MAX_CHANNELS);
 }
 
 template <int CH, Collect COLLECT, bool CHECKPOINT>
 __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK, least_blocks(CH, COLLECT, CHECKPOINT))
     blend_forward_kernel(TileLists lists, BlendForward blend, BlendConstants<float> constants, int n_warp_tiles) {
-    __shared__ float4 staged[WARPS_PER_BLOCK][WARP][RECORD / 4];
+    __shared__ Batch batches[WARPS_PER_BLOCK];
+    __shared__ Queues queues[WARPS_PER_BLOCK];
     const int lane = threadIdx.x & (WARP - 1), warp = threadIdx.x / WARP;
     const int index = blockIdx.x * WARPS_PER_BLOCK + warp;
     if (index >= n_warp_tiles) return;
@@ -65,10 +65,13 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK, least_blocks(CH, COLLEC
     ForwardColumn<float, CH, COLUMN_ROWS> column;
     RenderStats<float, COLUMN_ROWS> stats;
     start_forward<COLLECT>(column, stats, rows);
-    const float4(*own)[RECORD / 4] = pinned_shared(staged[warp]);
+    const Batch* batch = pinned_shared(batches + warp);
+    const unsigned* queue = queues[warp].words + Queues::WORDS * quarter_of(lane);
+    if (lane == 0) batches[warp].put(WARP, Record{});
     int n_buckets = 0;
     for (int first = begin; first < end; first += WARP) {  // per 32 records
-        if (!__any_sync(FULL_WARP, is_open(column, constants.stop))) break;
+        const unsigned open = quarters_with(is_open(column, constants.stop));
+        if (open == 0) break;
         if (CHECKPOINT) {
             float* here = checkpoint_of<CH>(lists, blend, tile.list, n_buckets, lane);
 #pragma unroll
@@ -85,26 +88,34 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK, least_blocks(CH, COLLEC
             ++n_buckets;
         }
         __syncwarp();
-        // a batch that is not full ends in splats of zeros, which reach nothing
-        Record record = {};
-        if (first + lane < end) record = load_record(blend.records, lists.listed[first + lane]);
-        staged[warp][lane][0] = record.a;
-        staged[warp][lane][1] = record.b;
-        staged[warp][lane][2] = record.c;
-        __syncwarp();
-        const int count = min(WARP, end - first);
-        for (int j = 0; j < count; j += GROUP) {  // per record
+        unsigned quarters = 0;
+        if (first + lane < end) {
+            const Record record = load_record(blend.records, lists.listed[first + lane]);
+            batches[warp].put(lane, record);
+            // where splats are counted, those that are only passed count too
+            quarters = COLLECT == Collect::everything
+                           ? open
+                           : open & quarters_reached(record.splat(), float(tile.x) + 0.5f, float(tile.y) + 0.5f);
+        }
+        const int visits = make_queues(quarters, lane, queues[warp]);
+        for (int j = 0; j < visits; j += GROUP) {  // per visit
             if (!__any_sync(FULL_WARP, is_open(column, constants.stop))) break;
+            const unsigned places = queue[j / GROUP];
 #pragma unroll
-            for (int g = j; g < j + GROUP; ++g) {
-                const Record record = {own[g][0], own[g][1], own[g][2]};
+            for (int g = 0; g < GROUP; ++g) {
+                const int at = Queues::place(places, g);
+                const Record record = batch->at(at);
                 float color[CH];
                 record.color<CH>(color);
                 // a pixel's winner is known by its place in the list until all are blended
-                const int place = first - begin + g;
+                const int place = first - begin + at;
                 blend_forward<COLLECT>(column, stats, record.splat(), color, place, px, py, place, constants);
             }
         }
+        // a pixel that is open has passed the whole batch, also what never reached it
+#pragma unroll
+        for (int k = 0; k < COLUMN_ROWS; ++k)
+            if (column.T[k] > constants.stop) column.last[k] = first - begin + WARP;
     }
     if (CHECKPOINT) sum_from_the_back<CH>(lists, blend, tile.list, n_buckets, lane, column);
 

@@ -67,8 +67,8 @@ POP_HD bool is_open(const ForwardColumn<Real, CH, ROWS>& column, Real stop) {
 }
 
 // Without branches, so that the pixels' exponentials overlap: nearly every splat of a tile's list reaches some pixel of
-// a row of its warp. A splat that is not within reach is blended with weight 0: its colour must be finite. x, y: the first pixel's centre; position: the splat's place in the list; id: what the winner of a
-// pixel is known by.
+// a row of its warp. A splat that is not within reach is blended with weight 0: its colour must be finite.
+// x, y: the first pixel's centre; position: the splat's place in the list; id: what the winner of a pixel is known by.
 template <Collect COLLECT, class Real, int CH, int ROWS>
 POP_HD void blend_forward(ForwardColumn<Real, CH, ROWS>& column, RenderStats<Real, ROWS>& stats,
                           const PackedSplat<Real>& splat, const Real* color, int id, Real x, Real y, int position,
@@ -92,7 +92,7 @@ POP_HD void blend_forward(ForwardColumn<Real, CH, ROWS>& column, RenderStats<Rea
             for (int c = 0; c < CH; ++c) column.color[k][c] = fused(weight, color[c], column.color[k][c]);
         }
         if (COLLECT == Collect::everything) stats.n_blended[k] += goes_on & (alpha > Real(0));
-        if (COLLECT != Collect::nothing) compete(stats.best[k], id, goes_on ? weight : Real(0));
+        if (COLLECT != Collect::nothing) compete(stats.best[k], id, weight, goes_on);
     }
 }
 

@@ -54,9 +54,9 @@ __device__ __forceinline__ WarpTile warp_tile(const TileLists& lists, int index)
             list / grid.tiles_x * grid.tile_h + part / across * WARP_TILE_H, list, part, parts};
 }
 
-// the column of a lane: x across, two halves of four rows
-__device__ __forceinline__ int lane_x(int lane) { return lane & (WARP_TILE_W - 1); }
-__device__ __forceinline__ int lane_y(int lane) { return (lane / WARP_TILE_W) * COLUMN_ROWS; }
+// the column of a lane: eight neighbouring lanes have a quarter of the tile, 8 x 4 pixels
+__device__ __forceinline__ int lane_x(int lane) { return (lane & 7) + (lane & 8); }
+__device__ __forceinline__ int lane_y(int lane) { return (lane / 16) * COLUMN_ROWS; }
 
 // The lane, as a number that the compiler knows nothing of: it then asks for a bit of it with one instruction, where it
 // takes three for a bit of threadIdx. All lanes of the warp must call it.

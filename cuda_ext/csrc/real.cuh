@@ -136,6 +136,19 @@ POP_HD unsigned bits_of(float x) {
 #endif
 }
 
+// a > b and also; on the device one comparison, where the compiler makes two of it
+POP_HD bool larger_and(float a, float b, bool also) {
+#ifdef __CUDA_ARCH__
+    int found;
+    asm("{ .reg .pred p, q; setp.ne.s32 q, %3, 0; setp.gt.and.f32 p, %1, %2, q; selp.s32 %0, 1, 0, p; }"
+        : "=r"(found) : "f"(a), "f"(b), "r"(int(also)));
+    return found != 0;
+#else
+    return (a > b) & also;
+#endif
+}
+POP_HD bool larger_and(double a, double b, bool also) { return (a > b) & also; }
+
 // 0 <= x < limit, for limit >= 0; not for a NaN. For floats one comparison.
 POP_HD bool within(float x, float limit) { return bits_of(x) < bits_of(limit); }
 POP_HD bool within(double x, double limit) { return x >= 0.0 && x < limit; }

@@ -38,7 +38,7 @@ KERNELS = {
     "blend_forward_kernel": ("tile", 128),
     "buckets_kernel": ("32 tiles", 256),
     "bucket_counts_kernel": ("32 tiles", 256),
-    "columns_kernel": ("tile", 128),
+    "columns_kernel": ("tile", 64),
     "contributions_kernel": ("tile", 128),
     "count_important_kernel": ("32 Gaussians", 256),
     "count_kernel": ("32 Gaussians", 256),
@@ -69,7 +69,7 @@ KERNELS = {
 # fixed: "// per record", "// per coefficient, 45 times"
 _UNIT = re.compile(r"// per ([\w ]+?)(?:, (\d+) times)?$")
 # one for every pixel of a lane's column, or for the one pixel of a step: tells how often a loop was unrolled
-EXPONENTIALS = {"record": 4, "step": 1}
+EXPONENTIALS = {"record": 4, "visit": 4, "step": 1}
 # what unrolling multiplies, unlike counters and branches
 _WORK = ("float", "special", "shared", "global")
 

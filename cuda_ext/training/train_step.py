@@ -17,6 +17,7 @@ from torch import Tensor
 
 from cuda_ext.arrays import BAD_ROW, N_INSTANCES, NOT_BAD, OVERFLOW, STEP, VIEW
 from cuda_ext.render.capacity import Capacity, Size
+from cuda_ext.render.lists import TileBuffers
 from cuda_ext.train_settings import KernelStatistics, Phase, StepSettings
 from cuda_ext.training.graphs import Watch, captured
 from cuda_ext.training.resident import ResidentViews
@@ -146,9 +147,18 @@ class FusedTrainer:
         return int(self._shared.state[N_INSTANCES])
 
     @property
+    def splats(self) -> Mapping[str, Tensor]:
+        """What the last step drew, by the kernels' names."""
+        return self._population.drawn.splats
+
+    @property
     def radii(self) -> Tensor:
         """Extents of the last step's splats, px, 0 where culled. [N, 2] int32"""
-        return self._population.drawn.splats["radii"]
+        return self.splats["radii"]
+
+    def lists(self) -> dict[Size, TileBuffers]:
+        """Return the tile lists of the last step at every image size that was drawn since `rebind`."""
+        return {size: frame.lists for size, frame in self._frames.items()}
 
     def render_stats(self) -> dict[Size, dict[str, Tensor]]:
         """Return, by image size, what the last step of a phase that asks for dominant Gaussians found at every pixel.

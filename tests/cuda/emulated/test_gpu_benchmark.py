@@ -203,6 +203,11 @@ def test_the_predicted_case_is_what_was_predicted(gpu, monkeypatch):
     assert loads.instances * BY**2 == pytest.approx(0.9 * INSTANCES, rel=0.1)
     assert loads.evaluated / loads.pixels == pytest.approx(EVALUATED, rel=0.1)
     assert loads.contributing / loads.pixels == pytest.approx(CONTRIBUTING, rel=0.1)
+    # what the predictions take of the entries that are walked
+    entries = loads.evaluated / 128
+    assert loads.visits / entries == pytest.approx(0.774, rel=0.05)
+    assert loads.eights / entries == pytest.approx(0.104, rel=0.05)
+    assert loads.batches / entries == pytest.approx(0.0354, rel=0.05)
     # lists are as unequal as those of captures
     ((size, told),) = trainer.render_stats().items()
     assert size == (case.width, case.height)
