@@ -7,7 +7,7 @@ WORKERS ?= $(shell $(PYTHON) -c "import os; print((os.cpu_count() or 1) + 1)")
 TORCH := $(shell sed -n 's/^\(torch==.*\)/\1/p' constraints.txt)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo walkthrough repro site test test-all test-fast explore lint bench faults wheel cuda sass emulate gpu-check docs-check clean
+.PHONY: help setup demo walkthrough repro site test test-all test-fast explore lint kit bench faults wheel cuda sass emulate gpu-check docs-check clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
@@ -73,6 +73,14 @@ lint: setup  ## ruff (rules and format) and pyright
 faults: setup  ## damaged files, kills, crashes, full disks, sanitizers (MINUTES=10), then large captures
 	$(BIN)/python -m benchmarks.faults --minutes $(or $(MINUTES),10)
 	$(BIN)/python -m benchmarks.load
+
+# hours of one core: every mutant in each precision, every line of the oracle that laws run
+kit: setup  ## measure the kit (kills, teeth, what laws and vectors reach) and write docs/kit.md's tables
+	$(BIN)/python -m pop_ref.conformance.mutants --json benchmarks/results/kills.json
+	$(BIN)/python -m pop_ref.conformance.teeth benchmarks/results/teeth.json
+	$(BIN)/python -m pop_ref.conformance.law_coverage benchmarks/results/law_coverage.json
+	$(BIN)/python -m pop_ref.conformance.vector_kills benchmarks/results/vector_kills.json
+	$(BIN)/python docs/tables.py --write
 
 bench: setup  ## check the fast path against the oracle, then time it
 	$(BIN)/python benchmarks/run.py

@@ -25,7 +25,7 @@ from paper_repro.status import everything, status_table
 from pop_fast.train.presets import METHODS, options_for
 from pop_ref.conformance.capabilities import STAGES as LAW_STAGES
 from pop_ref.conformance.law_coverage import LIMITS, reason
-from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, PROGRAM
+from pop_ref.conformance.mutants import BLACK_BOXES, FAMILIES, MUTANTS, PROGRAM
 from pop_ref.conformance.mutants.trial import every_law
 from pop_ref.conformance.scorecard import outcomes
 from pop_ref.conformance.teeth import UNITS
@@ -39,6 +39,7 @@ MUTANT_LIST = ROOT / "docs" / "MUTANTS.md"
 CARDS = ROOT / "benchmarks" / "results" / "scorecards"
 TEETH = ROOT / "benchmarks" / "results" / "teeth.json"
 LAW_COVERAGE = ROOT / "benchmarks" / "results" / "law_coverage.json"
+KILLS = ROOT / "benchmarks" / "results" / "kills.json"
 VECTOR_KILLS = ROOT / "benchmarks" / "results" / "vector_kills.json"
 CPU_TIMES = ROOT / "benchmarks" / "results" / "cpu.json"
 # the judged, in the order of their columns, and the card that each stands on
@@ -54,7 +55,6 @@ JUDGED = {
 }
 
 OURS = {title: judged for title, judged in JUDGED.items() if not title.startswith("gsplat")}
-FAMILIES = {"stages of the oracle": MUTANTS, "the program that trains": PROGRAM, "whole rasterizers": BLACK_BOXES}
 
 
 def rosetta() -> str:
@@ -227,11 +227,13 @@ def surfaces() -> str:
 
 def power() -> str:
     """Make the table of what the kit kills, and of sound backends that it refuses."""
-    vectors = json.loads(VECTOR_KILLS.read_text(encoding="utf-8"))
+    laws, vectors = (json.loads(path.read_text(encoding="utf-8")) for path in (KILLS, VECTOR_KILLS))
     rows = []
-    for family, count in ((name, len(mutants)) for name, mutants in FAMILIES.items()):
+    for family in FAMILIES:
+        count = len(laws[family])
+        killed = sum(None not in of.values() for of in laws[family].values())
         noticed = sum(first is not None for first in vectors[family].values())
-        rows.append([family, str(count), f"{count} of {count}", f"{noticed} of {len(vectors[family])}"])
+        rows.append([family, str(count), f"{killed} of {count}", f"{noticed} of {len(vectors[family])}"])
     failed = {title: sum(c["failed"] for c in card(file)["summary"][b].values()) for title, (file, b) in OURS.items()}
     refused = sum(1 for count in failed.values() if count)
     of_vectors = [first for first in vectors["sound"].values() if first is not None]
@@ -366,7 +368,7 @@ BOX_HEAD = """
 ## Behind gsplat's signature
 
 {n} rasterizers that draw one small view rightly and break one argument around it, or two together, judged as any
-`--rasterizer` is: by what they return alone. {n} of {n} are killed.
+`--rasterizer` is: by what they return alone.
 
 """
 

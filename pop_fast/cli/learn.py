@@ -175,9 +175,11 @@ def _subject(args: Train):
     capture = load_capture(args.scene)
     views = []
     for view in capture.views[:: max(1, len(capture.views) // 72)]:
-        by = SIZE / view.width
+        # a photograph that is small already is not enlarged
+        width = min(SIZE, view.width)
+        by = width / view.width
         height = max(1, round(view.height * by))
         K = view.K.copy()
         K[:2] *= [[by], [height / view.height]]
-        views.append(((view.viewmat, K, SIZE, height), shrunk(view.image[..., :3] / 255.0, SIZE, height)))
+        views.append(((view.viewmat, K, width, height), shrunk(view.image[..., :3] / 255.0, width, height)))
     return a_capture(views, capture.points, capture.points_rgb / 255.0, capture.scene_scale())

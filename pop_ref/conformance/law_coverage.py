@@ -55,8 +55,8 @@ LIMITS: Final[dict[str, str]] = {
     "camera z, world units": "negative is behind the camera; the far plane's default is 1e10",
     "norm of a quaternion": "directions do not depend on it, and 0 has none",
     "focal length, px": "scales with the picture's size",
-    "near_plane, world units": "from the smallest default to one that culls",
-    "far_plane, world units": "from one that culls to the default",
+    "near_plane, world units": "the smallest default, one that culls, and both in scenes that are scaled",
+    "far_plane, world units": "one that culls, the default, and both in scenes that are scaled",
     "eps2d, px^2": "about the default, 0.3",
     "radius_clip, px": "0 leaves nobody out",
 }

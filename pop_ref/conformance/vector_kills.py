@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from pop_ref.conformance.backends import SHIPPED, shipped
-from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, PROGRAM
+from pop_ref.conformance.mutants import FAMILIES
 from pop_ref.conformance.mutants.trial import alive
 from pop_ref.conformance.vector_answer import answered
 from pop_ref.conformance.vector_check import read_index, verdicts_of
@@ -67,13 +67,12 @@ def kills(report: Callable[[str, str | None], None] = lambda name, found: None, 
         report: is given every name and result as it comes.
         known: a mutant that is killed in these is not tried.
     """
-    families = {"stages of the oracle": MUTANTS, "the program that trains": PROGRAM, "whole rasterizers": BLACK_BOXES}
-    found: Kills = {family: {} for family in (*families, "sound")}
+    found: Kills = {family: {} for family in (*FAMILIES, "sound")}
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "vectors"
         export(folder)
         trials: list[tuple[str, str, Callable[[], AbstractContextManager[Any]]]] = []
-        for family, mutants in families.items():
+        for family, mutants in FAMILIES.items():
             trials += [(family, mutant.name, partial(alive, mutant)) for mutant in mutants]
         for family, name, living in trials:
             found[family][name] = (known or found).get(family, {}).get(name)

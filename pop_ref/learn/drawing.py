@@ -1,7 +1,8 @@
 """Draw a counterexample with NumPy alone: what a student's function gives in orange, what it should give in blue.
 
 Covariances are drawn as ellipses, rotations as the axes that they turn, the blue ones thinner and on top; pictures
-as pictures, and all other numbers as bars side by side, each pair to its own scale.
+as pictures, and all other numbers as bars side by side, each pair to its own scale. Over each panel stands what it
+shows, and under a pair of bars which number of the result it is.
 """
 
 from __future__ import annotations
@@ -16,15 +17,20 @@ import numpy as np
 
 from pop_ref.conformance.scenes import Scene
 from pop_ref.learn.judge import Verdict
+from pop_ref.learn.lettering import LINE, SQUARE, write_text
 from pop_ref.learn.student import Call, numbers
 from pop_ref.render import render
 
 SIDE: Final = 240
+# over each panel, for two lines
+HEAD: Final = 2 * LINE
 _FINER: Final = 3
 _PAPER, _RULE = np.array([0.99, 0.985, 0.975]), np.array([0.8, 0.79, 0.77])
 YOURS: Final = np.array([0.82, 0.38, 0.16])
 ORACLES: Final = np.array([0.15, 0.39, 0.79])
-_MOST_BARS: Final = 16
+_INK: Final = np.array([0.25, 0.25, 0.25])
+# as many as have room for the number's place, of three digits
+_MOST_BARS: Final = 6
 
 _AS_ELLIPSES: Final = ("covars_from_quats_scales", "covars_cam_from_covars", "project_covars", "low_pass")
 _AS_AXES: Final = ("rotmats_from_quats",)
@@ -37,15 +43,16 @@ def drawn_counterexample(verdict: Verdict) -> np.ndarray | None:
         verdict: of a stage that has not passed.
 
     Returns:
-        A picture [H, W, 3] in [0, 1]: the scene, if one was drawn, and the two results; None where there is nothing
-        to draw.
+        A picture [HEAD + SIDE, W, 3] in [0, 1]: the scene, if one was drawn, and the two results; None where there is
+        nothing to draw.
     """
-    panels = [_scene(value) for value in (verdict.drawn or {}).values() if isinstance(value, Scene)][:1]
+    scenes = [value for value in (verdict.drawn or {}).values() if isinstance(value, Scene)][:1]
+    panels = [_titled(_scene(value), ("the scene", _INK)) for value in scenes]
     if verdict.call is not None:
         panels += _results(verdict.call)
     if not panels:
         return None
-    gap = np.broadcast_to(_PAPER, (SIDE, 12, 3))
+    gap = np.broadcast_to(_PAPER, (HEAD + SIDE, 12, 3))
     return np.concatenate([part for panel in panels for part in (panel, gap)][:-1], axis=1)
 
 
@@ -55,12 +62,22 @@ def _results(call: Call) -> list[np.ndarray]:
         ours, theirs = np.asarray(found, dtype=float), np.asarray(expected, dtype=float)
         if ours.shape == theirs.shape and np.all(np.isfinite(ours)):
             both = ((ours, YOURS), (theirs, ORACLES))
-            return [_ellipses(both) if call.function in _AS_ELLIPSES else _axes(both)]
+            drawn, what = (_ellipses, "1 sigma") if call.function in _AS_ELLIPSES else (_axes, "axes x, y, z")
+            return [_titled(drawn(both), (f"yours: {what}", YOURS), (f"oracle: {what}", ORACLES))]
     pictures = [_image(value) for value in (found, expected)]
     if all(picture is not None for picture in pictures):
-        return [picture for picture in pictures if picture is not None]
+        titles = (("yours", YOURS), ("oracle", ORACLES))
+        return [_titled(picture, title) for picture, title in zip(pictures, titles, strict=True) if picture is not None]
     a, b = numbers(call.found), numbers(call.expected)
     return [_bars(a, b)] if len(a) and len(b) else []
+
+
+def _titled(panel: np.ndarray, *lines: tuple[str, np.ndarray]) -> np.ndarray:
+    """Put lines of text, each in its colour, over a panel."""
+    head = np.tile(_PAPER, (HEAD, SIDE, 1))
+    for k, (text, color) in enumerate(lines):
+        write_text(head, text, SQUARE, SQUARE + k * LINE, color)
+    return np.concatenate([head, panel], axis=0)
 
 
 def _canvas() -> np.ndarray:
@@ -124,7 +141,10 @@ def _axes(both: tuple[tuple[np.ndarray, np.ndarray], ...]) -> np.ndarray:
 
 
 def _bars(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
-    """Draw pairs of numbers as pairs of bars; those that differ first, each pair to the larger of its two."""
+    """Draw pairs of numbers as pairs of bars; those that differ first, each pair to the larger of its two.
+
+    The title gives the values of the first pair, and under each pair stands the place of its number in the result.
+    """
     n = min(len(found), len(expected))
     a, b = (np.nan_to_num(each[:n], posinf=1e300, neginf=-1e300) for each in (found, expected))
     order = np.argsort(-np.abs(a - b), kind="stable")[:_MOST_BARS]
@@ -136,10 +156,14 @@ def _bars(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
         for value, offset, color in ((a[order[k]], 0.1, YOURS), (b[order[k]], 0.5, ORACLES)):
             left, right = int((k + offset) * wide), int((k + offset + 0.38) * wide)
             # a number that is 0 beside the other is a line that can be seen
-            height = np.copysign(max(abs(0.9 * middle * float(value / size[k])), 2.0 * _FINER), value)
+            height = np.copysign(max(abs(0.85 * middle * float(value / size[k])), 2.0 * _FINER), value)
             top = middle - round(float(height))
             canvas[min(top, middle) : max(top, middle) + 1, left:right] = color
-    return _smooth(canvas)
+    panel, first = _smooth(canvas), order[0]
+    for k, place in enumerate(order):
+        write_text(panel, f"[{place}]", int((k + 0.1) * SIDE / len(order)), SIDE - LINE, _INK)
+    mine, oracles = ((f"{who} [{first}] {of[first]:.5g}") for who, of in (("yours", found), ("oracle", expected)))
+    return _titled(panel, (mine, YOURS), (oracles, ORACLES))
 
 
 def _image(value: Any) -> np.ndarray | None:

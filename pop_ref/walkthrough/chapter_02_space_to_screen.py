@@ -215,8 +215,8 @@ side.plot([1, 1], [-width / 2 / f, width / 2 / f], color=INK, lw=2)
 side.annotate("screen", (1, width / 2 / f), (-8, 4), textcoords="offset points")
 side.plot(0, 0, "o", color=INK)
 side.annotate("camera", (0, 0), (-8, -15), textcoords="offset points")
-side.set(xlim=(-0.3, 6.2), ylim=(-2.4, 2.6), aspect="equal", xlabel="depth z", ylabel="x")
-side.set(title="From the side")
+side.set(xlim=(-0.3, 6.2), ylim=(-2.4, 2.6), aspect="equal", xlabel="depth z, world units")
+side.set(title="From the side", ylabel="x, world units")
 screen.set(
     xlim=(-14, width), ylim=(height, 0), aspect="equal", xlabel="x, px", ylabel="y, px"
 )
@@ -224,7 +224,7 @@ screen.set(title="On the screen")
 picture(
     fig,
     "Two Gaussians, their ellipses of two standard deviations. Dots on the screen are points of the Gaussians sent "
-    "through the true pinhole; black ellipses are what the linearisation makes of them: close for the small one "
+    "through the true pinhole; the outlines are what the linearisation makes of them: close for the small one "
     "in the distance; the large one near the camera is lopsided, and its ellipse is not.",
 )
 

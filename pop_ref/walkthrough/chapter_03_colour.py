@@ -77,7 +77,7 @@ assert np.array_equal(grey, [[0.5, 0.5, 0.5]])
 side = np.linspace(-1, 1, 64)
 right, down = np.meshgrid(side, side)
 on_globe = right**2 + down**2 <= 1
-# looking along +z with y down: the near half of the sphere has z < 0, and d runs from the camera inwards
+# looking along +z with y down, the near half of the sphere has z < 0; d runs inwards
 near = -np.sqrt(np.maximum(1 - right**2 - down**2, 0))
 inwards = -np.stack([right, down, near], axis=-1)
 values = sh_basis(inwards.reshape(-1, 3), 3).reshape(64, 64, 16)

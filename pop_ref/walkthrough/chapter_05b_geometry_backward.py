@@ -336,9 +336,8 @@ for k, ((name, part), shade) in enumerate(
     right.bar(
         places + 0.27 * (k - 1), np.linalg.norm(part, axis=1), 0.25, color=shade, label=name
     )
-right.set(
-    xlabel="Gaussian", xticks=places, title="a position's gradient, by the way it came"
-)
+right.set(xlabel="Gaussian", xticks=places, ylabel="norm, loss per world unit")
+right.set(title="a position's gradient, by the way it came")
 right.legend()
 picture(
     fig,

@@ -318,7 +318,8 @@ for row, (name, scenes) in enumerate(runs.items()):
     panels[4 * row].set(ylabel=f"{name} the prior")
 picture(
     fig,
-    "The world from above; the cameras look up from below. Discs are Gaussians, as solid as they are opaque.",
+    "The world from above, x to the right and z upwards, in world units; the cameras look up from below. Discs are "
+    "Gaussians, as solid as they are opaque.",
 )
 
 # %%

@@ -150,7 +150,8 @@ show_image(panels[0], target, "target")
 show_image(panels[1], view.image, "before, and the gradients")
 show_image(panels[2], edited.image, "after: 5 Gaussians")
 for panel in panels:
-    panel.set(xlim=(0, 24), ylim=(24, 0), xlabel="x [px]")
+    panel.set(xlim=(0, 24), ylim=(24, 0), xlabel="x, px")
+panels[0].set(ylabel="y, px")
 for row, color in enumerate((ACCENT, SECOND, THIRD, INK)):
     outline(panels[1], view.splats, row, color, dashed=row == 3)
     if row < 2:
@@ -207,7 +208,7 @@ spread = np.repeat([1.6, 1.6, 2.5], [6, 6, 2])
 depth = np.repeat([2.0, 3.0, 1.0], [6, 6, 2])
 KINDS = {"wall": np.s_[0:6], "hidden": np.s_[6:12], "haze": np.s_[12:14]}
 
-# positions stand still, so the falloff of every splat at every pixel is computed once. [14, pixels]
+# positions stand still, so all falloffs are computed once. [14, pixels]
 py, px = (axis.ravel() + 0.5 for axis in np.indices((HEIGHT, WIDTH)))
 dx, dy = place[:, :1] - px, place[:, 1:] - py
 falloffs = np.exp(-(dx * dx + dy * dy) / (2.0 * spread[:, None] ** 2))
@@ -346,7 +347,7 @@ assert (
     ends["reset"]["wall"] - ends["reset"]["hidden"]
     < ends["neither"]["wall"] - ends["neither"]["hidden"]
 )
-# the prior does: the wall is opaque and the hidden are all but gone, but the haze has become thicker
+# the prior does: an opaque wall, the hidden all but gone; but the haze is thicker
 assert ends["prior"]["wall"] > 0.9 > 0.02 > ends["prior"]["hidden"]
 assert ends["prior"]["haze"] > ends["neither"]["haze"]
 
@@ -363,7 +364,7 @@ for (name, each), shade in zip(runs.items(), (INK, SECOND, ACCENT), strict=True)
     panels[3].plot(
         np.mean([run[0] for run in each], axis=0), color=shade, lw=1.2, label=name
     )
-panels[3].set(title="PSNR [dB], mean", xlabel="step")
+panels[3].set(title="mean PSNR, dB", xlabel="step")
 panels[3].legend(loc="lower right")
 picture(
     fig,

@@ -116,7 +116,8 @@ for n_views in (2, 4, 12):
 assert errors[12] < errors[4] < errors[2]
 
 # %% [markdown]
-# What COLMAP leaves is a folder: `images/` with the photographs, and `sparse/0/` with three files.
+# What COLMAP leaves is a folder: `images/` with the photographs, and `sparse/0/` with three files that
+# matter here. (Since version 3.12 it also writes `frames.bin` and `rigs.bin`, for cameras that are mounted together.)
 #
 # | file | a record holds |
 # |---|---|
@@ -129,7 +130,8 @@ assert errors[12] < errors[4] < errors[2]
 # it, and `pop train` on a bare folder of photographs runs structure from motion itself.
 
 # %%
-print(*files)
+print(*files, sep="\n")
+assert {"cameras.bin", "images.bin", "points3D.bin"} <= {Path(each).name for each in files}
 at, depths = pixels_of(view, capture.points)
 inside = (depths > 0) & np.all((at > 0) & (at < [view.width, view.height]), axis=1)
 print(f"{len(capture.points)} points, {inside.sum()} of them in photograph 0,", end=" ")

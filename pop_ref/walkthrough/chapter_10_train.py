@@ -152,7 +152,7 @@ assert state.step == 30
 # rule (POP paper, eq. 6) is on from 30 to 60, the prior (eq. 8) until 150. With so few steps the prior must push
 # harder: its weight is 0.02 and not 0.001. The objective is the paper's,
 #
-# $$L = (1 - \lambda_{\mathrm{SSIM}}) L_2 + \lambda_{\mathrm{SSIM}} L_{\mathrm{D-SSIM}} +
+# $$L = (1 - \lambda_{\mathrm{SSIM}}) L_2 + \lambda_{\mathrm{SSIM}} L_{\mathrm{DSSIM}} +
 # \lambda_{\mathrm{POP}} L_{\mathrm{POP}} \qquad \text{(POP paper, eq. 9)}.$$
 #
 # We train twice, with the prior and with its weight at 0, and nothing else changed.
@@ -236,7 +236,7 @@ for name, color in (("prior", ACCENT), ("none", MUTED)):
     tenths = histogram(name, 199).reshape(10, 10).sum(axis=1)
     places = np.arange(10) / 10 + (0.03 if name == "prior" else 0.07)
     panels[3].bar(places, tenths, 0.04, color=color, label=label)
-titles = "Gaussians", "PSNR [dB]", "blended per pixel"
+titles = "Gaussians", "PSNR, dB", "blended per pixel"
 for panel, title in zip(panels, titles, strict=False):
     panel.axvspan(30, 60, color=SECOND, alpha=0.15, lw=0)
     panel.axvline(150, color=THIRD, lw=1.0, ls="--")

@@ -396,8 +396,11 @@ assert seconds[0] < seconds[1]
 
 # %% answer
 # $u$ stands in $f_0 = \ln o - \frac12 (A u^2 + 2 B u v + C v^2)$ with derivative $-(A u + B v)$, in $f_1$ with $A$ and
-# in $f_2 = B u + C v$ with $B$. So $\partial L / \partial u = -(A u + B v)\, s_0 + A s_x + B s_y = -(A\, d_u + B\,
-# d_v)$ with $d_u = u s_0 - s_x$ and $d_v = v s_0 - s_y$.
+# in $f_2 = B u + C v$ with $B$. So
+#
+# $$\frac{\partial L}{\partial u} = -(A u + B v)\, s_0 + A s_x + B s_y = -(A\, d_u + B\, d_v)$$
+#
+# with $d_u = u s_0 - s_x$ and $d_v = v s_0 - s_y$.
 A, B, C = splats.conics.T
 by_sums = -(A * splat_u + B * splat_v) * s0 + A * sx + B * sy
 assert np.allclose(by_sums, v_means2d[:, 0])

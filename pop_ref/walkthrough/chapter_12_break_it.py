@@ -241,8 +241,8 @@ with living(BY_NAME["no_half_in_the_exponent"]) as backend:
 # %% answer
 # Only the last changes a picture: it cuts off what is visible between 3 and 3.33 standard deviations. Gradients are not
 # drawn, and a tie changes which Gaussian dominates, not the colour.
-# it ends shortly behind a tile's border, with three deviations shortly before it
 screen = Camera(np.eye(4), K, WIDTH, HEIGHT)
+# it ends shortly behind a tile's border, with three deviations shortly before it
 one = Scene(pack([Record(6.0, 12.0, 2.0, (3.0, 3.0, 3.0), opacity=1.0)], screen), screen)
 for name in ("weight_above_one", "tie_to_the_back", "extent_of_three_deviations"):
     with living(BY_NAME[name]) as backend:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import fcntl
 import json
 import os
 import shutil
@@ -11,7 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import cv2
 import numpy as np
@@ -42,8 +43,8 @@ def find_chromium() -> str:
 class Browser:
     """A tab. `requests` lists what it asked of any network."""
 
-    def __init__(self, to: int, back: int) -> None:
-        self._to, self._back, self._rest = os.fdopen(to, "wb"), back, b""
+    def __init__(self, to: BinaryIO, back: BinaryIO) -> None:
+        self._to, self._back, self._rest = to, back, b""
         self._number, self._session = 0, None
         self.requests: list[str] = []
         self.errors: list[str] = []
@@ -59,7 +60,6 @@ class Browser:
         if self._session is not None:
             message["sessionId"] = self._session
         self._to.write(json.dumps(message).encode() + b"\0")
-        self._to.flush()
         while True:
             answer = self._receive()
             if answer.get("method") == "Network.requestWillBeSent":
@@ -72,7 +72,7 @@ class Browser:
 
     def _receive(self) -> dict[str, Any]:
         while b"\0" not in self._rest:
-            part = os.read(self._back, 1 << 20)
+            part = self._back.read(1 << 20)
             assert part, "the browser has ended"
             self._rest += part
         message, _, self._rest = self._rest.partition(b"\0")
@@ -116,9 +116,9 @@ def browser(folder: Path) -> Iterator[Browser]:
     read_here, write_there = os.pipe()
 
     def pipes() -> None:
-        # the browser reads from 3 and writes to 4
-        taken = [os.dup(read_there), os.dup(write_there)]
-        for number, end in zip((3, 4), taken, strict=True):
+        # the browser reads from 3 and writes to 4: both ends are first lifted over those, so that neither is lost
+        lifted = [fcntl.fcntl(each, fcntl.F_DUPFD, 10) for each in (read_there, write_there)]
+        for number, end in zip((3, 4), lifted, strict=True):
             os.dup2(end, number)
 
     process = subprocess.Popen(
@@ -131,7 +131,8 @@ def browser(folder: Path) -> Iterator[Browser]:
     os.close(read_there)
     os.close(write_there)
     try:
-        yield Browser(write_here, read_here)
+        with os.fdopen(write_here, "wb", buffering=0) as to, os.fdopen(read_here, "rb", buffering=0) as back:
+            yield Browser(to, back)
     finally:
         process.terminate()
         try:

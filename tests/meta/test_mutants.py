@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from pathlib import Path
 from typing import Any
@@ -14,19 +15,21 @@ from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.backends import shipped
 from pop_ref.conformance.capabilities import STAGES
 from pop_ref.conformance.catalogue import FILE, catalogue
-from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, PROGRAM, BlackBox
+from pop_ref.conformance.mutants import BLACK_BOXES, FAMILIES, MUTANTS, PROGRAM, BlackBox
 from pop_ref.conformance.mutants.__main__ import main
 from pop_ref.conformance.mutants.copies import Mutant
 from pop_ref.conformance.mutants.trial import every_law, killed_by, law_named, obeys
 from tests.judged import EVERY_PRECISION
 
+RESULTS = Path(__file__).resolve().parents[2] / "benchmarks" / "results"
 EVERYONE = (*MUTANTS, *PROGRAM)
 # what has two precisions; the oracle has one
 OUTSIDE = (*PROGRAM, *BLACK_BOXES)
-DTYPES = ("float32", "float64")
 # each mutant in one of them, turn and turn about
 TRIED = [
-    (mutant, dtype) for k, mutant in enumerate(OUTSIDE) for dtype in (DTYPES if EVERY_PRECISION else [DTYPES[k % 2]])
+    (mutant, dtype)
+    for k, mutant in enumerate(OUTSIDE)
+    for dtype in (mutant.precisions if EVERY_PRECISION else [mutant.precisions[k % 2]])
 ]
 
 
@@ -54,14 +57,46 @@ def test_the_program_itself_obeys_what_its_mutants_break(law: str) -> None:
 def test_a_trial_says_who_dies_by_what(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["no_half_in_the_exponent"]) == 0
     assert capsys.readouterr().out.startswith(
-        "no_half_in_the_exponent: killed by "
+        "no_half_in_the_exponent in float64: killed by "
         "test_alpha:the_exponent_is_half_the_squared_distance_in_the_conics_metric (AssertionError: alpha.sigma"
     )
     assert main(["near_plane_ignored"]) == 0
-    assert "behind gsplat's signature: 1 of 1 killed" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "near_plane_ignored in float32: killed by" in said
+    assert "near_plane_ignored in float64: killed by" in said
+    assert "whole rasterizers: 1 of 1 killed" in said
     with pytest.raises(SystemExit):
         main(["nobody"])
     assert "there is no mutant nobody" in capsys.readouterr().err
+
+
+class _Soft:
+    """A mutant that its law notices in float32 alone."""
+
+    name, law, precisions = "soft", "test_alpha:soft", ("float32", "float64")
+
+
+def test_a_mutant_that_lives_in_one_precision_is_kept_as_alive(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = importlib.import_module("pop_ref.conformance.mutants.__main__")
+    monkeypatch.setattr(command, "FAMILIES", {"soft ones": (_Soft,)})
+    monkeypatch.setattr(command, "killed_by", lambda mutant, dtype: "broken" if dtype == "float32" else None)
+    assert main(["--json", str(tmp_path / "kills.json")]) == 1
+    assert capsys.readouterr().out.endswith("soft ones: 0 of 1 killed\n")
+    assert json.loads((tmp_path / "kills.json").read_text()) == {
+        "soft ones": {"soft": {"float32": "broken", "float64": None}}
+    }
+    with pytest.raises(SystemExit):
+        main(["soft", "--json", str(tmp_path / "kills.json")])
+    assert "name none" in capsys.readouterr().err
+
+
+def test_what_is_published_of_kills_is_of_todays_mutants_in_every_precision_that_they_have() -> None:
+    kept = json.loads((RESULTS / "kills.json").read_text(encoding="utf-8"))
+    for family, mutants in FAMILIES.items():
+        tried = {name: set(of) for name, of in kept[family].items()}
+        assert tried == {mutant.name: set(mutant.precisions) for mutant in mutants}, "run 'make kit'"
 
 
 def test_there_are_at_least_twenty_mutants_and_no_two_alike() -> None:
@@ -91,7 +126,7 @@ def test_every_law_has_a_stage_of_its_own_and_a_sentence_for_a_name() -> None:
     assert {stated.stage for stated in laws.values()} == set(STAGES)
 
 
-KEPT = json.loads((Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "teeth.json").read_text())
+KEPT = json.loads((RESULTS / "teeth.json").read_text(encoding="utf-8"))
 IMAGE, GRADIENTS = "test_agreement:the_image_is_one_of_the_oracles_outcomes", "test_agreement:gradients_are_the_oracles"
 
 

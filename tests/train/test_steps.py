@@ -65,7 +65,9 @@ def test_ten_steps_in_double_precision_are_the_oracles_to_the_last_digits(tmp_pa
     assert not any(step.doubtful for step in steps)
 
 
+# the oracle's time is most of it; what is compiled in C++ takes them in the native step
 @pytest.mark.slow
+@pytest.mark.parametrize("engine", ["fast", "native"], indirect=True)
 def test_three_hundred_steps_with_all_density_control_are_the_oracles(engine: Any, tmp_path: Path) -> None:
     steps = judged(run_of(RECIPE, tmp_path, engine), RECIPE, STEPS)
     agree(steps)

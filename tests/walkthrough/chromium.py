@@ -53,6 +53,13 @@ class Page:
         for each in (to_browser, from_browser, *lifted):
             os.close(each)
         self._rest, self._number, self._session = b"", 0, ""
+        try:
+            self._attach()
+        except BaseException:
+            self.__exit__()
+            raise
+
+    def _attach(self) -> None:
         page = next(t for t in self.call("Target.getTargets")["targetInfos"] if t["type"] == "page")
         self._session = self.call("Target.attachToTarget", targetId=page["targetId"], flatten=True)["sessionId"]
         for domain in ("Page", "Runtime", "Log"):

@@ -10,6 +10,7 @@ import fcntl
 import functools
 import importlib.util
 import pickle
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -128,10 +129,15 @@ def executed(written: str, before: str = "", behind: str = "") -> list[dict[str,
     """
     import nbclient
     import nbformat
+    from traitlets.config import Config
 
     whole = nbformat.reads(written, as_version=4)
     nbformat.validate(whole)
     first, last = (nbformat.v4.new_code_cell(text, metadata={"added": True}) for text in (before, behind))
     whole.cells = [first, *whole.cells, last]
-    nbclient.NotebookClient(whole, timeout=600, kernel_name="python3").execute()
+    with tempfile.TemporaryDirectory() as place:
+        # sockets in a folder: of ports, the kernel is told five that are free, and binds them a second later, when a
+        # server of another test may have one of them (ZMQError: Address already in use)
+        ours = Config(KernelManager={"transport": "ipc", "connection_file": f"{place}/kernel.json"})
+        nbclient.NotebookClient(whole, timeout=600, kernel_name="python3", config=ours).execute()
     return [cell for cell in whole.cells if cell.cell_type == "code" and "added" not in cell.metadata]

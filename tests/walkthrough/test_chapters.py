@@ -18,7 +18,6 @@ from pop_ref.walkthrough.builder.chapter import (
     TIERS,
     ChapterError,
     Part,
-    as_wide_as_a_page,
     chapter_number,
     parts,
     read_chapter,
@@ -96,9 +95,10 @@ def test_a_chapter_runs_and_holds_what_a_chapter_must(path: Path) -> None:
 
 # what a chapter concludes is no matter of the draw: by how much its seeds are moved here. 1b draws nothing and tries
 # other starts itself
-OTHER_DRAWS = {"2": 100, "3": 100, "4": 100, "4b": 100, "5": 300, "5b": 100, "6": 100, "7": 100, "11": 100}
-OTHER_DRAWS |= {"0": 100, "8": 100, "9": 300, "9b": 100, "10": 100, "12": 100}
-# of those that train or draw a scene: what else is written otherwise, a size, a start or the seed of a run
+OTHER_DRAWS = {"0": 100, "2": 100, "3": 100, "4": 100, "4b": 100, "5": 300, "5b": 100, "6": 100, "7": 100, "11": 100}
+OTHER_DRAWS |= {"9": 300}
+# of those that train or draw a scene: what else is written otherwise, a size, a start or the seed of a run, most of
+# them with other draws at once
 OTHERWISE = {
     "1, another splat": (
         "1",
@@ -111,7 +111,7 @@ OTHERWISE = {
     "9, other starts": ("9", 0, ("rng = np.random.default_rng(seed)", "rng = np.random.default_rng(seed + 200)")),
     "9b, more views": ("9b", 300, ("views=12", "views=14"), ("rng.choice(12", "rng.choice(14")),
     "10, larger": ("10", 200, ("SIZE, N_VIEWS, SH_C0 = 24", "SIZE, N_VIEWS, SH_C0 = 28")),
-    "10, other run": ("10", 0, ("config = TrainConfig(", "config = TrainConfig(seed=7, ")),
+    "10, other run": ("10", 100, ("config = TrainConfig(", "config = TrainConfig(seed=7, ")),
     "12, larger": (
         "12",
         100,
@@ -299,24 +299,9 @@ def test_what_only_checks_look_at_is_folded_with_them() -> None:
     assert page.index("What was checked") < page.index('<span class="n">n</span>')
 
 
-def test_a_signature_is_broken_where_it_is_wider_than_a_page() -> None:
-    short = "def f(x: int) -> int:\n    # why (A27)\n    return x"
-    assert as_wide_as_a_page(short) == "def f(x: int) -> int:\n    # why\n    return x"
-    given = ", ".join(f'{name * 12}: Float64[np.ndarray, "N 3"]' for name in "abc")
-    wide = f"def f({given}) -> tuple[int, int]:\n    return 1, 2"
-    for each in (wide, wide.replace("f(", "f(\n    ").replace(") ->", "\n) ->")):
-        lines = as_wide_as_a_page(each).split("\n")
-        assert lines[1] == '    aaaaaaaaaaaa: Float64[np.ndarray, "N 3"],'
-        assert lines[4:] == [") -> tuple[int, int]:", "    return 1, 2"]
-
-
 def test_a_printed_table_of_long_lines_is_not_broken() -> None:
     assert '<pre class="printed long">' in _whole(GOOD.replace("print(Pair(1.0).x)", "print('x' * 100)"))
     assert '<pre class="printed">' in _whole(GOOD)
-
-
-def test_a_comma_behind_a_formula_stays_with_it() -> None:
-    assert re.search(r'<span class="math inline stays"><math [^>]*>.*?</math>\.</span>', _whole(GOOD), re.DOTALL)
 
 
 def test_the_comment_that_opens_an_answer_is_prose() -> None:
@@ -325,17 +310,6 @@ def test_the_comment_that_opens_an_answer_is_prose() -> None:
     page = _whole(GOOD.replace("two = 2", "# it is $1 + 1$ < 3\ntwo = 2"))
     assert "it is <span" in page
     assert "# it is" not in page
-
-
-def test_names_of_functions_stand_apart_from_what_is_no_parenthesis() -> None:
-    def formula(latex: str) -> str:
-        return re.sub(r"<mspace[^>]*>", " ", _whole(GOOD.replace("$x^2$", f"${latex}$")))
-
-    assert "<mi>o</mi> <mi>exp</mi><mo" in formula(r"o\exp(x)")
-    assert "<mi>ln</mi> <mi>o</mi>" in formula(r"\ln o")
-    assert "<mi>diag</mi><mo" in formula(r"\operatorname{diag}(2, 1)")
-    assert "<msub><mi>max</mi><mi>i</mi></msub> <mi>x</mi>" in formula(r"\max_i x")
-    assert "<msub><mi>T</mi><mrow><mi>max</mi></mrow></msub>" in formula(r"T_{\max}")
 
 
 def test_a_prediction_is_asked_for_before_its_answer() -> None:
@@ -353,9 +327,6 @@ def test_a_directive_stands_for_what_the_package_says() -> None:
     assert yours is not None
     assert "falloff" in yours[1]
     assert "pop learn check alpha" in page
-    assert '<details class="yours"' not in _whole(
-        GOOD.replace("# What is two?", "# {{source: pop_ref.tiles.listed_pixels}}")
-    )
     assert "Falloff" not in page, "the docstring is left out"
     assert f'href="{GLOSSARY_PAGE}#D5"' in page
     assert f'href="{GLOSSARY_PAGE}#D6"' not in page, "code is left alone"

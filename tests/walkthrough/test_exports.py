@@ -11,9 +11,10 @@ import pytest
 from pop_ref.walkthrough.builder import command
 from pop_ref.walkthrough.builder.chapter import Chapter, ChapterError, chapter_number, read_chapter
 from pop_ref.walkthrough.builder.command import main
-from pop_ref.walkthrough.builder.layout import book
+from pop_ref.walkthrough.builder.layout import asset, book, document
 from pop_ref.walkthrough.builder.slides import FILE, chapters_of, deck, read_slides
 from pop_ref.walkthrough.pages import Outcome, run_chapter
+from pop_ref.walkthrough.widgets import html
 from tests.walkthrough.chromium import SCREENSHOTS, WHY_NOT, Page, keep
 from tests.walkthrough.ran import CHAPTERS, ran
 
@@ -222,6 +223,17 @@ def test_the_book_holds_every_chapter_and_no_id_twice(small: tuple[Chapter, list
     for used in re.findall(r'(?:href="#|url\(#)([^")]+)', text):
         assert used in ids, used
     assert not re.search(r'href="(?!#)', text)
+
+
+@in_browser
+def test_a_training_in_a_book_is_drawn_before_the_page_is_loaded(page: Page, tmp_path: Path) -> None:
+    # what is printed is the page as it is when it has loaded, and a worker answers later
+    early = "<script>early = [...document.querySelectorAll('dd')].map(each => each.textContent)</script>"
+    text = document("A book", html("train") + early, asset("page.css"), attributes=' class="book"')
+    (tmp_path / "book.html").write_text(text, encoding="utf-8")
+    page.open(tmp_path / "book.html")
+    assert page.complaints == []
+    assert page.ask("early.filter(each => / dB$/.test(each))") == ["10.3 dB", "10.3 dB"]
 
 
 @in_browser

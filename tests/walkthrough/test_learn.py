@@ -18,9 +18,10 @@ from pop_fast.demo import make_demo
 from pop_ref.learn import stubs
 from pop_ref.learn.course import BY_NAME, COURSE, Stage, stage_named
 from pop_ref.learn.diagnosis import diagnose
-from pop_ref.learn.drawing import ORACLES, SIDE, YOURS, drawn_counterexample
+from pop_ref.learn.drawing import HEAD, ORACLES, SIDE, YOURS, drawn_counterexample
 from pop_ref.learn.grading import read_grade
-from pop_ref.learn.judge import judge
+from pop_ref.learn.judge import Verdict, judge
+from pop_ref.learn.lettering import lettered
 from pop_ref.learn.mistakes import MISTAKES
 from pop_ref.learn.progress import PASSED, WRITTEN, course_map, note_passed, picture, state
 from pop_ref.learn.splat import orbit, photograph, write_png
@@ -247,7 +248,9 @@ def test_a_counterexample_is_drawn_with_what_came_out_and_what_should(
     verdict = judge(read_work(mine), BY_NAME[stage])
     image = drawn_counterexample(verdict)
     assert image is not None
-    assert image.shape[0] == SIDE
+    assert image.shape[0] == HEAD + SIDE
+    assert _reads(image, "yours", YOURS)
+    assert _reads(image, "oracle", ORACLES)
     assert image.min() >= 0.0
     assert image.max() <= 1.0
     # a short line at least: how small the counterexample is made, and what it shows, depends on the time that it takes
@@ -262,6 +265,28 @@ def test_a_counterexample_is_drawn_with_what_came_out_and_what_should(
     write(mine, stage)
     assert main(["learn", "check", stage, str(mine)]) == 0
     assert not picture.exists()
+
+
+def _reads(image: np.ndarray, text: str, color: np.ndarray) -> bool:
+    """Tell whether a text stands anywhere in a picture in a colour."""
+    inked = lettered(text)
+    found = np.all(np.abs(image - color) < 1e-9, axis=2)
+    places = np.lib.stride_tricks.sliding_window_view(found, inked.shape)
+    return bool(np.any(np.all(places == inked, axis=(2, 3))))
+
+
+def test_bars_say_which_numbers_they_are_and_the_first_ones_values() -> None:
+    expected = np.arange(20.0) + 1.0
+    found = expected.copy()
+    found[17], found[4] = 18.25, -3.0
+    call = Call("blend", (), (), {}, (found,), (expected,))
+    image = drawn_counterexample(Verdict("", call=call))
+    assert image is not None
+    assert _reads(image, "yours [4] -3", YOURS)
+    assert _reads(image, "oracle [4] 5", ORACLES)
+    ink = np.array([0.25, 0.25, 0.25])
+    assert _reads(image, "[17]", ink)
+    assert not _reads(image, "[18]", ink), "what does not differ comes after what does"
 
 
 def test_the_chapter_that_explains_a_stage_is_there() -> None:
@@ -431,7 +456,8 @@ def test_a_capture_of_ones_own_ends_above_20_db_and_not_by_what_came_last(
     mine: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     _written(mine)
-    make_demo(mine / "demo", views=16, width=64, height=48)
+    # smaller than what photographs are shrunk to: they are taken as they are
+    make_demo(mine / "demo", views=12, width=48, height=36)
     assert main(["learn", "train", str(mine), "--steps", "60", "--scene", str(mine / "demo")]) == 0
     told_ = capsys.readouterr().out
     psnrs = [float(text) for text in re.findall(r"([\d.]+) dB  ", told_)]

@@ -19,7 +19,7 @@ OPENED = [(900, False), (400, True)]
 # what is wider than its own box and neither scrolls nor is cut off there
 STICKS_OUT = """[...document.querySelectorAll('main *')].filter(each => {
     const box = each.getBoundingClientRect();
-    const scrolls = each.closest('pre, .wide, .math, svg, math, details:not([open])');
+    const scrolls = each.closest('pre, .wide, .math.block, svg');
     return box.width && box.right > innerWidth + 1 && !scrolls;
 }).map(each => each.tagName + ' ' + each.className + ' ' + each.textContent.slice(0, 60))"""
 
@@ -33,6 +33,8 @@ def page() -> Iterator[Page]:
 def _looked_at(page: Page, file: Path) -> None:
     for width, dark in OPENED:
         page.open(file, width=width, dark=dark)
+        # answers, too, must fit
+        page.ask("document.querySelectorAll('details').forEach(each => { each.open = true; })")
         _is_sound(page, file.stem, width, dark)
         page.switch(dark=not dark)
         _is_sound(page, file.stem, width, not dark)

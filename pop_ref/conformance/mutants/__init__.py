@@ -23,4 +23,7 @@ PROGRAM = (*LINES, *TRAINERS, *COLLECTED, *STRANGERS, *UNSEEN)
 # behind gsplat's signature: one argument broken, several together; autograd, memory, size
 BLACK_BOXES = (*SINGLE, *COMBINED, *SEAMS, *TRAINERS_BOXES, *STRANGERS_BOXES, *UNSEEN_BOXES)
 
-__all__ = ["BLACK_BOXES", "MUTANTS", "PROGRAM", "BlackBox", "Mutant", "living"]
+# they are counted apart: what the kit has to see from outside says nothing of what stages show
+FAMILIES = {"stages of the oracle": MUTANTS, "the program that trains": PROGRAM, "whole rasterizers": BLACK_BOXES}
+
+__all__ = ["BLACK_BOXES", "FAMILIES", "MUTANTS", "PROGRAM", "BlackBox", "Mutant", "living"]

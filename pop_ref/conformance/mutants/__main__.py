@@ -1,26 +1,47 @@
-"""Put every mutant on trial: `python -m pop_ref.conformance.mutants [--every] [NAME ...]`."""
+"""Put every mutant on trial: `python -m pop_ref.conformance.mutants [--every] [--json FILE] [NAME ...]`.
+
+A mutant is tried in each precision that it has. With `--json`, how its law breaks is kept by family, mutant and
+precision, None where the mutant survives.
+"""
 
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 from pop_ref.conformance.hypothesis_profiles import EXAMPLES
-from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, PROGRAM, BlackBox, Mutant
+from pop_ref.conformance.mutants import FAMILIES, BlackBox, Mutant
 from pop_ref.conformance.mutants.trial import killed_by, killers
 
-# the kinds that are counted apart: what the kit has to see from outside says nothing of what stages show
-KINDS = {"of the oracle": MUTANTS, "of the program that trains": PROGRAM, "behind gsplat's signature": BLACK_BOXES}
+Trials = dict[str, dict[str, dict[str, str | None]]]
 
 
-def report(mutants: Sequence[Mutant | BlackBox], every: bool, examples: int) -> Iterator[str]:
-    """Yield a line a mutant: how its law breaks on it; with `every`, all laws that do, and how many they are."""
-    for mutant in mutants:
-        breaks = killed_by(mutant)
-        yield f"{mutant.name}: {'SURVIVES' if breaks is None else 'killed by'} {mutant.law} ({breaks})"
-        if every:
-            found = killers(mutant, examples)
-            yield f"    {len(found)} laws notice with {examples} examples each: {', '.join(found)}"
+def tried(chosen: Sequence[str]) -> Iterator[tuple[str, Mutant | BlackBox, str, str | None]]:
+    """Yield family, mutant, precision and how the mutant's law breaks, None where the mutant survives.
+
+    Args:
+        chosen: names of mutants; none for all.
+    """
+    for family, mutants in FAMILIES.items():
+        for mutant in mutants:
+            if not chosen or mutant.name in chosen:
+                for dtype in mutant.precisions:
+                    yield family, mutant, dtype, killed_by(mutant, dtype)
+
+
+def report(chosen: Sequence[str], every: bool, examples: int) -> Trials:
+    """Print a line for each mutant and precision; with `every`, all laws that notice it, too; return what was found."""
+    found: Trials = {}
+    for family, mutant, dtype, breaks in tried(chosen):
+        found.setdefault(family, {}).setdefault(mutant.name, {})[dtype] = breaks and breaks[:120]
+        verdict = "SURVIVES" if breaks is None else "killed by"
+        print(f"{mutant.name} in {dtype}: {verdict} {mutant.law} ({breaks})", flush=True)
+        if every and dtype == mutant.precisions[-1]:
+            laws = killers(mutant, examples)
+            print(f"    {len(laws)} laws notice with {examples} examples each: {', '.join(laws)}", flush=True)
+    return found
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -29,21 +50,21 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("names", nargs="*", metavar="NAME", help="only these mutants")
     parser.add_argument("--every", action="store_true", help="try every law on every mutant and list those that break")
     parser.add_argument("--examples", type=int, default=EXAMPLES["ci"], help="of each law under --every")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="keep how each of all mutants dies")
     args = parser.parse_args(words)
-    everyone = tuple(mutant for kind in KINDS.values() for mutant in kind)
-    unknown = set(args.names) - {mutant.name for mutant in everyone}
+    unknown = set(args.names) - {mutant.name for mutants in FAMILIES.values() for mutant in mutants}
     if unknown:
         parser.error(f"there is no mutant {', '.join(sorted(unknown))}")
-    chosen = [mutant for mutant in everyone if not args.names or mutant.name in args.names]
-    alive: set[str] = set()
-    for line in report(chosen, args.every, args.examples):
-        name, survives, _ = line.partition(": SURVIVES ")
-        alive |= {name} if survives else set()
-        print(line, flush=True)
-    for kind, mutants in KINDS.items():
-        tried = [mutant.name for mutant in mutants if mutant in chosen]
-        if tried:
-            print(f"{kind}: {len(set(tried) - alive)} of {len(tried)} killed")
+    if args.json and args.names:
+        parser.error("--json keeps the trial of all mutants: name none")
+    found = report(args.names, args.every, args.examples)
+    if args.json:
+        args.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    alive = 0
+    for family, of in found.items():
+        killed = sum(None not in breaks.values() for breaks in of.values())
+        alive += len(of) - killed
+        print(f"{family}: {killed} of {len(of)} killed")
     return 1 if alive else 0
 
 

@@ -32,6 +32,7 @@ class BlackBox:
     story: str
     breaks: Callable[[Rasterization, dict[str, Any]], Any]
     law: str
+    precisions = ("float32", "float64")
 
     def adapter(self, dtype: str = "float32") -> Any:
         """Return it as the kit is handed any rasterizer, in float32 or float64."""

@@ -46,6 +46,11 @@ class Mutant:
         """Return the name that the copy is imported by."""
         return f"{self.package}_mutant"
 
+    @property
+    def precisions(self) -> tuple[str, ...]:
+        """Return what it is judged in; the oracle has float64 alone."""
+        return ("float64",) if self.package == ORACLE else ("float32", "float64")
+
     def broken_source(self) -> str:
         """Return the module's text with the line changed."""
         text = (_folder(self.package) / self.file).read_text(encoding="utf-8")

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
 from pop_ref.learn.course import COURSE
+from pop_ref.learn.stubs import formulas
 
 Kind = Literal["prose", "code", "setup", "answer"]
 Role = Literal["plain", "imports", "checks", "draws"]
@@ -233,8 +234,18 @@ def _expanded(name: str, argument: str, whole: str, marked: bool) -> str:
 
 
 def _stage_of(path: str) -> str:
-    """Name the stage of `pop learn` in which a reader writes this function, if there is one."""
-    return next((stage.name for stage in COURSE if path.rpartition(".")[2] in stage.names), "")
+    """Name the stage of `pop learn` in which a reader writes this function, or what a private one does for another.
+
+    The course has a formula to show for most functions; where it has none, a page shows what a private one does.
+    """
+    name = path.rpartition(".")[2]
+    for stage in COURSE:
+        for home, names in stage.functions.items():
+            helped = [each for each in names if formulas(home, each)] if name.startswith("_") else []
+            calls = any(f"{name}(" in source_of(f"pop_ref.{home}.{each}")[0] for each in helped)
+            if calls or name in names:
+                return stage.name
+    return ""
 
 
 def _chapters() -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import re
 from collections.abc import Mapping, Sequence
-from html import escape
+from html import escape, unescape
 from pathlib import Path
 from typing import Any, Final
 
@@ -50,15 +50,21 @@ _FUNCTION: Final = re.compile(
     rf"(</m(?!o|space)\w+>)?((?:<(msub|munder|msup)>)?)<m[io]>({_FUNCTIONS})</m[io]>((?(3).*?</\3>))(?=(<m(?!o|space)\w)?)"
 )
 _THIN: Final = '<mspace width="0.167em" />'
+# a sign behind an operator or an opening parenthesis has one operand; MathML would set it as one between two
+_SIGN: Final = re.compile(r"(<mo\b[^>]*>[^)\]}|]</mo>(?:<mspace[^>]*/>)?)<mo>([−+±])</mo>")
+_BAR: Final = re.compile(r'<mo(?: stretchy="false")?>\|</mo>')
 # a comma behind a formula stays on its line
 _PUNCTUATED: Final = re.compile(r'<span class="math inline">((?:(?!</math>).)*</math>)</span>([,.;:)?]+)', re.DOTALL)
 # labels of decisions and kinks in prose; what code quotes is left alone
 _LABEL: Final = re.compile(r"(<(pre|code|a|math|h\d)\b.*?</\2>)|\b([DB][1-8])\b", re.DOTALL)
 # a printed function that the course asks the reader to write
 _YOURS: Final = re.compile(
-    r"<p>(<code>[\w/., ]+</code>), yours to write first in <code>pop learn check (\w+)</code>:</p>\s*(<pre>.*?</pre>)",
+    r"<p>(<code>[\w/., ]+</code>), yours to write first in <code>pop learn check (\w+)</code>:</p>\s*(<pre\b.*?</pre>)",
     re.DOTALL,
 )
+_TAG: Final = re.compile(r"<[^>]*>")
+# as many characters of code have room in the narrowest box of a page or a book; so few lines stay on one page of a book
+_LONG, _SHORT = 80, 12
 _WIDGET: Final = re.compile(r"<p>\{\{widget: (\w+)\}\}</p>")
 # two pictures of a page, or two chapters of a book, may use one id for different things
 _ID: Final = re.compile(r'(\bid="|\bfor="|href="#|url\(#)')
@@ -303,11 +309,21 @@ def _folded_source(found: re.Match[str]) -> str:
 
 
 def _code(text: str) -> str:
-    return f"<pre><code>{_colored(text, 'python', '')}</code></pre>"
+    lines = highlight(text, PythonLexer(), HtmlFormatter(nowrap=True)).splitlines(keepends=True)
+    short = ' class="short"' if len(lines) <= _SHORT else ""
+    return f"<pre{short}><code>{''.join(map(_hanging, lines))}</code></pre>"
 
 
 def _colored(text: str, language: str, _: str) -> str:
-    return highlight(text, PythonLexer(), HtmlFormatter(nowrap=True)) if language == "python" else escape(text)
+    return _code(text) if language == "python" else escape(text)
+
+
+def _hanging(line: str) -> str:
+    """Let what is broken off a long line of code begin to the right of where the line begins."""
+    plain = unescape(_TAG.sub("", line))
+    if len(plain) <= _LONG:
+        return line
+    return f'<span class="hangs" style="--at:{len(plain) - len(plain.lstrip()) + 4}ch">{line}</span>'
 
 
 def _data(png: bytes) -> str:
@@ -337,6 +353,13 @@ def _formula(latex: str, options: dict[str, Any]) -> str:
         raise _FormulaError(f"{latex.strip()}\n    {unknown[1]} is not known")
     # characters rather than references, but for those that mean something to HTML
     plain = re.sub(r"&#x(?!0003[CE]|00026)(\w+);", lambda found: chr(int(found[1], 16)), mathml)
+    # no operator, which would have spaces around it
+    plain = re.sub(r"<mo>([⊤∂∇])</mo>", r"<mi>\1</mi>", _SIGN.sub(r'\1<mo form="prefix">\2</mo>', plain))
+    n_pairs, odd = divmod(len(_BAR.findall(plain)), 2)
+    if not odd:
+        # the bars of a norm open and close
+        forms = iter(("prefix", "postfix") * n_pairs)
+        plain = _BAR.sub(lambda _: f'<mo stretchy="false" form="{next(forms)}">|</mo>', plain)
     return _FUNCTION.sub(_spaced, plain)
 
 

@@ -40,7 +40,8 @@ function train(root) {
   try {
     const place = URL.createObjectURL(new Blob([WORKER], { type: "text/javascript" }));
     workers = titles.map((_, side) => {
-      const worker = new Worker(place);
+      // a page that is printed does not wait for a worker
+      const worker = document.body.classList.contains("book") ? here() : new Worker(place);
       worker.onmessage = ({ data }) => receive(side, data);
       worker.onerror = ({ message }) => { told.textContent = `The training stopped: ${message}`; };
       return worker;
@@ -49,6 +50,12 @@ function train(root) {
   } catch {
     told.textContent = "This browser runs no workers here: open the page in another, or run python -m pop_ref.learn.splat.";
     play.disabled = true;
+  }
+
+  function here() {
+    const worker = {}, text = `let onmessage; ${WORKER}\nreturn onmessage;`;
+    const answer = new Function("postMessage", text)((data) => worker.onmessage({ data }));
+    return Object.assign(worker, { postMessage: (data) => answer({ data }) });
   }
 
   function panel(title) {
