@@ -11,50 +11,27 @@ import json
 import re
 import runpy
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+import kit_tables
+from kit_tables import MUTANT_LIST, table
 from stages import ROOT, STAGES, files, functions, laws
 
 from paper_repro.claims_page import outcome as outcome_of
 from paper_repro.methods import load_pinned
 from paper_repro.status import everything, status_table
 from pop_fast.train.presets import METHODS, options_for
-from pop_ref.conformance.capabilities import STAGES as LAW_STAGES
-from pop_ref.conformance.law_coverage import LIMITS, reason
-from pop_ref.conformance.mutants import BLACK_BOXES, FAMILIES, MUTANTS, PROGRAM
-from pop_ref.conformance.mutants.trial import every_law
-from pop_ref.conformance.scorecard import outcomes
-from pop_ref.conformance.teeth import UNITS
 from pop_ref.constants import GSPLAT_1_5, GSPLAT_1_6, INRIA, PAPER, SPEEDY_SPLAT
 from pop_ref.notation import SYMBOLS
 from pop_ref.recipes import BASELINES, L1_DIVIDED, RECIPES
 
 README = ROOT / "README.md"
 PAGES = (README, *sorted(path for path in (ROOT / "docs").glob("*.md") if path.name != "MUTANTS.md"))
-MUTANT_LIST = ROOT / "docs" / "MUTANTS.md"
-CARDS = ROOT / "benchmarks" / "results" / "scorecards"
-TEETH = ROOT / "benchmarks" / "results" / "teeth.json"
-LAW_COVERAGE = ROOT / "benchmarks" / "results" / "law_coverage.json"
-KILLS = ROOT / "benchmarks" / "results" / "kills.json"
-VECTOR_KILLS = ROOT / "benchmarks" / "results" / "vector_kills.json"
 CPU_TIMES = ROOT / "benchmarks" / "results" / "cpu.json"
-# the judged, in the order of their columns, and the card that each stands on
-JUDGED = {
-    "pop_fast float64": ("pop_fast.json", "fast64"),
-    "pop_fast float32": ("pop_fast.json", "fast32"),
-    "compiled float64": ("compiled.json", "compiled64"),
-    "compiled float32": ("compiled.json", "compiled32"),
-    "host mirror float64": ("host_mirror.json", "mirror64"),
-    "host mirror float32": ("host_mirror.json", "mirror32"),
-    "gsplat torch float64": ("gsplat.json", "gsplat-torch64"),
-    "gsplat torch float32": ("gsplat.json", "gsplat-torch32"),
-}
-
-OURS = {title: judged for title, judged in JUDGED.items() if not title.startswith("gsplat")}
 
 
 def rosetta() -> str:
@@ -65,13 +42,13 @@ def rosetta() -> str:
         shown = [f"`{name}`" + ("ᵀ" if f"{name}_vjp" in names else "") for name in names if not name.endswith("_vjp")]
         places = [_links(files(room, stage)) for room in ("pop_ref", "pop_fast", "cuda_ext/csrc")]
         rows.append([stage.title, stage.paper, ", ".join(shown), *places, _links(laws(stage))])
-    return _table(["stage", "paper", "functions", "`pop_ref`", "`pop_fast`", "`cuda_ext`", "laws"], rows)
+    return table(["stage", "paper", "functions", "`pop_ref`", "`pop_fast`", "`cuda_ext`", "laws"], rows)
 
 
 def conventions() -> str:
     """Make the table of symbols from `pop_ref.notation`."""
     rows = [[f"`{s.name}`", s.shape, s.unit, s.frame, f"${s.paper}$" if s.paper else "", s.meaning] for s in SYMBOLS]
-    return _table(["name", "shape", "unit", "frame", "paper", "meaning"], rows)
+    return table(["name", "shape", "unit", "frame", "paper", "meaning"], rows)
 
 
 def profiles() -> str:
@@ -90,7 +67,7 @@ def profiles() -> str:
         ("principal point", lambda p: p.principal_point),
         ("gradient of the frustum clamp", lambda p: p.clamp_gradient),
     ]
-    return _table(["", *(f"`{p.name}`" for p in named)], [[title, *map(show, named)] for title, show in lines])
+    return table(["", *(f"`{p.name}`" for p in named)], [[title, *map(show, named)] for title, show in lines])
 
 
 def recipes() -> str:
@@ -99,7 +76,7 @@ def recipes() -> str:
             for name, recipe in (*RECIPES.items(), *BASELINES.items())]  # fmt: skip
     divided = " ".join(options_for(L1_DIVIDED[10]))
     rows.append(["L1 div = 10", f"`pop train scene {divided}`", "and likewise 1, 2, 5, 20, 50, 100"])
-    return _table(["row of the paper", "command", ""], rows)
+    return table(["row of the paper", "command", ""], rows)
 
 
 RECIPE_NOTES = {
@@ -120,14 +97,14 @@ def methods() -> str:
     """Make a table a method: every setting that decides a training, its value, and where its source says so."""
     parts = []
     for name in METHODS:
-        table = load_pinned(name)
-        rows = [_cited(setting, of) for setting, of in table.settings.items()]
-        differing = {**{f"row {row}": of for row, of in table.rows.items()}, **table.scenes}
+        pinned = load_pinned(name)
+        rows = [_cited(setting, of) for setting, of in pinned.settings.items()]
+        differing = {**{f"row {row}": of for row, of in pinned.rows.items()}, **pinned.scenes}
         rows += [_cited(f"{where}: {setting}", one) for where, of in differing.items() for setting, one in of.items()]
-        order = [_cited(kind, (" · ".join(events), source)) for kind, (events, source) in table.order.items()]
-        read = "".join(f"- {source}\n" for source in table.sources)
-        settings = _table(["setting", "value", "where its source says so"], rows)
-        steps = _table(["step", "what happens to the Gaussians, in this order", "where"], order)
+        order = [_cited(kind, (" · ".join(events), source)) for kind, (events, source) in pinned.order.items()]
+        read = "".join(f"- {source}\n" for source in pinned.sources)
+        settings = table(["setting", "value", "where its source says so"], rows)
+        steps = table(["step", "what happens to the Gaussians, in this order", "where"], order)
         parts.append(f"## {name}\n\n{read}\n{settings}\n\n{steps}")
     return "\n\n".join(parts)
 
@@ -180,95 +157,6 @@ def blocks() -> str:
     return str(runpy.run_path(str(ROOT / "benchmarks" / "blocks.py"))["table"]())
 
 
-def scorecards() -> str:
-    """Make the table of what the kit found: rows are stages, cells say laws passed, failed and skipped."""
-    columns = [card(file)["summary"][backend] for file, backend in JUDGED.values()]
-    rows = [[stage, *(_counts(column[stage]) for column in columns)] for stage in LAW_STAGES]
-    total = [{key: sum(column[s][key] for s in LAW_STAGES) for key in column[LAW_STAGES[0]]} for column in columns]
-    head = ["stage", *JUDGED]
-    return _table(head, [*rows, ["**all**", *(f"**{_counts(count)}**" for count in total)]])
-
-
-def card(file: str) -> dict[str, Any]:
-    """Read a scorecard."""
-    return dict(json.loads((CARDS / file).read_text(encoding="utf-8")))
-
-
-def _counts(count: dict[str, int]) -> str:
-    if not count["passed"] + count["failed"]:
-        return f"– ({count['skipped']})"
-    broken = f", {count['failed']} broken" if count["failed"] else ""
-    return f"{count['passed']}{broken}" + (f" ({count['skipped']})" if count["skipped"] else "")
-
-
-def broken_laws() -> str:
-    """List the laws that a judged backend breaks."""
-    lines = []
-    for title, (file, backend) in JUDGED.items():
-        for of_stage in card(file)["laws"][backend].values():
-            names = [law for law, came in outcomes(of_stage).items() if came.startswith("failed")]
-            lines += [f"- {title}: {law.replace('_', ' ')}" for law in names]
-    return "\n".join(lines) or "None is broken."
-
-
-def surfaces() -> str:
-    """Make the table of how much of each judged backend the laws reach, and of what they cost."""
-    rows = []
-    for title, (file, backend) in JUDGED.items():
-        told = card(file)
-        surface, counts, cpu = told["surface"][backend], told["summary"][backend].values(), told["made"]["cpu seconds"]
-        tried, every = sum(c["passed"] + c["failed"] for c in counts), sum(sum(c.values()) for c in counts)
-        groups = [surface[group] for group in ("whole views", "arguments", "stage functions")]
-        reached = [f"{len(g['offered'])} of {len(g['offered']) + len(g['not'])}" for g in groups]
-        rows.append([title, f"{tried} of {every}", str(cpu[backend]), surface["profile"], *reached])
-    head = ["", "laws tried", "CPU seconds", "constants", "of whole views", "of gsplat's arguments", "stage functions"]
-    return _table(head, rows)
-
-
-def power() -> str:
-    """Make the table of what the kit kills, and of sound backends that it refuses."""
-    laws, vectors = (json.loads(path.read_text(encoding="utf-8")) for path in (KILLS, VECTOR_KILLS))
-    rows = []
-    for family in FAMILIES:
-        count = len(laws[family])
-        killed = sum(None not in of.values() for of in laws[family].values())
-        noticed = sum(first is not None for first in vectors[family].values())
-        rows.append([family, str(count), f"{killed} of {count}", f"{noticed} of {len(vectors[family])}"])
-    failed = {title: sum(c["failed"] for c in card(file)["summary"][b].values()) for title, (file, b) in OURS.items()}
-    refused = sum(1 for count in failed.values() if count)
-    of_vectors = [first for first in vectors["sound"].values() if first is not None]
-    sound = f"{refused} of {len(failed)} refused", f"{len(of_vectors)} of {len(vectors['sound'])} refused"
-    rows.append(["sound backends of this project", "", *sound])
-    return _table(
-        ["broken on purpose", "mutants", "killed in every precision", "noticed by the portable vectors alone"], rows
-    )
-
-
-def reached() -> str:
-    """Make the tables of what laws reach: ranges of arguments, and lines of the oracle that none runs."""
-    logged = json.loads(LAW_COVERAGE.read_text(encoding="utf-8"))
-    ranges = [[name, f"{low:.3g}", f"{high:.3g}", LIMITS[name]] for name, (low, high) in logged["ranges"].items()]
-    choices = [[name, ", ".join(f"`{value}`" for value in values)] for name, values in logged["choices"].items()]
-    lines, refusals, others = 0, 0, dict[tuple[str, str], int]()
-    for file, found in logged["modules"].items():
-        lines += found["lines"]
-        for function, _ in found["unreached"]:
-            why = reason(file, function)
-            refusals += why is None
-            if why is not None:
-                others[file, why] = others.get((file, why), 0) + 1
-    rows = [[f"`{file}`", str(count), why] for (file, why), count in others.items()]
-    rows.append(["all", str(refusals), "arguments are refused: tests of the oracle give wrong ones, laws give none"])
-    run = lines - refusals - sum(others.values())
-    said = f"Of {lines:,} lines in the oracle's functions the laws run {run:,}. The others:"
-    return "\n\n".join((
-        _table(["argument", "least", "largest", "why no further"], ranges),
-        _table(["argument", "values"], choices),
-        said,
-        _table(["module", "lines not reached", "why"], rows),
-    ))  # fmt: skip
-
-
 def speed() -> str:
     """Make the tables of CPU times, those of a row taken in turns in one process: training steps, renders, blends."""
     timed = json.loads(CPU_TIMES.read_text(encoding="utf-8"))
@@ -283,7 +171,7 @@ def speed() -> str:
             ratio = blend["forward_backward_ms"]["compiled / fast"]
             what = f"blend and backward alone, {_size(case)}, {blend['tile']} px tiles"
             rows.append([what, ns["fast"], ns["compiled"], f"{ratio:.2f}"])
-    made.append(_table(["", "`fast`", "`compiled`", "ratio of times"], rows))
+    made.append(table(["", "`fast`", "`compiled`", "ratio of times"], rows))
     made.append(f"{machine['cpu']}, {machine['capability']}, {machine['threads']} threads, torch {machine['torch']}.")
     return "\n\n".join(made)
 
@@ -295,82 +183,6 @@ def _size(case: dict[str, Any]) -> str:
 def _speed_row(what: str, ms: dict[str, float]) -> list[str]:
     return [what, f"{ms['fast']:.0f} ms", f"{ms['compiled']:.0f} ms", f"{ms['compiled / fast']:.2f}"]
 
-
-def kit() -> str:
-    """Say how much the kit holds."""
-    where = f"[{MUTANT_LIST.name}]({MUTANT_LIST.relative_to(ROOT).as_posix()})"
-    return (
-        f"{len(every_law())} laws in {len(LAW_STAGES)} stages; {len(MUTANTS)} mutants of the oracle and {len(PROGRAM)} "
-        f"of the program that trains, and {len(BLACK_BOXES)} rasterizers that break arguments, every one of them "
-        f"killed by a named law within the `ci` profile: {where}."
-    )
-
-
-def teeth() -> str:
-    """Make the table of the smallest errors that the kit notices, and of what sound backends need of its tolerances."""
-    kept = json.loads(TEETH.read_text(encoding="utf-8"))
-    single, double = kept["float32"], kept["float64"]
-
-    def needed(of: dict[str, dict[str, float]], name: str) -> str:
-        share = of["sound"].get(name, of["sound"]["image"])
-        return f"{100.0 * share:.2g} %"
-
-    rows = [
-        [
-            f"`{name}`" if name.startswith("v_") else f"{name}, {UNITS.get(name, 'share of itself')}",
-            *(f"{of['teeth'][name]:.1e}" for of in (single, double)),
-            *(needed(of, name) for of in (single, double)),
-        ]
-        for name in single["teeth"]
-    ]
-    head = ["error in", "float32 notices", "float64 notices", "sound float32 needs", "sound float64 needs"]
-    return _table(head, rows)
-
-
-def mutants() -> str:
-    """Make the list of mutants: what was broken in which file, and the law that notices."""
-    laws = every_law()
-    rows = [
-        [
-            m.name.replace("_", " "),
-            m.story.replace("|", "\\|"),
-            f"`{m.package}/{m.file}`",
-            laws[m.law].stage,
-            m.law.partition(":")[2].replace("_", " "),
-        ]
-        for m in (*MUTANTS, *PROGRAM)
-    ]
-    head = MUTANT_HEAD.format(n=len(MUTANTS), programs=len(PROGRAM))
-    boxes = [[b.name.replace("_", " "), b.story, b.law.partition(":")[2].replace("_", " ")] for b in BLACK_BOXES]
-    return "".join(
-        (
-            head,
-            _table(["mutant", "what happened", "file", "stage", "killed by"], rows),
-            BOX_HEAD.format(n=len(BLACK_BOXES)),
-            _table(["black box", "what it does", "killed by"], boxes),
-        )
-    )
-
-
-MUTANT_HEAD = """# Mutants
-
-Made by `python docs/tables.py --write`; a test holds it to the code.
-
-{n} copies of the oracle and {programs} of the program that trains, each with one line broken as somebody once broke it.
-A kit that lets one live is not worth its time, so for each a law is named that breaks on it within the `ci` profile;
-`tests/meta/test_mutants.py` tries them all. `python -m pop_ref.conformance.mutants` puts them on trial again, `--every`
-lists all laws that notice.
-
-"""
-
-BOX_HEAD = """
-
-## Behind gsplat's signature
-
-{n} rasterizers that draw one small view rightly and break one argument around it, or two together, judged as any
-`--rasterizer` is: by what they return alone.
-
-"""
 
 TABLES: dict[str, Callable[[], str]] = {
     "rosetta": rosetta,
@@ -388,13 +200,13 @@ TABLES: dict[str, Callable[[], str]] = {
     "reproduction": reproduction,
     "settled": outcome,
     "outcome": outcome,
-    "kit": kit,
-    "teeth": teeth,
-    "scorecards": scorecards,
-    "surfaces": surfaces,
-    "power": power,
-    "reached": reached,
-    "broken": broken_laws,
+    "kit": kit_tables.kit,
+    "teeth": kit_tables.teeth,
+    "scorecards": kit_tables.scorecards,
+    "surfaces": kit_tables.surfaces,
+    "power": kit_tables.power,
+    "reached": kit_tables.reached,
+    "broken": kit_tables.broken_laws,
 }
 
 
@@ -422,10 +234,6 @@ def with_tables(page: Path) -> str:
     return text
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows))
-
-
 def _links(paths: Iterable[Path]) -> str:
     found = dict.fromkeys(paths)
     return ", ".join(f"[{path.name}]({path.relative_to(ROOT).as_posix()})" for path in found) or "–"
@@ -439,10 +247,10 @@ def main(words: list[str]) -> int:
     if "--write" in words:
         for page in PAGES:
             page.write_text(with_tables(page), encoding="utf-8")
-        MUTANT_LIST.write_text(f"{mutants()}\n", encoding="utf-8")
+        MUTANT_LIST.write_text(f"{kit_tables.mutants()}\n", encoding="utf-8")
         return 0
     stale = [page.name for page in PAGES if with_tables(page) != page.read_text(encoding="utf-8")]
-    stale += [MUTANT_LIST.name] if MUTANT_LIST.read_text(encoding="utf-8") != f"{mutants()}\n" else []
+    stale += [MUTANT_LIST.name] if MUTANT_LIST.read_text(encoding="utf-8") != f"{kit_tables.mutants()}\n" else []
     for name in stale:
         print(f"{name}: a table is not what sources and runs say; run 'python docs/tables.py --write'")
     return 1 if stale else 0

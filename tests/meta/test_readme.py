@@ -57,6 +57,7 @@ def load(name: str) -> ModuleType:
 
 
 stages = load("stages")
+kit_tables = load("kit_tables")
 tables = load("tables")
 BOTH_ROOMS = [
     (f"{module}.{name}", reference, fast[name])
@@ -176,16 +177,16 @@ def test_every_option_of_the_kit_exists(line: str) -> None:
 
 
 def test_the_list_of_mutants_is_current() -> None:
-    assert f"{tables.mutants()}\n" == tables.MUTANT_LIST.read_text(encoding="utf-8"), (
+    assert f"{kit_tables.mutants()}\n" == kit_tables.MUTANT_LIST.read_text(encoding="utf-8"), (
         "run 'python docs/tables.py --write'"
     )
 
 
-@pytest.mark.parametrize("file", sorted({file for file, _ in tables.JUDGED.values()}))
+@pytest.mark.parametrize("file", sorted({file for file, _ in kit_tables.JUDGED.values()}))
 def test_every_law_stands_on_every_scorecard(file: str) -> None:
     expected = {(law.stage, law.name) for law in every_law().values()}
-    told = tables.card(file)
-    assert set(told["laws"]) == {backend for name, backend in tables.JUDGED.values() if name == file}
+    told = kit_tables.card(file)
+    assert set(told["laws"]) == {backend for name, backend in kit_tables.JUDGED.values() if name == file}
     for backend, stages_of in told["laws"].items():
         found = {(stage, law) for stage, laws in stages_of.items() for law in outcomes(laws)}
         assert found == expected, f"{file}: judge {backend} again"
@@ -198,7 +199,7 @@ def test_every_law_stands_on_every_scorecard(file: str) -> None:
 
 def test_our_own_backends_break_no_law() -> None:
     for file in ("pop_fast.json", "host_mirror.json"):
-        for column in tables.card(file)["summary"].values():
+        for column in kit_tables.card(file)["summary"].values():
             assert sum(count["failed"] for count in column.values()) == 0
             assert sum(count["passed"] for count in column.values()) > 100
 
