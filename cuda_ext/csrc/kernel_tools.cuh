@@ -58,13 +58,6 @@ __device__ __forceinline__ WarpTile warp_tile(const TileLists& lists, int index)
 __device__ __forceinline__ int lane_x(int lane) { return (lane & 7) + (lane & 8); }
 __device__ __forceinline__ int lane_y(int lane) { return (lane / 16) * COLUMN_ROWS; }
 
-// The lane, as a number that the compiler knows nothing of: it then asks for a bit of it with one instruction, where it
-// takes three for a bit of threadIdx. All lanes of the warp must call it.
-__device__ __forceinline__ int opaque_lane() {
-    const int lane = threadIdx.x & (WARP - 1);
-    return __shfl_sync(FULL_WARP, lane, lane);
-}
-
 // Keep a number that all lanes share in a register, where the compiler would make it anew at every use: it cannot see
 // through a shuffle. All lanes of the warp must call it.
 template <class T>

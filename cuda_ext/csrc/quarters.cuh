@@ -1,7 +1,8 @@
 // The four quarters of a warp's tile, 8 x 4 pixels to eight lanes each. A splat of the tile's list that does not reach
 // a quarter is left out there: every quarter goes through its own queue of a batch, all four in the same instructions,
-// so that a warp makes as many visits as the longest queue has splats. In the case that times are predicted for these
-// are 72 for 100 entries, and to look which quarters a splat reaches costs about five instructions of an entry's 150.
+// so that a warp makes as many visits as the longest queue has splats, rounded up to four. In the case that times are
+// predicted for these are 77 for 100 entries, and queues take about 8 of the 79 instructions an entry of the forward
+// pass. Both are counted by benchmarks/gpu_visits.py and `make sass`.
 //
 // What is left out blends nothing and has no gradient, so that no bit depends on it.
 #pragma once
