@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from paper_repro.jobs import Job
 from paper_repro.published import file_hash, ply_of
-from paper_repro.record import BINS, LPIPS_VARIANTS, Result, run_id, settings_hash
+from paper_repro.record import BINS, LPIPS_VARIANTS, UNTIMED, Result, run_id, settings_hash
 from pop_fast.errors import PopError
 from pop_fast.io.read_back import read_arrays, read_json
 from pop_fast.machine import processor_kind
@@ -123,6 +123,7 @@ def _collected(job: Job, folder: Path, files: Mapping[str, str]) -> Result:
     stats, before = final_stats(folder, last), final_stats(folder, last, "train")
     said = read_json(folder / BESIDE, _AGAIN)
     data_hash, commit = said.pop("data_hash"), said.pop("commit")
+    untimed = said.pop("untimed", False)
     settings = _settings(config)
     config_hash = settings_hash(settings)
     n, size = stats["num_GS"], job.row.bytes_per_gaussian
@@ -146,7 +147,7 @@ def _collected(job: Job, folder: Path, files: Mapping[str, str]) -> Result:
             **said,
             "ssim": _SSIM,
             "lpips": "; ".join(_LPIPS[name] for name in variants) or "not measured",
-            "timing": _TIMING,
+            "timing": _TIMING + (UNTIMED if untimed else ""),
             "checkpoint_bytes_per_gaussian": size,
         },
         schedule=settings,

@@ -19,11 +19,13 @@ from typing import Any, Final
 from paper_repro.scales import SCALES
 from pop_fast.errors import PopError
 
-__all__ = ["BINS", "LPIPS_VARIANTS", "SCHEMA", "Result", "from_line", "run_id", "settings_hash", "to_line"]
+__all__ = ["BINS", "LPIPS_VARIANTS", "SCHEMA", "UNTIMED", "Result", "from_line", "run_id", "settings_hash", "to_line"]
 
 SCHEMA: Final = 2
 LPIPS_VARIANTS: Final = ("vgg_01", "alex_norm", "alex_01")
 BINS: Final = 50  # of the opacity histogram over [0, 1]
+# what the timing of a run ends with that had not its machine to itself
+UNTIMED: Final = "; beside other trainings, so not compared"
 
 # names that cannot be identifiers, by the identifier that stands for them here
 _KEYS: Final = {"opacity_below_01": "opacity_below_0.1", "opacity_above_09": "opacity_above_0.9"}
@@ -135,7 +137,8 @@ class Result:
     @property
     def is_timed(self) -> bool:
         """Whether that can be compared: a CPU's by the clock cannot, since it may have done other work."""
-        return "cpu" in self.seconds or ", " in self.machine
+        alone = not self.protocol["timing"].endswith(UNTIMED)
+        return alone and ("cpu" in self.seconds or ", " in self.machine)
 
     @property
     def trained_on(self) -> str:

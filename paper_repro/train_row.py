@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
+import os
 import shutil
 import subprocess
 import time
@@ -71,6 +72,7 @@ class Options:
         again: train a row that is finished again, and replace its result.
         keep_ply: keep the Gaussians in the work folder.
         keep_checkpoints: keep the checkpoints too.
+        untimed: its seconds are not compared, because the machine has other work meanwhile.
         quiet: no progress bar.
     """
 
@@ -87,6 +89,7 @@ class Options:
     again: bool = False
     keep_ply: bool = False
     keep_checkpoints: bool = False
+    untimed: bool = False
     quiet: bool = False
 
 
@@ -161,7 +164,10 @@ def capture_folder(scene: PaperScene, options: Options) -> Path:
 
 
 def commit() -> str | None:
-    """Return the commit of the clone that this runs from, "-dirty" where its files differ from it; None outside one."""
+    """Return the commit of the clone that this runs from, "-dirty" where its files differ from it.
+
+    Outside a clone it is what the environment says (`POP_COMMIT`, as for `cuda_ext.gpu_check`), else None.
+    """
     here = Path(__file__).resolve().parents[1]
     git = ["git", "-C", str(here)]
     try:
@@ -174,7 +180,7 @@ def commit() -> str | None:
             check=True,
         )
     except (OSError, subprocess.CalledProcessError):
-        return None
+        return os.environ.get("POP_COMMIT") or None
     return asked.stdout.strip() + ("-dirty" if changed.stdout.strip() else "")
 
 
@@ -228,6 +234,7 @@ def _train(job: Job, options: Options, config: TrainConfig) -> None:
     keep_freed_memory()
     print(f"{job}: {capture.source}; {config.max_steps:,} steps; {chosen}", flush=True)
     said = {"commit": program, **state_of_data(job, config, capture), **({} if base is None else {"base": base})}
+    said |= {"untimed": True} if options.untimed else {}
     beside = {BESIDE: json.dumps(said, indent=2) + "\n"}
     more = {"resume": True, "loading_seconds": seconds, "beside": beside}
     ProbedRun(config, capture, every=max(config.log_every, spacing(config.max_steps)), **more).run()

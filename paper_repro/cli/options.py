@@ -61,6 +61,8 @@ def add_training(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(f"--lpips-{net}", nargs="+", default=[], metavar="FILE", help=note)
     parser.add_argument("--keep-ply", action="store_true", help="keep the Gaussians of finished rows in --work")
     parser.add_argument("--keep-checkpoints", action="store_true", help="keep their checkpoints too")
+    note = "the machine has other work meanwhile: seconds are kept with the result, and compared with no other's"
+    parser.add_argument("--untimed", action="store_true", help=note)
 
 
 def training_words(args: argparse.Namespace) -> list[str]:
@@ -81,6 +83,6 @@ def training_words(args: argparse.Namespace) -> list[str]:
     for name in ("lpips_vgg", "lpips_alex"):
         files = [str(Path(file).absolute()) for file in getattr(args, name)]
         words += [f"--{name.replace('_', '-')}", *files] if files else []
-    for name in ("keep_ply", "keep_checkpoints"):
+    for name in ("keep_ply", "keep_checkpoints", "untimed"):
         words += [f"--{name.replace('_', '-')}"] if getattr(args, name) else []
     return words

@@ -109,7 +109,7 @@ def _ready(missing: Sequence[Job], args: argparse.Namespace) -> bool:
 def _options(args: argparse.Namespace) -> dict[str, Any]:
     names = (
         *("data", "results", "work", "published", "threads", "backend", "checkpoint_every", "log_every"),
-        *("keep_ply", "keep_checkpoints"),
+        *("keep_ply", "keep_checkpoints", "untimed"),
     )
     return {
         **{name: getattr(args, name) for name in names},
