@@ -1,4 +1,4 @@
-"""What kernels and ranks should take, before any card has run them: the three CUDA tables of NOTES.md.
+"""What kernels and ranks should take, and what a card has measured of it: the CUDA tables of NOTES.md.
 
     python benchmarks/gpu_predictions.py            print them
     python benchmarks/gpu_predictions.py --write    put them into NOTES.md, between their marks
@@ -9,7 +9,10 @@ of `gpu_floors`, for one case on an H200:
 
     predicted = the largest time of `gpu_floors` / USED + NODE * nodes of the graph
 
-The third is `cuda_ext.training.batch_step.step_bytes`, which a test holds to what emulated ranks count.
+Beside it stands what `gpu_check` has measured (`results/gpu/kernels.json`), with the floor on that card. The third
+compares with gsplat (`results/gpu/gsplat.json`), the fourth is what the hardware's counters say of every kernel
+(`results/gpu/counters.json`). The last is `cuda_ext.training.batch_step.step_bytes`, which a test holds to what
+emulated ranks count.
 """
 
 from __future__ import annotations
@@ -19,11 +22,12 @@ from pathlib import Path
 from typing import Any
 
 from gpu_floors import SASS, Card, Loads, floors
-from record import with_table
+from record import read_json, with_table
 
 from cuda_ext.training.batch_step import step_bytes
 
 NOTES = Path(__file__).resolve().parent / "NOTES.md"
+MEASURED = NOTES.parent / "results" / "gpu"
 # 132 processors of 128 lanes at the clock that an H200 holds under load; the bandwidth that a copy reaches on it
 H200 = Card(4.2e12, 132 * 128 * 1.755e9, 1.755e9)
 # 270,000 Gaussians, 160,000 of them visible, 1.6 MP, 120 evaluated and 35 contributing pairs a pixel; the longest list
@@ -48,6 +52,7 @@ NODES = {
 # Gaussians and processes, each of which draws one view of a step; steps between two changes of the Gaussians
 TOGETHER = ((270_000, 8), (3_000_000, 8), (40_000_000, 64))
 BETWEEN = 100
+LEAST_SHOWN = 10.0  # us
 # of the blend, besides those of memory and issue
 OTHER_TIMES = ("half rate", "shared memory", "longest list")
 # the instantiations that training takes, and what else is compared with them
@@ -100,8 +105,12 @@ def machine_code(sass: dict[str, Any]) -> str:
 
 
 def predictions() -> str:
-    """Make the table of predicted times."""
-    head = ["step", "bound by", "floor at full use, ms", f"{', '.join(OTHER_TIMES)}, ms", "predicted, ms", "measured"]
+    """Make the table of predicted times, and what the card of the last check took."""
+    found = read_json(MEASURED / "kernels.json")
+    case = found["cases"]["270k_1.6MP"]
+    card, by_kernel = found["gpu"], case["pixel_parallel_by_kernel"]
+    head = ["step", "bound by", "floor at full use, ms", f"{', '.join(OTHER_TIMES)}, ms", "predicted, ms"]
+    head += [f"measured, {card}, ms", "its floor there, ms"]
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     total = least = 0.0
     known = floors(CASE, H200)
@@ -110,10 +119,50 @@ def predictions() -> str:
         predicted = entry["floor_ms"] / USED + NODE * nodes
         bound = "latency" if NODE * nodes > predicted / 2 else entry["bound"]
         others = [f"{entry['times_ms'][key]:.3f}" for key in OTHER_TIMES if key in entry["times_ms"]]
-        cells = [f"`{name}`", bound, f"{entry['floor_ms']:.3f}", ", ".join(others), f"{predicted:.3f}", "not run"]
+        cells = [f"`{name}`", bound, f"{entry['floor_ms']:.3f}", ", ".join(others), f"{predicted:.3f}"]
+        measured = by_kernel["kernels"][name]
+        cells += [f"{measured['ms']:.3f}", f"{measured['floor_ms']:.3f}" if "floor_ms" in measured else ""]
         lines.append(f"| {' | '.join(cells)} |")
         total, least = total + predicted, least + entry["floor_ms"]
-    lines.append(f"| whole step, {sum(NODES.values())} graph nodes | | {least:.2f} | | {total:.2f} | not run |")
+    step = case["pixel_parallel"]["step_with_pop_ms"]
+    lines.append(
+        f"| whole step, {sum(NODES.values())} graph nodes | | {least:.2f} | | {total:.2f} | {step:.2f} | "
+        f"{by_kernel['floor_ms']:.2f} |"
+    )
+    return "\n".join(lines)
+
+
+def beside_gsplat() -> str:
+    """Make the table of this project's times and gsplat's, of one process on one card."""
+    found = read_json(MEASURED / "gsplat.json")
+    head = "| case | | kernels, ms | gsplat's kernels, ms | | with Python and waiting, ms | gsplat, ms | |"
+    lines = [head, "|---|---|---|---|---|---|---|---|"]
+    names = {"forward": "forward", "forward_backward": "forward and backward", "step": "training step"}
+    for case, both in found["cases"].items():
+        for key, title in names.items():
+            sums = [both[side][f"{key}_kernels"]["kernels_ms"] for side in ("ours", "gsplat")]
+            walls = [both[side][f"{key}_ms"] for side in ("ours", "gsplat")]
+            cells = [f"{ours:.2f} | {theirs:.2f} | {theirs / ours:.2f} times" for ours, theirs in (sums, walls)]
+            lines.append(f"| `{case}` | {title} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def counters() -> str:
+    """Make the table of the hardware's counters of the kernels that take 10 us or more."""
+    found = read_json(MEASURED / "counters.json")
+    head = "| kernel | us | instructions, millions | issue slots used | warps there | what its warps wait for most |"
+    lines = [head, "|---|---|---|---|---|---|"]
+    for kernel in found["kernels"]:
+        if kernel["us"] < LEAST_SHOWN:
+            continue
+        name = kernel["kernel"].removeprefix("void ").removeprefix("pop::")
+        # a sort's arguments are lines of policy
+        name = f"cub::{name.split('<')[0]}" if name.startswith("radix_sort::") else name
+        waits = [f"{what.replace('_', ' ')} {share}" for what, share in kernel["warps_stalled_per_issue"].items()]
+        waits = [words for words in waits if not words.startswith(("selected", "not selected"))]
+        shares = f"{kernel['issue_percent']} % | {kernel['warps_percent']} %"
+        millions = kernel["instructions"] / 1e6
+        lines.append(f"| `{name}` | {kernel['us']:.0f} | {millions:.1f} | {shares} | {', '.join(waits[:2])} |")
     return "\n".join(lines)
 
 
@@ -133,6 +182,7 @@ def exchanged() -> str:
 def with_tables(text: str) -> str:
     """Put the tables between their marks."""
     tables = {"machine code": machine_code(SASS), "predictions": predictions(), "ranks": exchanged()}
+    tables |= {"beside gsplat": beside_gsplat(), "counters": counters()}
     for name, table in tables.items():
         text = with_table(text, name, table)
     return text
@@ -148,7 +198,7 @@ def main(words: list[str]) -> int:
             print("NOTES.md: the CUDA tables are not what the counts give; run gpu_predictions.py --write")
             return 1
     else:
-        print(machine_code(SASS), predictions(), exchanged(), sep="\n\n")
+        print(machine_code(SASS), predictions(), beside_gsplat(), counters(), exchanged(), sep="\n\n")
     return 0
 
 

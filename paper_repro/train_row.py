@@ -164,10 +164,12 @@ def capture_folder(scene: PaperScene, options: Options) -> Path:
 
 
 def commit() -> str | None:
-    """Return the commit of the clone that this runs from, "-dirty" where its files differ from it.
+    """Return the commit of the clone that this runs from, "-dirty" where its files differ from it; None outside one.
 
-    Outside a clone it is what the environment says (`POP_COMMIT`, as for `cuda_ext.gpu_check`), else None.
+    What the environment says comes first (`POP_COMMIT`, as for `cuda_ext.gpu_check`): files that were sent to a node.
     """
+    if os.environ.get("POP_COMMIT"):
+        return os.environ["POP_COMMIT"]
     here = Path(__file__).resolve().parents[1]
     git = ["git", "-C", str(here)]
     try:
@@ -180,7 +182,7 @@ def commit() -> str | None:
             check=True,
         )
     except (OSError, subprocess.CalledProcessError):
-        return os.environ.get("POP_COMMIT") or None
+        return None
     return asked.stdout.strip() + ("-dirty" if changed.stdout.strip() else "")
 
 

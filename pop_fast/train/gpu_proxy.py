@@ -76,6 +76,11 @@ def translate_oom() -> Iterator[None]:
         raise PopError(f"{error}; {_LESS}") from error
     except torch.cuda.OutOfMemoryError as error:
         raise PopError(f"the GPU has no room ({str(error).split('. ')[0]}); {_LESS}") from error
+    # what is asked of the driver itself, a stream for one, is told as any other failed call
+    except torch.AcceleratorError as error:
+        if "out of memory" not in str(error):
+            raise
+        raise PopError(f"the GPU has no room ({str(error).splitlines()[0]}); {_LESS}") from error
 
 
 def renderer(name: str) -> tuple[Renderer, str | None]:

@@ -164,6 +164,13 @@ def test_images_and_what_is_told_of_them_come_back_from_the_device(tmp_path):
 def test_other_errors_keep_their_words():
     with pytest.raises(RuntimeError, match="a launch failed"), translate_oom():
         raise RuntimeError("a launch failed")
+    with pytest.raises(torch.AcceleratorError, match="an illegal address"), translate_oom():
+        raise torch.AcceleratorError("CUDA error: an illegal address")
+
+
+def test_a_driver_without_room_is_told_in_a_sentence():
+    with pytest.raises(PopError, match=r"the GPU has no room .*out of memory.*; use smaller images"), translate_oom():
+        raise torch.AcceleratorError("CUDA error: out of memory\nCompile with `TORCH_USE_CUDA_DSA`")
 
 
 # What a run changes in its process: settings of torch that are put back, memory that is kept.

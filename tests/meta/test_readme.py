@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib
 import importlib.util
+import json
 import re
 import runpy
 import shlex
@@ -448,3 +449,19 @@ def test_chapters_lead_back_to_the_site_and_have_been_built(tmp_path: Path, monk
     assert b'<main><nav><a href="../index.html">' in made["learn/index.html"]
     assert b'<a href="../../learn.html">Learn</a></nav><h1>It' in made["learn/notebooks/index.html"]
     assert made["learn/book.pdf"] == b"%PDF-\xff"
+
+
+def test_the_ratios_to_gsplat_on_a_gpu_are_those_of_the_run_that_is_kept():
+    kept = ROOT / "benchmarks" / "results" / "gpu"
+    both = json.loads((kept / "gsplat.json").read_text(encoding="utf-8"))["cases"]
+    ratios = sorted(case["ratios"]["step"] for case in both.values())
+    assert f"a training step {ratios[0]:.1f} to {ratios[-1]:.1f} times as fast as gsplat's on one H100" in README
+    kernels = json.loads((kept / "kernels.json").read_text(encoding="utf-8"))
+    step = kernels["cases"]["270k_1.6MP"]["pixel_parallel"]["step_with_pop_ms"]
+    page = " ".join((ROOT / "docs" / "cuda.md").read_text(encoding="utf-8").split())
+    assert "H100" in kernels["gpu"]
+    assert f"takes {step:.2f} ms, {both['270k_1.6MP']['ratios']['step']:.1f} times as fast as gsplat's" in page
+    for job in (1, 2):
+        stages = json.loads((kept / f"check_{job}.json").read_text(encoding="utf-8"))["stages"]
+        for name in {"smoke", "laws"} & set(stages):
+            assert stages[name]["tests"]["failed"] == 0 < stages[name]["tests"]["passed"]
