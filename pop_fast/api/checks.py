@@ -1,13 +1,13 @@
 """Checks of what `rasterization` is given: every wrong input is named, with its index, before anything is drawn.
 
-Shapes, types and places are read at once. What only values can tell is asked in one go, so that a GPU
-is waited for once.
+Shapes, types and places are read at once. What only values can tell is asked in a pass or two over each tensor, and of
+a GPU in two copies: the cameras, and what was made of everything else.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from numbers import Integral
 from typing import Any, Final
@@ -108,11 +108,21 @@ def _check_profile(profile: Profile) -> None:
 
 @dataclass(frozen=True)
 class _Rule:
-    """A tensor, whether any entry or row of it may be bad, which are, and what it must be."""
+    """A rule of a tensor's values.
+
+    Attributes:
+        name: of the tensor.
+        tensor: it.
+        probe: a few numbers of it, each made in a pass or two.
+        suspicious: whether these numbers leave room for a bad entry; only then it is looked at closely.
+        bad: which entries or rows are.
+        words: what it must be.
+    """
 
     name: str
     tensor: Tensor
-    quick: Callable[[], Tensor]
+    probe: Callable[[], Sequence[Tensor]]
+    suspicious: Callable[..., bool]
     bad: Callable[[], Tensor]
     words: str
 
@@ -150,10 +160,14 @@ class Checks:
             raise ValueError(f"{name} has dtype {tensor.dtype}; all tensors must {rule}")
         if tuple(tensor.shape) != shape:
             raise ValueError(f"{name} has shape {list(tensor.shape)}; it must be {list(shape)}")
-        t = tensor.detach()
-        # a sum is one fast pass, and only a suspicious one is looked at closely
-        self._rule(name, t, lambda: ~torch.isfinite(t.sum()), lambda: ~torch.isfinite(t), "must be finite")
         return tensor
+
+    def finite(self, name: str, tensor: Tensor) -> Tensor:
+        """Ask in `values` that a tensor is finite, and return it without its gradient."""
+        t = tensor.detach()
+        # a sum is one fast pass
+        self._rule(name, t, lambda: (t.sum(),), _not_finite, lambda: ~torch.isfinite(t), "must be finite")
+        return t
 
     def gaussians(
         self,
@@ -171,27 +185,32 @@ class Checks:
         if means.dim() < 2 or means.shape[-1] != 3:
             raise ValueError(f"means has shape {list(means.shape)}; it must be [..., N, 3]")
         batch, n = tuple(means.shape[:-2]), means.shape[-2]
-        self.tensor("means", means, tuple(means.shape))
-        self._opacities(self.tensor("opacities", opacities, (*batch, n)).detach())
+        self.finite("means", self.tensor("means", means, tuple(means.shape)))
+        self._opacities(self.finite("opacities", self.tensor("opacities", opacities, (*batch, n))))
         if covars is not None:
-            self.tensor("covars", covars, (*batch, n, 3, 3))
+            self.finite("covars", self.tensor("covars", covars, (*batch, n, 3, 3)))
         else:
-            self._quats(self.tensor("quats", quats, (*batch, n, 4)).detach())
-            self._scales(self.tensor("scales", scales, (*batch, n, 3)).detach())
+            self._quats(self.finite("quats", self.tensor("quats", quats, (*batch, n, 4))))
+            self._scales(self.finite("scales", self.tensor("scales", scales, (*batch, n, 3))))
         return batch
 
     def _opacities(self, o: Tensor) -> None:
-        self._each("opacities", o, lambda: ~((o >= 0.0) & (o <= 1.0)), "must be in [0, 1]")
+        def outside(least: float, most: float) -> bool:
+            return not (least >= 0.0 and most <= 1.0)
+
+        bad = "must be in [0, 1]"
+        self._rule("opacities", o, lambda: torch.aminmax(o), outside, lambda: ~((o >= 0.0) & (o <= 1.0)), bad)
 
     def _quats(self, q: Tensor) -> None:
-        def zero() -> Tensor:
-            return q.abs().amax(-1) == 0.0
+        def shortest() -> tuple[Tensor]:
+            # of a tiny quaternion it may be rounded to 0, which is looked at closely
+            return (torch.linalg.vector_norm(q, dim=-1).amin(),)
 
-        self._each("quats", q, zero, "must have a norm > 0")
+        self._rule("quats", q, shortest, _zero, lambda: q.abs().amax(-1) == 0.0, "must have a norm > 0")
 
     def _scales(self, s: Tensor) -> None:
         words = "must be >= 0; give standard deviations, not logarithms"
-        self._rule("scales", s, lambda: s.amin() < 0.0, lambda: s < 0.0, words)
+        self._rule("scales", s, lambda: (s.amin(),), _negative, lambda: s < 0.0, words)
 
     def cameras(
         self, viewmats: Tensor, Ks: Tensor, width: int, height: int, tile_size: int, batch: tuple[int, ...]
@@ -204,9 +223,12 @@ class Checks:
         if viewmats.dim() < 3:
             raise ValueError(f"viewmats has shape {list(viewmats.shape)}; it must be [..., C, 4, 4]")
         n = viewmats.shape[-3]
-        V = self.tensor("viewmats", viewmats, (*batch, n, 4, 4)).detach()
-        K = self.tensor("Ks", Ks, (*batch, n, 3, 3)).detach()
+        given = self.tensor("viewmats", viewmats, (*batch, n, 4, 4)), self.tensor("Ks", Ks, (*batch, n, 3, 3))
         check_sizes(width, height, tile_size)
+        # a few numbers, of which every question is a launch on a GPU and next to nothing here
+        V, K = _on_host(*given)
+        self.finite("viewmats", V)
+        self.finite("Ks", K)
         rows = "must be rigid: an orthonormal 3x3 rotation with determinant +1"
         self._each("viewmats", V, lambda: _not_rigid(V[..., :3, :3]), rows)
         last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=V.dtype, device=V.device)
@@ -234,7 +256,9 @@ class Checks:
                 raise ValueError(
                     f"colors has shape {list(colors.shape)}; sh_degree={sh_degree} needs [..., N, >={need}, 3]"
                 )
-        self.tensor("colors", colors, per_camera if tuple(colors.shape) == per_camera else shared)
+        self.finite(
+            "colors", self.tensor("colors", colors, per_camera if tuple(colors.shape) == per_camera else shared)
+        )
         return tuple(colors.shape) == per_camera
 
     def values(self) -> None:
@@ -243,21 +267,31 @@ class Checks:
         Raises:
             ValueError: names the tensor and the index.
         """
-        suspicious = torch.stack([rule.quick() for rule in self._rules]).tolist()
-        for asked, rule in zip(suspicious, self._rules, strict=True):
-            found = rule.bad().nonzero() if asked else None
+        probes = [rule.probe() for rule in self._rules]
+        # what is on a GPU comes in one copy
+        there = [number for numbers in probes for number in numbers if number.device.type != "cpu"]
+        read = iter(torch.stack(there).tolist() if there else ())
+        for numbers, rule in zip(probes, self._rules, strict=True):
+            here = [number.item() if number.device.type == "cpu" else next(read) for number in numbers]
+            found = rule.bad().nonzero() if rule.suspicious(*here) else None
             if found is not None and len(found):
                 index = found[0].tolist()
                 raise ValueError(f"{rule.name}{index} is {rule.tensor[tuple(index)].tolist()}; it {rule.words}")
 
     def _each(self, name: str, tensor: Tensor, bad: Callable[[], Tensor], words: str) -> None:
-        self._rule(name, tensor, lambda: bad().any(), bad, words)
+        self._rule(name, tensor, lambda: (bad().any(),), bool, bad, words)
 
     def _rule(
-        self, name: str, tensor: Tensor, quick: Callable[[], Tensor], bad: Callable[[], Tensor], words: str
+        self,
+        name: str,
+        tensor: Tensor,
+        probe: Callable[[], Sequence[Tensor]],
+        suspicious: Callable[..., bool],
+        bad: Callable[[], Tensor],
+        words: str,
     ) -> None:
         if tensor.numel():
-            self._rules.append(_Rule(name, tensor, quick, bad, words))
+            self._rules.append(_Rule(name, tensor, probe, suspicious, bad, words))
 
 
 def check_given(**tensors: Any) -> None:
@@ -283,6 +317,28 @@ def check_sizes(width: int, height: int, tile_size: int) -> None:
             raise ValueError(f"{name} is {value!r}; it must be a whole number >= 1")
     if tile_size > LARGEST_TILE:
         raise ValueError(f"tile_size is {tile_size}; it must be <= {LARGEST_TILE}")
+
+
+def _not_finite(total: float) -> bool:
+    return not math.isfinite(total)
+
+
+def _zero(least: float) -> bool:
+    return least == 0.0
+
+
+def _negative(least: float) -> bool:
+    return least < 0.0
+
+
+def _on_host(*tensors: Tensor) -> list[Tensor]:
+    """Return small tensors of one device and type on the CPU, without their gradients, in one copy."""
+    own = [tensor.detach() for tensor in tensors]
+    if own[0].device.type == "cpu":
+        return own
+    joined = torch.cat([tensor.reshape(-1) for tensor in own]).cpu()
+    parts = joined.split([tensor.numel() for tensor in own])
+    return [part.reshape(tensor.shape) for part, tensor in zip(parts, own, strict=True)]
 
 
 def _not_rigid(rotations: Tensor) -> Tensor:

@@ -157,7 +157,8 @@ def rasterization(
     n_cameras = checks.cameras(viewmats, Ks, width, height, tile_size, batch)
     per_camera = checks.colors(colors, sh_degree, batch, n_cameras, means.shape[-2])
     if backgrounds is not None:
-        checks.tensor("backgrounds", backgrounds, (*batch, n_cameras, 3 if sh_degree is not None else colors.shape[-1]))
+        shape = (*batch, n_cameras, 3 if sh_degree is not None else colors.shape[-1])
+        checks.finite("backgrounds", checks.tensor("backgrounds", backgrounds, shape))
     checks.values()
     n, n_scenes = means.shape[-2], math.prod(batch)
     n_images = n_scenes * n_cameras

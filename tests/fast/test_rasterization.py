@@ -12,8 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import torch.utils._pytree
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
+from pop_fast.api.checks import Checks
 from pop_fast.api.meta import RenderMeta
 from pop_fast.api.rasterize import rasterization as program
 from pop_fast.api.registry import backend_names, fastest_backend, get_backend
@@ -488,3 +491,45 @@ def test_numbers_with_which_nothing_can_be_drawn_raise(backend: str, argument: d
     match = "radius_clip=" if expected is NotImplementedError else re.escape(said)
     with pytest.raises(expected, match=match):
         program(**scene(), **cameras(), **argument, backend=backend)
+
+
+class Passes(TorchDispatchMode):
+    """Counts operations that read a tensor of at least so many numbers; what only names one anew reads nothing."""
+
+    def __init__(self, least: int) -> None:
+        super().__init__()
+        self.least, self.found = least, list[str]()
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        given = [value for value in torch.utils._pytree.tree_leaves((args, kwargs)) if isinstance(value, torch.Tensor)]
+        made = function(*args, **(kwargs or {}))
+        seen = {value.untyped_storage().data_ptr() for value in given}
+        anew = isinstance(made, torch.Tensor) and made.untyped_storage().data_ptr() in seen
+        if not anew and max((value.numel() for value in given), default=0) >= self.least:
+            self.found.append(str(function))
+        return made
+
+
+def test_values_are_asked_for_in_a_pass_or_two_a_tensor(monkeypatch: pytest.MonkeyPatch) -> None:
+    # on a GPU every one is a launch, and they were three quarters of a plain rasterization's
+    passes = Passes(least=200)
+    values = Checks.values
+
+    def counted(checks: Checks) -> None:
+        with passes:
+            values(checks)
+
+    monkeypatch.setattr(Checks, "values", counted)
+    g = torch.Generator().manual_seed(2)
+    means = torch.randn(200, 3, generator=g) + torch.tensor([0.0, 0.0, 5.0])
+    rows = (torch.randn(200, 4, generator=g), torch.full((200, 3), 0.1), torch.full((200,), 0.5))
+    shot = cameras(dtype=torch.float32)
+    program(means, *rows, torch.rand(200, 3, generator=g), **shot, backend="fast")
+    assert sorted(passes.found) == sorted(
+        [
+            *5 * ["aten.sum.default"],
+            "aten.aminmax.default",
+            "aten.linalg_vector_norm.default",
+            *2 * ["aten.amin.default"],
+        ]
+    )
