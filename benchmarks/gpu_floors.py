@@ -1,10 +1,10 @@
 """What each kernel of a training step has to do at least: bytes, instructions, and the time that a card needs for them.
 
-The blend's instructions are counted in its machine code for sm_90 (`results/sass.json`), the loss's are estimated from
-its loops there. A floor is the largest of five times: for the bytes, at the bandwidth that this card copies with; for
-the instructions, at its full issue rate; for comparisons, selections and integers of the blend, which go through a pipe
-of half that rate; for its accesses of shared memory, 128 bytes a cycle; and for the longest list, whose warp issues one
-instruction a cycle when the others are done.
+The instructions of the blend and of the tiles that are tried are counted in the machine code for sm_90
+(`results/sass.json`), the loss's are estimated from its loops there. A floor is the largest of five times: for the
+bytes, at the bandwidth that this card copies with; for the instructions, at its full issue rate; for comparisons,
+selections and integers of the blend, which go through a pipe of half that rate; for its accesses of shared memory, 128
+bytes a cycle; and for the longest list, whose warp issues one instruction a cycle when the others are done.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ WARP, SCHEDULERS = 32, 4
 SASS = json.loads((Path(__file__).resolve().parent / "results" / "sass.json").read_text(encoding="utf-8"))
 # what a POP step launches
 FORWARD, BACKWARD = "blend_forward_kernel<3, 1, false>", "columns_kernel<3, false, false, false>"
+COUNT, EMIT = "count_kernel", "emit_kernel<unsigned short>"
 BLENDS = {"blend_forward": FORWARD, "blend_backward": BACKWARD}
 # cycles of shared memory: of a visit, three pieces of 16 bytes for each of four quarters, and going back a lane's 24
 # bytes of sums; of eight visits, these again and a row of 48 bytes, read and written; of a batch, 48 bytes a lane in
@@ -48,6 +49,7 @@ class Loads:
         pixels: of the image.
         longest: entries of one tile's list up to where its last pixel stops, at most.
         visits, eights, batches: of the blend's warps, as `gpu_visits` counts them.
+        tried: tiles in the splats' rectangles.
     """
 
     gaussians: int
@@ -60,6 +62,7 @@ class Loads:
     visits: int
     eights: int
     batches: int
+    tried: int
 
 
 @dataclass(frozen=True)
@@ -125,9 +128,9 @@ def work(loads: Loads) -> dict[str, tuple[float, float]]:
         # 36 bytes for the lists, and a packed splat where one is seen
         "project": (4 * (GEOMETRY * (n - seen) + PARAMETERS * seen) + 36 * n + ROW * seen, 0.0),
         # four passes of an 8-byte pair over 32-bit depths, extents read, counts written
-        "count_instances": ((4 * 16 + ROW + 8) * n, 0.0),
+        "count_instances": ((4 * 16 + ROW + 8) * n, WARP * issued_per(COUNT, "32 tiles")[0] * loads.tried / WARP),
         # emitted once, two passes of a 6-byte pair over 16-bit tiles, ids and slots written
-        "make_tile_lists": ((6 + 2 * 12 + 12) * entries, 0.0),
+        "make_tile_lists": ((6 + 2 * 12 + 12) * entries, WARP * issued_per(EMIT, "32 tiles")[0] * loads.tried / WARP),
         "blend_forward": ((ROW + 4) * entries + 20 * pixels, WARP * blend_work("blend_forward", loads)[0]),
         # a pixel and channel: 215 for its window, 162 for its gradient
         "photometric": (8 * 12 * pixels, (215.0 + 162.0) * 3 * pixels),

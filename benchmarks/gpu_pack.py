@@ -1,6 +1,7 @@
 """Make what a bare GPU node cannot fetch: trained scenes as npz, shrunk captures, wheels, and a list of all of it.
 
     python benchmarks/gpu_pack.py FOLDER [--runs out/garden_pop ...] [--captures data/garden ...] [--pixels 400000]
+                                         [--whole data/bear ...]
 
 `python3 -m cuda_ext.gpu_check --pack FOLDER` runs this; its help says what the folder holds.
 """
@@ -15,6 +16,7 @@ import platform
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -93,6 +95,18 @@ def pack_capture(source: Path, folder: Path, pixels: float) -> Path:
     return target
 
 
+def keep_capture(source: Path, folder: Path) -> Path:
+    """Copy a capture as it is, of which rows of the paper's tables can be trained.
+
+    Raises:
+        CaptureError: it cannot be read.
+    """
+    load_capture(source)
+    target = folder / source.resolve().name
+    shutil.copytree(source, target)
+    return target
+
+
 def _shrunk(view: View, pixels: float) -> tuple[np.ndarray, np.ndarray]:
     by = min(1.0, math.sqrt(pixels / (view.width * view.height)))
     size = (max(round(by * view.width), 1), max(round(by * view.height), 1))
@@ -161,6 +175,7 @@ def main() -> int:
     parser.add_argument("folder", type=Path, help="is made anew; it must not hold anything else")
     parser.add_argument("--runs", nargs="*", type=Path, default=[], help="results of `pop train`")
     parser.add_argument("--captures", nargs="*", type=Path, default=[], help="captures to train on")
+    parser.add_argument("--whole", nargs="*", type=Path, default=[], help="captures that keep their bytes, for rows")
     parser.add_argument("--pixels", type=float, default=4e5, help="of a packed photograph, at most")
     parser.add_argument("--no-wheels", action="store_true", help="download nothing")
     args = parser.parse_args()
@@ -171,15 +186,16 @@ def main() -> int:
     shutil.rmtree(folder, ignore_errors=True)
     (folder / "scenes").mkdir(parents=True)
     absent: list[str] = []
-    for what, sources in (("run", args.runs), ("capture", args.captures)):
+    scenes, captures = folder / "scenes", folder / "captures"
+    packed: tuple[tuple[str, list[Path], Callable[[Path], Path]], ...] = (
+        ("run", args.runs, lambda source: pack_scene(source, scenes)),
+        ("capture", args.captures, lambda source: pack_capture(source, captures, args.pixels)),
+        ("capture", args.whole, lambda source: keep_capture(source, captures)),
+    )
+    for what, sources, pack in packed:
         for source in sources:
             try:
-                made = (
-                    pack_scene(source, folder / "scenes")
-                    if what == "run"
-                    else pack_capture(source, folder / "captures", args.pixels)
-                )
-                print(f"{what} {source}: {made.relative_to(folder)}")
+                print(f"{what} {source}: {pack(source).relative_to(folder)}")
             except PopError as error:
                 absent.append(f"{what} {source}: {error}")
     absent += [] if args.no_wheels else fetch_wheels(folder / "wheels")

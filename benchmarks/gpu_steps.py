@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from gpu_floors import Loads
 from gpu_profile import kernel_sums
-from gpu_visits import count_visits
+from gpu_visits import count_tried, count_visits
 from torch import Tensor
 
 from cuda_ext.training import step_program
@@ -89,6 +89,7 @@ def step_loads(trainer: FusedTrainer) -> Loads:
         width * height,
         int(longest.max()),
         *count_visits(trainer.lists()[size], trainer.splats, stats["n_traversed"]),
+        count_tried(trainer.splats["means2d"], trainer.radii, width, height),
     )
 
 

@@ -31,6 +31,16 @@ class Visits(NamedTuple):
     batches: int
 
 
+def count_tried(means2d: Tensor, radii: Tensor, width: int, height: int) -> int:
+    """Count the 16 x 8 tiles in the rectangles of splats, which are tried when lists are made."""
+    tried = torch.ones(len(means2d), dtype=torch.long, device=means2d.device)
+    for axis, (size, length) in enumerate(((16, width), (8, height))):
+        center, radius, tiles = means2d[:, axis], radii[:, axis], -(-length // size)
+        first, last = ((center - radius) / size).floor(), ((center + radius) / size).ceil()
+        tried *= (last.clamp(0, tiles) - first.clamp(0, tiles)).long()
+    return int(tried[(radii > 0).all(1)].sum())
+
+
 def count_visits(lists: Any, splats: Mapping[str, Tensor], traversed: Tensor) -> Visits:
     """Count the visits of a view.
 

@@ -55,7 +55,7 @@ class ProbedRun(TrainingRun):
         views = capture.train_views(config.test_every)
         chosen = sorted({round(i * (len(views) - 1) / max(VIEWS - 1, 1)) for i in range(VIEWS)})
         self._probed = [ViewTensors.of(views[i], self.params["means"].dtype) for i in chosen]
-        self._renderer, self._every = engine.backend, every
+        self._renderer, self._device, self._every = engine.backend, engine.device, every
         self._path = Path(config.result_dir) / PROBE
         self._points: dict[int, Mapping[str, float]] | None = None
         self._written = 0
@@ -84,10 +84,15 @@ class ProbedRun(TrainingRun):
             with torch.no_grad():
                 rendered = render_view(self._renderer, self.params, view, config, degree, counts=True)
             blended, traversed = gaussians_per_pixel(rendered.info)
-            found = gradient_sizes(rendered.image, view.target(), view.mask, config.ssim_padding)
+            found = gradient_sizes(*self._placed(rendered.image, view), config.ssim_padding)
             for name, value in {**found, "probe_blended": blended, "probe_traversed": traversed}.items():
                 sums[name] = sums.get(name, 0.0) + value / len(self._probed)
         return {"num_gaussians": len(self.params["means"]), **sums}
+
+    def _placed(self, image: Tensor, view: ViewTensors) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return a render, the photograph and its mask where training computes; windows take long on one CPU thread."""
+        mask = None if view.mask is None else view.mask.to(self._device)
+        return image.to(self._device), view.target().to(self._device), mask
 
     def _read(self) -> dict[int, Mapping[str, float]]:
         """Take up what was probed before the step that the run continues from."""

@@ -16,7 +16,7 @@ namespace pop {
 
 namespace {
 
-constexpr int BLOCK = 256, SMALL_RECT = 8;
+constexpr int BLOCK = 256;
 
 // Addition that stops at the largest number instead of beginning again at zero. Of numbers >= 0 it is associative, which
 // a scan asks for, and whatever is below the limit is exact: no need to scan 64 bits.
@@ -34,73 +34,85 @@ __global__ void depth_keys_kernel(int n, SplatArrays splats, unsigned* keys, uns
     order[i] = unsigned(i);
 }
 
+// what a warp reads of its splats when it tries their tiles
 struct Footprint {
-    float x, y, A, B, C, reach;
-    TileRect rect;
+    float x, y, reach;
+    Exponent<float> exponent;
+    int x0, y0, across;
+    float rows;  // a tile is 1 / across of one
+    unsigned splat;
 };
 
 __device__ __forceinline__ Footprint footprint_of(unsigned splat, const SplatArrays& splats, const TileGrid& grid,
-                                                  const Profile<float>& profile) {
+                                                  const Profile<float>& profile, int& size) {
     const float *u = splats.means2d + 2 * size_t(splat), *q = splats.conics + 3 * size_t(splat);
     const Radii radii = {splats.radii[2 * size_t(splat)], splats.radii[2 * size_t(splat) + 1]};
     const TileRect rect = tile_rect(Vec2<float>{u[0], u[1]}, radii, grid, profile);
     const float reach = logf(splats.opacities[splat] / profile.alpha_floor) + 1e-3f;
-    return {u[0], u[1], q[0], q[1], q[2], reach, rect};
+    const int across = rect.x1 - rect.x0;
+    size = n_tiles_in(rect);
+    return {u[0], u[1], reach, exponent_of(q[0], q[1], q[2]), rect.x0, rect.y0, across, 1.0f / float(across), splat};
 }
 
 __device__ __forceinline__ bool reaches(const Footprint& f, int index, const TileGrid& grid, bool exact, int& tile) {
-    const int across = f.rect.x1 - f.rect.x0;
-    const int x = f.rect.x0 + index % across, y = f.rect.y0 + index / across;
+    // index / across; rounded, it can be one off where there are millions of tiles
+    int row = int((float(index) + 0.5f) * f.rows), column = index - row * f.across;
+    const int off = int(column >= f.across) - int(column < 0);
+    row += off, column -= off * f.across;
+    const int x = f.x0 + column, y = f.y0 + row;
     tile = y * grid.tiles_x + x;
-    return !exact || least_sigma_in_tile(Vec2<float>{f.x, f.y}, f.A, f.B, f.C, x, y, grid) <= f.reach;
+    return !exact || least_sigma_in_tile(Vec2<float>{f.x, f.y}, f.exponent, x, y, grid) <= f.reach;
 }
 
-__device__ __forceinline__ Footprint from_lane(const Footprint& f, int lane) {
-    const auto real = [lane](float v) { return __shfl_sync(FULL_WARP, v, lane); };
-    const auto integer = [lane](int v) { return __shfl_sync(FULL_WARP, v, lane); };
-    return {real(f.x),         real(f.y),
-            real(f.A),         real(f.B),
-            real(f.C),         real(f.reach),
-            {integer(f.rect.x0), integer(f.rect.y0), integer(f.rect.x1), integer(f.rect.y1)}};
-}
+// The splats of a block's warps, and where the tiles of each begin when a warp's are put in a row.
+struct WarpSplats {
+    Footprint of[BLOCK];
+    int begin[BLOCK];
+};
 
-// Call visit(tile, number) for every tile that the splat of this lane reaches, in row-major order; small rectangles by
-// their own lane, large ones by the whole warp. Returns how many there were. All lanes of the warp must call it.
+// Call visit(splat, tile, number) for every tile that the splats of this warp's lanes reach, splat by splat and row by
+// row, with its number among all of them; returns how many the splat of this lane reaches. However unequal rectangles
+// are, every lane has a tile to try until the warp's last 32. All lanes of the warp must call it.
 template <class Visit>
-__device__ __forceinline__ unsigned visit_tiles(const Footprint& f, const TileGrid& grid, bool exact, Visit visit) {
-    const int lane = threadIdx.x & (WARP - 1), size = n_tiles_in(f.rect);
-    unsigned found = 0;
-    if (size <= SMALL_RECT) {
-        int tile;
-        for (int k = 0; k < size; ++k)
-            if (reaches(f, k, grid, exact, tile)) visit(lane, tile, found++);
+__device__ __forceinline__ unsigned visit_tiles(WarpSplats& shared, const Footprint& f, int size, const TileGrid& grid,
+                                                bool exact, Visit visit) {
+    const int lane = threadIdx.x & (WARP - 1);
+    Footprint* of = shared.of + (threadIdx.x - lane);
+    int* begin = shared.begin + (threadIdx.x - lane);
+    int end = size;
+    for (int step = 1; step < WARP; step *= 2) {
+        const int before = __shfl_up_sync(FULL_WARP, end, step);
+        if (lane >= step) end += before;
     }
-    unsigned large = __ballot_sync(FULL_WARP, size > SMALL_RECT);
-    while (large) {
-        const int owner = __ffs(large) - 1;
-        large &= large - 1;
-        const Footprint wide = from_lane(f, owner);
-        const int wide_size = n_tiles_in(wide.rect);
-        unsigned before = 0;
-        for (int first = 0; first < wide_size; first += WARP) {
-            const int k = first + lane;
-            int tile = 0;
-            const bool kept = k < wide_size && reaches(wide, k, grid, exact, tile);
-            const unsigned hits = __ballot_sync(FULL_WARP, kept);
-            if (kept) visit(owner, tile, before + __popc(hits & ((1u << lane) - 1u)));
-            before += __popc(hits);
-        }
-        if (lane == owner) found = before;
+    of[lane] = f;
+    begin[lane] = end - size;
+    const int total = __shfl_sync(FULL_WARP, end, WARP - 1);
+    __syncwarp();
+    unsigned found = 0, before = 0;
+    for (int first = 0; first < total; first += WARP) {  // per 32 tiles
+        const int k = first + lane;
+        int owner = 0, tile = 0;
+        for (int step = WARP / 2; step > 0; step /= 2)
+            if (begin[owner + step] <= k) owner += step;
+        const bool kept = k < total && reaches(of[owner], k - begin[owner], grid, exact, tile);
+        const unsigned hits = __ballot_sync(FULL_WARP, kept);
+        if (kept) visit(of[owner].splat, tile, before + __popc(hits & ((1u << lane) - 1u)));
+        before += __popc(hits);
+        // those of the 32 that are this lane's own splat's
+        const int low = max(end - size - first, 0), high = min(end - first, WARP);
+        if (low < high) found += __popc(hits >> low << (WARP - (high - low)));
     }
     return found;
 }
 
 __global__ void count_kernel(TileLists lists, SplatArrays splats, Profile<float> profile) {
+    __shared__ WarpSplats shared;
     const int rank = blockIdx.x * blockDim.x + threadIdx.x;
     Footprint f = {};
-    if (rank < lists.n) f = footprint_of(lists.order[1][rank], splats, lists.grid, profile);
-    unsigned found = unsigned(n_tiles_in(f.rect));
-    if (lists.exact) found = visit_tiles(f, lists.grid, true, [](int, int, unsigned) {});
+    int size = 0;
+    if (rank < lists.n) f = footprint_of(lists.order[1][rank], splats, lists.grid, profile, size);
+    unsigned found = unsigned(size);
+    if (lists.exact) found = visit_tiles(shared, f, size, lists.grid, true, [](unsigned, int, unsigned) {});
     if (rank < lists.n) lists.counts[rank] = found;
 }
 
@@ -118,6 +130,7 @@ __global__ void total_kernel(TileLists lists, DeviceState* state) { state->n_ins
 template <class Key>
 __global__ void emit_kernel(TileLists lists, SplatArrays splats, Profile<float> profile, int* dominant_counts,
                             DeviceState* state) {
+    __shared__ WarpSplats shared;
     const int rank = blockIdx.x * blockDim.x + threadIdx.x, threads = gridDim.x * blockDim.x;
     const int total = n_instances(lists);
     // after an earlier halt the view may be that of another size of image: its numbers mean nothing
@@ -133,21 +146,24 @@ __global__ void emit_kernel(TileLists lists, SplatArrays splats, Profile<float> 
         lists.slots[0][k] = unsigned(k);
     }
     Footprint f = {};
+    int size = 0;
     if (rank < lists.n) {
         const unsigned splat = lists.order[1][rank];
-        if (listed) f = footprint_of(splat, splats, lists.grid, profile);
+        if (listed) f = footprint_of(splat, splats, lists.grid, profile, size);
         lists.splat_begin[splat] = listed ? lists.offsets[rank] : 0;
         lists.splat_count[splat] = listed ? lists.counts[rank] : 0;
         if (dominant_counts != nullptr) dominant_counts[splat] = 0;
     }
+    // slots are numbered as the warp finds them
     const int first_rank = rank - int(threadIdx.x & (WARP - 1));
-    visit_tiles(f, lists.grid, lists.exact, [&](int owner, int tile, unsigned number) {
-        const unsigned slot = lists.offsets[first_rank + owner] + number;
+    const unsigned first_slot = first_rank < lists.n ? lists.offsets[first_rank] : 0u;
+    visit_tiles(shared, f, size, lists.grid, lists.exact, [&](unsigned splat, int tile, unsigned number) {
+        const unsigned slot = first_slot + number;
         // never, unless this pass saw more tiles than the one that counted: then not in somebody else's memory
         if (slot >= unsigned(lists.capacity)) return;
         keys[slot] = Key(tile);
         lists.slots[0][slot] = slot;
-        lists.slot_splat[slot] = lists.order[1][first_rank + owner];
+        lists.slot_splat[slot] = splat;
     });
 }
 

@@ -61,11 +61,24 @@ POP_HD TileRect tile_rect(Vec2<Real> mean2d, Radii radii, TileGrid grid, const P
 // tile is only dropped when it is certain. pop_fast/stages/tiles.py has the same two numbers.
 constexpr double TILE_SLACK = 1e-3, TILE_SLACK_SHARE = 1e-5;
 
+// A splat's exponent sigma = (A dx^2 + C dy^2) / 2 + B dx dy, and where along an edge it is least: at dy = down dx on one
+// at dx, at dx = right dy on one at dy.
+template <class Real>
+struct Exponent {
+    Real A, B, C, down, right;
+};
+
+template <class Real>
+POP_HD Exponent<Real> exponent_of(Real A, Real B, Real C) {
+    return {A, B, C, -B / C, -B / A};
+}
+
 // the exponent on an edge of a box at offset `fixed`, at its least over the other offset in [low, high], less the slack
 template <class Real>
-POP_HD Real least_on_edge(Real fixed_coefficient, Real cross, Real free_coefficient, Real fixed, Real low, Real high) {
+POP_HD Real least_on_edge(Real fixed_coefficient, Real cross, Real free_coefficient, Real slope, Real fixed, Real low,
+                          Real high) {
     // rounded where it is written: the kernel that counts tiles and the one that lists them must agree to the bit
-    const Real offset = clamped(mul(-cross, fixed) / free_coefficient, low, high);
+    const Real offset = clamped(mul(slope, fixed), low, high);
     const Real across = mul(mul(fixed_coefficient, fixed), fixed), along = mul(mul(free_coefficient, offset), offset);
     const Real squares = mul(Real(0.5), add(across, along)), mixed = mul(mul(cross, fixed), offset);
     const Real slack = add(Real(TILE_SLACK), mul(Real(TILE_SLACK_SHARE), squares));
@@ -75,7 +88,7 @@ POP_HD Real least_on_edge(Real fixed_coefficient, Real cross, Real free_coeffici
 // The least sigma that any pixel centre of a tile can have, or a little less. sigma is convex: outside the box of
 // centres its least value lies on an edge that faces the splat's centre.
 template <class Real>
-POP_HD Real least_sigma_in_tile(Vec2<Real> mean2d, Real A, Real B, Real C, int tile_x, int tile_y, TileGrid grid) {
+POP_HD Real least_sigma_in_tile(Vec2<Real> mean2d, const Exponent<Real>& of, int tile_x, int tile_y, TileGrid grid) {
     const Real half = Real(0.5), one = Real(1);
     const Real left = Real(tile_x * grid.tile_w) + half;
     const Real top = Real(tile_y * grid.tile_h) + half;
@@ -88,8 +101,8 @@ POP_HD Real least_sigma_in_tile(Vec2<Real> mean2d, Real A, Real B, Real C, int t
     if (x_inside && y_inside) return Real(0);
     const Real none = Real(3e38);
     const Real dx = x_low > Real(0) ? x_low : x_high, dy = y_low > Real(0) ? y_low : y_high;
-    const Real on_x = x_inside ? none : least_on_edge(A, B, C, dx, y_low, y_high);
-    const Real on_y = y_inside ? none : least_on_edge(C, B, A, dy, x_low, x_high);
+    const Real on_x = x_inside ? none : least_on_edge(of.A, of.B, of.C, of.down, dx, y_low, y_high);
+    const Real on_y = y_inside ? none : least_on_edge(of.C, of.B, of.A, of.right, dy, x_low, x_high);
     return min_of(on_x, on_y);
 }
 

@@ -63,11 +63,10 @@ void list_splats(Frame<Real>& frame, const Arguments<Real>& a) {
         const SplatRow<Real>& s = frame.splats[i];
         const TileRect rect = tile_rect(s.mean2d, s.radii, grid, a.profile);
         const Real reach = frame.blended[i].beyond * Real(LN_2) + Real(1e-3);
+        const Exponent<Real> exponent = exponent_of(s.conic.xx, s.conic.xy, s.conic.yy);
         for (int y = rect.y0; y < rect.y1; ++y)
             for (int x = rect.x0; x < rect.x1; ++x) {
-                const Conic<Real>& q = s.conic;
-                if (a.integers[EXACT_LISTS] && least_sigma_in_tile(s.mean2d, q.xx, q.xy, q.yy, x, y, grid) > reach)
-                    continue;
+                if (a.integers[EXACT_LISTS] && least_sigma_in_tile(s.mean2d, exponent, x, y, grid) > reach) continue;
                 frame.lists[size_t(y) * grid.tiles_x + x].push_back(i);
             }
     }

@@ -240,8 +240,8 @@ const Entry<Real>* stage_table() {
                  a.out[0][i] = densification_gradient(vec2(a.in[0], i), a.integers[0], a.integers[1])),
         POP_ROWS("least_sigma_in_tile", const Vec3<Real> c = vec3(a.in[1], i);
                  const TileGrid grid = grid_of(a.integers[0], a.integers[1], a.integers[2], a.integers[3]);
-                 a.out[0][i] = least_sigma_in_tile(vec2(a.in[0], i), c.x, c.y, c.z, a.integers[4], a.integers[5],
-                                                   grid)),
+                 a.out[0][i] = least_sigma_in_tile(vec2(a.in[0], i), exponent_of(c.x, c.y, c.z), a.integers[4],
+                                                   a.integers[5], grid)),
         {"ssim", ssim_and_vjp<Real>},
         {nullptr, nullptr},
     };

@@ -24,6 +24,7 @@ from cuda_ext.gpu_check.outcomes import outcomes
 from cuda_ext.gpu_check.shared import MARGIN, Budget, Command, Share, StageContext, first_line, run, write_json
 from cuda_ext.gpu_check.stages import JOBS, SHARES, STAGES, wheels_stage
 from cuda_ext.gpu_check.training import train_one
+from paper_repro.record import from_line
 from pop_fast.cli import main as pop
 from pop_fast.data import load_capture
 from tests.app.captures import colmap_capture
@@ -227,6 +228,8 @@ def test_rows_of_the_paper_are_trained_and_brought_back(tmp_path, monkeypatch):
     )
     assert found["status"] == 0, found["output"]
     assert found["rows"] == ["toy/l1_div_100.jsonl"]
+    (line,) = (tmp_path / "rows.jsonl").read_text().splitlines()
+    assert from_line(line, "the row").row == "l1_div_100"
 
 
 def test_gsplat_that_was_not_compiled_is_told_and_is_no_failure(tmp_path):
@@ -351,6 +354,15 @@ def test_a_packed_capture_is_the_capture_shrunk(pack, tmp_path):
         np.testing.assert_allclose(ours.K[0] / ours.width, theirs.K[0] / theirs.width, rtol=1e-12)
         np.testing.assert_allclose(ours.K[1] / ours.height, theirs.K[1] / theirs.height, rtol=1e-12)
         assert abs(float(ours.image.mean()) - float(theirs.image.mean())) < 8.0
+
+
+def test_a_capture_packed_whole_keeps_its_bytes(pack, tmp_path):
+    source = colmap_capture(tmp_path / "scene")
+    assert pack(tmp_path / "pack", "--whole", str(source), "--pixels", "200") == 0
+    kept = tmp_path / "pack" / "captures" / "scene"
+    files = sorted(path.relative_to(source) for path in source.rglob("*") if path.is_file())
+    assert files == sorted(path.relative_to(kept) for path in kept.rglob("*") if path.is_file())
+    assert all((source / path).read_bytes() == (kept / path).read_bytes() for path in files)
 
 
 def test_every_file_is_listed_with_its_digest(pack, tmp_path):

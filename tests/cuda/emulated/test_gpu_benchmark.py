@@ -205,6 +205,7 @@ def test_the_predicted_case_is_what_was_predicted(gpu, monkeypatch):
     assert loads.contributing / loads.pixels == pytest.approx(CONTRIBUTING, rel=0.1)
     # what the predictions take of the entries that are walked
     entries = loads.evaluated / 128
+    assert loads.tried / loads.visible == pytest.approx(27.3, rel=0.1)
     assert loads.visits / entries == pytest.approx(0.774, rel=0.05)
     assert loads.eights / entries == pytest.approx(0.104, rel=0.05)
     assert loads.batches / entries == pytest.approx(0.0354, rel=0.05)

@@ -175,3 +175,83 @@ def test_the_share_that_blurs_is_of_the_pixels_that_a_view_keeps(gpu):
         assert torch.equal(trainer.statistics.blurred.bool().cpu(), counts > THETA * kept), step
         differs += int((counts > THETA * kept).sum() - (counts > THETA * WIDTH * HEIGHT).sum())
     assert differs > 0
+
+
+def test_exact_lists_hold_the_tiles_that_a_splat_reaches_and_no_others(gpu):
+    from cuda_ext import load
+    from cuda_ext.arrays import N_INSTANCES, kernel_profile, new_state, stream_of
+    from cuda_ext.render.lists import TileBuffers, splat_struct
+
+    # rectangles of no tile, of one and of the whole image, and needles, in one warp and over the end of another
+    g = torch.Generator().manual_seed(4)
+    n, width, height = 75, 260, 130
+    sizes = torch.exp(4.5 * torch.rand((n, 2), generator=g)) * torch.tensor([1.0, 0.4])
+    turn = 3.2 * torch.rand(n, generator=g)
+    axes = torch.stack((torch.cos(turn), torch.sin(turn), -torch.sin(turn), torch.cos(turn)), 1).view(n, 2, 2)
+    covariance = axes @ torch.diag_embed(sizes.square()) @ axes.mT
+    inverse = torch.linalg.inv(covariance)
+    conics = torch.stack((inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]), 1)
+    opacities = 0.02 + 0.97 * torch.rand(n, generator=g)
+    widths = torch.sqrt(2.0 * torch.log(255.0 * opacities))[:, None] * covariance.diagonal(dim1=1, dim2=2).sqrt()
+    radii = torch.ceil(widths).int()
+    radii[::7] = 0
+    means2d = torch.rand((n, 2), generator=g) * torch.tensor([width + 80.0, height + 80.0]) - 40.0
+    depths = torch.rand(n, generator=g)
+    rows = [t.to(gpu).contiguous() for t in (means2d, depths, conics, opacities, radii)]
+    state, buffers = new_state(gpu), TileBuffers(n, width, height, (16, 8), True, gpu, buckets=False)
+    kernels, profile, stream = load(), kernel_profile(PAPER, 16), stream_of(gpu)
+    splats = splat_struct(*rows, None)
+    kernels.count_instances(buffers.struct, splats, profile, state.data_ptr(), stream)
+    total = int(state[N_INSTANCES])
+    buffers.reserve(total)
+    kernels.make_tile_lists(buffers.struct, splats, profile, 0, state.data_ptr(), stream)
+    listed, begin, end = (buffers.tensor(name).long().cpu() for name in ("listed", "tile_begin", "tile_end"))
+    assert int((end - begin).sum()) == total
+
+    reach = torch.log(255.0 * opacities.double())
+    offsets = torch.arange(0.5, 16.0, 0.1, dtype=torch.float64)
+    for tile, (first, last) in enumerate(zip(begin.tolist(), end.tolist(), strict=True)):
+        y, x = divmod(tile, -(-width // 16))
+        ids = listed[first:last]
+        # in the tile's box, where it is inside the image: at pixel centres, and on a grid ten times as fine
+        right, bottom = (min(16, width - 16 * x), min(8, height - 8 * y))
+        fine = torch.cartesian_prod(offsets[: 10 * right - 9] + 16 * x, offsets[: 10 * bottom - 9] + 8 * y)
+        d = means2d[:, None].double() - fine
+        A, B, C = conics.double()[:, :, None].unbind(1)
+        sigma = 0.5 * (A * d[..., 0] ** 2 + C * d[..., 1] ** 2) + B * d[..., 0] * d[..., 1]
+        centres = ((fine - 0.5) % 1.0).sub(0.5).abs().amin(1) > 0.49
+        inside = (radii > 0).all(1)
+        must = (sigma[:, centres].amin(1) <= reach) & inside
+        may = (sigma.amin(1) <= reach + 0.15) & inside
+        held = torch.zeros(n, dtype=torch.bool)
+        held[ids] = True
+        assert bool((held >= must).all()), tile
+        assert bool((held <= may).all()), tile
+        assert ids.tolist() == sorted(ids.tolist(), key=lambda i: (float(depths[i]), i))
+    lengths = end - begin
+    assert 0 in lengths
+    assert int(lengths.max()) > 8
+
+
+def test_rows_of_a_rectangle_are_exact_where_a_float_cannot_number_its_tiles(gpu):
+    from cuda_ext import load
+    from cuda_ext.arrays import kernel_profile, new_state, stream_of
+    from cuda_ext.render.lists import TileBuffers, splat_struct
+
+    # a band of 3 px over 12 million tiles, of which it reaches those of its rows alone
+    across, down = 6_001, 2_000
+    rows = {
+        "means2d": torch.tensor([[8.0 * across, 8.0 * down - 4.0]], device=gpu),
+        "depths": torch.ones(1, device=gpu),
+        "conics": torch.tensor([[1e-12, 0.0, 1.0]], device=gpu),
+        "opacities": torch.tensor([0.05], device=gpu),
+        "radii": torch.full((1, 2), 16 * across, dtype=torch.int32, device=gpu),
+    }
+    buffers = TileBuffers(1, 16 * across, 8 * down, (16, 8), True, gpu, buckets=False)
+    state, profile, splats = new_state(gpu), kernel_profile(PAPER, 16), splat_struct(**rows, colors=None)
+    load().count_instances(buffers.struct, splats, profile, state.data_ptr(), stream_of(gpu))
+    buffers.reserve(2 * across)
+    load().make_tile_lists(buffers.struct, splats, profile, 0, state.data_ptr(), stream_of(gpu))
+    begin, end = buffers.tensor("tile_begin"), buffers.tensor("tile_end")
+    reached = (end > begin).nonzero()[:, 0]
+    assert torch.equal(reached.cpu(), torch.arange(across) + (down - 1) * across)
