@@ -79,11 +79,12 @@ def an_iteration(kernel: dict[str, Any]) -> str:
     # an update has a loop over slots too, and much besides
     told = () if kernel["kernel"].startswith("update") else ("visit", "step", "8 visits", "8 slots", "32 records")
     for unit in told:
-        for loop in kernel["loops"]:
-            if loop["per"] == unit:
-                least, most = (loop[name] / loop["iterations"] for name in ("always", "all"))
-                span = f"{most:.0f}" if most - least < 1 else f"{least:.0f} to {most:.0f}"
-                found.append(f"{span} per {unit}")
+        # what is unrolled has several loops of one unit
+        spans = [[loop[name] / loop["iterations"] for name in ("always", "all")] for loop in kernel["loops"]]
+        spans = [span for span, loop in zip(spans, kernel["loops"], strict=True) if loop["per"] == unit]
+        if spans:
+            least, most = min(span[0] for span in spans), max(span[1] for span in spans)
+            found.append(f"{most:.0f} per {unit}" if most - least < 1.5 else f"{least:.0f} to {most:.0f} per {unit}")
     if found:
         return ", ".join(found)
     return f"{kernel['instructions']} in all, per {kernel['per']}"

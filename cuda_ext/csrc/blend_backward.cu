@@ -259,29 +259,48 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
     }
 }
 
-// One warp a splat: eight rows at a time, three float4 a row, added in a fixed order.
+constexpr int SPLATS = 4;  // of a warp
+
+__device__ __forceinline__ void add(float4& total, const float4& v) {
+    total = {total.x + v.x, total.y + v.y, total.z + v.z, total.w + v.w};
+}
+
+// One warp four splats: of each eight rows at a time, three float4 a row, added in a fixed order. Most splats have few
+// rows, and what is waited for is where they lie and the first of them: of four splats together, not one by one.
 __global__ void sum_slots_kernel(TileLists lists, BlendBackward blend, int parts) {
-    const int splat = (blockIdx.x * blockDim.x + threadIdx.x) / WARP, lane = threadIdx.x & (WARP - 1);
-    if (splat >= lists.n) return;
-    const size_t begin = size_t(lists.splat_begin[splat]) * parts;
+    constexpr int PIECES = RECORD / 4, STRIDE = PIECES * WARP / 4;
+    const int first = (blockIdx.x * blockDim.x + threadIdx.x) / WARP * SPLATS, lane = threadIdx.x & (WARP - 1);
     const size_t most = size_t(lists.capacity) * parts;
-    const size_t count = size_t(lists.splat_count[splat]) * parts;
-    const size_t end = begin + count < most ? begin + count : most;
-    const int quarter = lane & 3;
-    float4 total = {0.0f, 0.0f, 0.0f, 0.0f};
-    if (quarter < RECORD / 4)
-        for (size_t row = begin + lane / 4; row < end; row += WARP / 4) {  // per 8 slots
-            const float4 v = reinterpret_cast<const float4*>(blend.rows + RECORD * row)[quarter];
-            total = {total.x + v.x, total.y + v.y, total.z + v.z, total.w + v.w};
-        }
+    const float4* rows = reinterpret_cast<const float4*>(blend.rows);
+    float4* sums = reinterpret_cast<float4*>(blend.sums) + PIECES * size_t(first);
+    const float4 *row[SPLATS], *end[SPLATS];
+    float4 total[SPLATS] = {};
+    bool any[SPLATS];
 #pragma unroll
-    for (int mask = 4; mask < WARP; mask *= 2) {
-        total.x += __shfl_xor_sync(FULL_WARP, total.x, mask);
-        total.y += __shfl_xor_sync(FULL_WARP, total.y, mask);
-        total.z += __shfl_xor_sync(FULL_WARP, total.z, mask);
-        total.w += __shfl_xor_sync(FULL_WARP, total.w, mask);
+    for (int k = 0; k < SPLATS; ++k) {
+        const size_t begin = first + k < lists.n ? size_t(lists.splat_begin[first + k]) * parts : 0;
+        const size_t count = first + k < lists.n ? size_t(lists.splat_count[first + k]) * parts : 0;
+        any[k] = count > 0;
+        end[k] = rows + PIECES * (begin + count < most ? begin + count : most);
+        row[k] = (lane & 3) < PIECES ? rows + PIECES * (begin + lane / 4) + (lane & 3) : end[k];
     }
-    if (lane < RECORD / 4) reinterpret_cast<float4*>(blend.sums + size_t(RECORD) * splat)[lane] = total;
+#pragma unroll
+    for (int k = 0; k < SPLATS; ++k)
+        if (row[k] < end[k]) add(total[k], *row[k]);
+#pragma unroll
+    for (int k = 0; k < SPLATS; ++k) {
+        if (any[k]) {
+            for (row[k] += STRIDE; row[k] < end[k]; row[k] += STRIDE) add(total[k], *row[k]);  // per 8 slots
+#pragma unroll
+            for (int mask = 4; mask < WARP; mask *= 2) {
+                total[k].x += __shfl_xor_sync(FULL_WARP, total[k].x, mask);
+                total[k].y += __shfl_xor_sync(FULL_WARP, total[k].y, mask);
+                total[k].z += __shfl_xor_sync(FULL_WARP, total[k].z, mask);
+                total[k].w += __shfl_xor_sync(FULL_WARP, total[k].w, mask);
+            }
+        }
+        if (first + k < lists.n && lane < PIECES) sums[PIECES * k + lane] = total[k];
+    }
 }
 
 template <int CH, bool ABS, bool PASS, bool ATOMIC>
@@ -301,7 +320,8 @@ void launch(const TileLists& lists, const BlendBackward& blend, const BlendConst
     }
     if (!ATOMIC && lists.n > 0) {
         const int parts = (lists.grid.tile_w / WARP_TILE_W) * (lists.grid.tile_h / WARP_TILE_H);
-        sum_slots_kernel<<<blocks_for((long long)(lists.n) * WARP, 256), 256, 0, stream>>>(lists, blend, parts);
+        const long long warps = (lists.n + SPLATS - 1) / SPLATS;
+        sum_slots_kernel<<<blocks_for(warps * WARP, 256), 256, 0, stream>>>(lists, blend, parts);
         POP_LAUNCHED("sum_slots_kernel");
     }
 }

@@ -58,7 +58,7 @@ KERNELS = {
     "splat_gradients_kernel": ("32 Gaussians", 256),
     "splats_kernel": ("bucket", 128),
     "split_rows_kernel": ("32 Gaussians", 256),
-    "sum_slots_kernel": ("Gaussian", 256),
+    "sum_slots_kernel": ("4 Gaussians", 256),
     "tile_order_kernel": ("image", 512),
     "total_kernel": ("step", 1),
     "update_kernel": ("32 Gaussians", 128),

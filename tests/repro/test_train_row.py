@@ -72,6 +72,17 @@ def test_a_result_lies_in_its_place_and_holds_what_was_asked_for(made):
     assert str(how.data) not in toy("pop").file(how.results).read_text()
 
 
+def test_seconds_of_a_machine_with_other_work_are_kept_and_not_compared(made, tmp_path, monkeypatch):
+    monkeypatch.setenv("POP_COMMIT", "c0ffee1")
+    how, job = options(tmp_path, untimed=True), toy("l1_div_100", steps_scaler=0.001)
+    shared, alone = train_row(job, how), made[1]
+    assert (alone.is_timed, shared.is_timed) == (True, False)
+    assert shared.protocol["timing"].startswith(alone.protocol["timing"])
+    assert shared.seconds["cpu"] > 0.0
+    # that of files without their clone
+    assert shared.commit == "c0ffee1"
+
+
 def test_a_curve_has_every_densification_step_and_the_held_out_views_of_every_fifteenth(made):
     curve = made[1].curve
     steps = [point["step"] for point in curve]
