@@ -87,9 +87,23 @@ def test_a_mutant_that_lives_in_one_precision_is_kept_as_alive(
     assert json.loads((tmp_path / "kills.json").read_text()) == {
         "soft ones": {"soft": {"float32": "broken", "float64": None}}
     }
-    with pytest.raises(SystemExit):
-        main(["soft", "--json", str(tmp_path / "kills.json")])
-    assert "name none" in capsys.readouterr().err
+
+
+def test_named_mutants_alone_are_kept_anew_and_those_that_are_gone_are_dropped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class New(_Soft):
+        name = "new"
+
+    command = importlib.import_module("pop_ref.conformance.mutants.__main__")
+    monkeypatch.setattr(command, "FAMILIES", {"soft ones": (New, _Soft)})
+    monkeypatch.setattr(command, "killed_by", lambda mutant, dtype: f"{mutant.name} broken")
+    file, before = tmp_path / "kills.json", {"float32": "as it was", "float64": "as it was"}
+    file.write_text(json.dumps({"soft ones": {"gone": before, "soft": before}}))
+    assert main(["new", "--json", str(file)]) == 0
+    kept = json.loads(file.read_text())
+    assert kept == {"soft ones": {"new": dict.fromkeys(New.precisions, "new broken"), "soft": before}}
+    assert list(kept["soft ones"]) == ["new", "soft"]
 
 
 def test_what_is_published_of_kills_is_of_todays_mutants_in_every_precision_that_they_have() -> None:

@@ -1,7 +1,7 @@
 """Put every mutant on trial: `python -m pop_ref.conformance.mutants [--every] [--json FILE] [NAME ...]`.
 
 A mutant is tried in each precision that it has. With `--json`, how its law breaks is kept by family, mutant and
-precision, None where the mutant survives.
+precision, None where the mutant survives; where mutants are named, those of them alone are kept anew.
 """
 
 from __future__ import annotations
@@ -50,16 +50,22 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("names", nargs="*", metavar="NAME", help="only these mutants")
     parser.add_argument("--every", action="store_true", help="try every law on every mutant and list those that break")
     parser.add_argument("--examples", type=int, default=EXAMPLES["ci"], help="of each law under --every")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="keep how each of all mutants dies")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="keep how each mutant dies")
     args = parser.parse_args(words)
     unknown = set(args.names) - {mutant.name for mutants in FAMILIES.values() for mutant in mutants}
     if unknown:
         parser.error(f"there is no mutant {', '.join(sorted(unknown))}")
-    if args.json and args.names:
-        parser.error("--json keeps the trial of all mutants: name none")
     found = report(args.names, args.every, args.examples)
     if args.json:
-        args.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        kept: Trials = json.loads(args.json.read_text(encoding="utf-8")) if args.names and args.json.is_file() else {}
+        # in the order of the families, without what is no longer there
+        trials = {
+            family: {
+                m.name: now for m in mutants if (now := (kept.get(family, {}) | found.get(family, {})).get(m.name))
+            }
+            for family, mutants in FAMILIES.items()
+        }
+        args.json.write_text(json.dumps(trials, indent=1) + "\n", encoding="utf-8")
     alive = 0
     for family, of in found.items():
         killed = sum(None not in breaks.values() for breaks in of.values())

@@ -19,15 +19,15 @@ def _torch() -> Any:
     return importlib.import_module("torch")
 
 
-def _given(change: Callable[[Given], Given]) -> Breaks:
+def breaking(change: Callable[[Given], Given]) -> Breaks:
     return lambda sound, given: sound(**given | change(given))
 
 
-def _told(change: Callable[[Given, Any, Any, Any], tuple[Any, Any, Any]]) -> Breaks:
+def telling(change: Callable[[Given, Any, Any, Any], tuple[Any, Any, Any]]) -> Breaks:
     return lambda sound, given: change(given, *sound(**given))
 
 
-def _meta(**changed: Callable[[Given, Any], Any]) -> Breaks:
+def meta_telling(**changed: Callable[[Given, Any], Any]) -> Breaks:
     """Change what meta tells, where it is not differentiated."""
 
     def breaks(sound: Rasterization, given: Given) -> Any:
@@ -163,141 +163,141 @@ def _alphas_snap(given: Given, images: Any, alphas: Any, meta: Any) -> tuple[Any
     return images, _torch().where(alphas > 0.99, alphas + (1.0 - alphas).detach(), alphas), meta
 
 
-def _through(change: Callable[[Any], Any], *names: str) -> Breaks:
-    return _given(lambda given: {name: change(given[name]) for name in names if given[name] is not None})
+def passing(change: Callable[[Any], Any], *names: str) -> Breaks:
+    return breaking(lambda given: {name: change(given[name]) for name in names if given[name] is not None})
 
 
 _BOXES: Final = (
     (
         "principal_point_in_the_middle",
         "cx and cy are not read (viewers draw about the centre)",
-        _given(_middle),
+        breaking(_middle),
         "test_agreement:the_image_is_one_of_the_oracles_outcomes",
     ),
     (
         "halves_of_quaternions",
         "w is taken to be positive, its sign is lost (three-component quaternions of compressed files)",
-        _through(lambda q: _torch().cat((q[..., :1].abs(), q[..., 1:]), -1), "quats"),
+        passing(lambda q: _torch().cat((q[..., :1].abs(), q[..., 1:]), -1), "quats"),
         "test_agreement:gradients_are_the_oracles",
     ),
     (
         "no_axis_under_a_thousandth",
         "scales are at least 0.001 (flat Gaussians blow up some solvers)",
-        _through(lambda s: s.clamp(min=1e-3), "scales"),
+        passing(lambda s: s.clamp(min=1e-3), "scales"),
         "test_signature_arguments:a_world_told_in_other_units_is_drawn_alike",
     ),
     (
         "no_axis_over_fifty",
         "scales are at most 50 (sky of SuperSplat's scenes)",
-        _through(lambda s: s.clamp(max=50.0), "scales"),
+        passing(lambda s: s.clamp(max=50.0), "scales"),
         "test_signature_arguments:a_world_told_in_other_units_is_drawn_alike",
     ),
     (
         "opacities_at_most_99_percent",
         "opacity is capped before the falloff, alpha after it is not",
-        _through(lambda o: o.clamp(max=0.99), "opacities"),
+        passing(lambda o: o.clamp(max=0.99), "opacities"),
         "test_agreement:the_image_is_one_of_the_oracles_outcomes",
     ),
     (
         "translation_learns_nothing",
         "of a camera only the rotation has a gradient",
-        _given(_translation_stays),
+        breaking(_translation_stays),
         "test_agreement:gradients_are_the_oracles",
     ),
     (
         "alpha_of_the_background",
         "with a background alpha is 1 everywhere",
-        _told(_alpha_of_the_background),
+        telling(_alpha_of_the_background),
         "test_signature_arguments:plain_colours_are_drawn_as_they_are",
     ),
     (
         "depth_of_nothing_is_nan",
         "expected depth is divided by an alpha of 0",
-        _told(_depth_of_nothing),
+        telling(_depth_of_nothing),
         "test_signature_depth:the_expected_depth_is_the_accumulated_one_over_the_opacity",
     ),
     (
         "extents_in_sixteen_bits",
         "radii over 32,767 wrap (16-bit bounds of WebGPU viewers)",
-        _meta(radii=lambda _, r: ((r + 2**15) % 2**16 - 2**15).to(r.dtype)),
+        meta_telling(radii=lambda _, r: ((r + 2**15) % 2**16 - 2**15).to(r.dtype)),
         "test_signature_meta:extents_that_sixteen_bits_do_not_hold_are_told_as_they_are",
     ),
     (
         "extents_are_round",
         "both extents are the larger one (gsplat before 1.5)",
-        _meta(radii=lambda _, r: r.amax(-1, keepdim=True).expand_as(r).contiguous()),
+        meta_telling(radii=lambda _, r: r.amax(-1, keepdim=True).expand_as(r).contiguous()),
         "test_signature_cameras:packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same",
     ),
     (
         "centres_told_from_corners",
         "screen centres are half a pixel off",
-        _meta(means2d=lambda _, m: m - 0.5),
+        meta_telling(means2d=lambda _, m: m - 0.5),
         "test_signature_meta:the_splats_that_meta_shows_where_nothing_requires_a_gradient_are_the_oracles",
     ),
     (
         "conics_told_backwards",
         "xx and yy change places",
-        _meta(conics=lambda _, c: c.flip(-1)),
+        meta_telling(conics=lambda _, c: c.flip(-1)),
         "test_signature_meta:the_splats_that_meta_shows_where_nothing_requires_a_gradient_are_the_oracles",
     ),
     (
         "depths_told_from_the_near_plane",
         "depth is counted from the near plane",
-        _meta(depths=lambda given, d: d - given["near_plane"]),
+        meta_telling(depths=lambda given, d: d - given["near_plane"]),
         "test_signature_meta:the_splats_that_meta_shows_where_nothing_requires_a_gradient_are_the_oracles",
     ),
     (
         "last_columns_black",
         "columns beyond the last whole tile are not drawn",
-        _told(_last_columns_black),
+        telling(_last_columns_black),
         "test_signature_cameras:packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same",
     ),
     (
         "tiles_of_sixteen",
         "tile_size is not read",
-        _given(lambda _: {"tile_size": 16}),
+        breaking(lambda _: {"tile_size": 16}),
         "test_signature_meta:meta_says_what_was_asked",
     ),
     (
         "three_backgrounds",
         "the background of channels after the third is black",
-        _given(_three_backgrounds),
+        breaking(_three_backgrounds),
         "test_signature_arguments:colours_of_any_number_of_channels_are_drawn_alike",
     ),
     (
         "first_chunk_learns",
         "channels after the thirty-second have no gradient",
-        _told(_first_chunk_learns),
+        telling(_first_chunk_learns),
         "test_signature_pairs:every_pair_of_arguments_has_the_oracles_gradients",
     ),
     (
         "far_by_distance",
         "the far plane is a sphere",
-        _given(_far_by_distance),
+        breaking(_far_by_distance),
         "test_signature_pairs:every_pair_of_arguments_has_the_oracles_gradients",
     ),
     (
         "nearest_plane_of_inria",
         "nothing nearer than 0.2 is drawn (Inria's rasterizer)",
-        _given(lambda given: {"near_plane": max(given["near_plane"], 0.2)}),
+        breaking(lambda given: {"near_plane": max(given["near_plane"], 0.2)}),
         "test_thresholds:at_the_near_plane_a_splat_is_wholly_there_or_wholly_gone",
     ),
     (
         "smallest_extent_kept",
         "what is exactly as large as radius_clip, or half a pixel less, is drawn",
-        _given(lambda given: {"radius_clip": max(given["radius_clip"] - 0.5, 0.0)}),
+        breaking(lambda given: {"radius_clip": max(given["radius_clip"] - 0.5, 0.0)}),
         "test_signature_arguments:what_is_no_larger_than_radius_clip_is_culled",
     ),
     (
         "blur_of_three_tenths",
         "eps2d is not read",
-        _given(lambda _: {"eps2d": 0.3}),
+        breaking(lambda _: {"eps2d": 0.3}),
         "test_signature_arguments:the_low_pass_is_as_wide_as_the_call_says",
     ),
     (
         "covariances_overruled",
         "scales and quaternions go before covariances",
-        _given(_covariances_overruled),
+        breaking(_covariances_overruled),
         "test_signature_arguments:covariances_go_before_quaternions_and_scales",
     ),
     (
@@ -309,49 +309,49 @@ _BOXES: Final = (
     (
         "strides_unread",
         "centres are read as if columns were rows where they are strided",
-        _given(_strides_unread),
+        breaking(_strides_unread),
         "test_autograd:how_arguments_lie_in_memory_changes_no_gradient",
     ),
     (
         "cotangent_of_strides",
         "a gradient that is expanded counts as 0",
-        _told(_cotangent_of_strides),
+        telling(_cotangent_of_strides),
         "test_autograd:how_cotangents_lie_in_memory_changes_no_gradient",
     ),
     (
         "white_in_evaluation",
         "without a gradient the picture is clamped",
-        _told(_white_in_evaluation),
+        telling(_white_in_evaluation),
         "test_agreement:the_image_is_one_of_the_oracles_outcomes",
     ),
     (
         "background_of_the_first_entry",
         "entries of a batch share the first one's background",
-        _given(_background_of_the_first_entry),
+        breaking(_background_of_the_first_entry),
         "test_signature_cameras:batch_entries_do_not_know_of_each_other",
     ),
     (
         "centres_in_half_precision",
         "centres are of 16 bits (textures of WebGL viewers)",
-        _through(lambda m: m + (m.half().to(m.dtype) - m).detach(), "means"),
+        passing(lambda m: m + (m.half().to(m.dtype) - m).detach(), "means"),
         "test_agreement:the_image_is_one_of_the_oracles_outcomes",
     ),
     (
         "opacities_in_eight_bits",
         "opacities have 256 values (.splat)",
-        _through(lambda o: _rounded(o, 255.0), "opacities"),
+        passing(lambda o: _rounded(o, 255.0), "opacities"),
         "test_agreement:the_image_is_one_of_the_oracles_outcomes",
     ),
     (
         "colours_in_eight_bits",
         "colours have steps of 1/255",
-        _through(lambda c: _rounded(c, 255.0), "colors"),
+        passing(lambda c: _rounded(c, 255.0), "colors"),
         "test_agreement:the_image_is_one_of_the_oracles_outcomes",
     ),
     (
         "first_65536",
         "Gaussians from 65,536 on are not drawn (16-bit indices)",
-        _given(_first_65536),
+        breaking(_first_65536),
         "test_scale:the_image_of_seventy_thousand_is_the_oracles",
     ),
     (
@@ -363,31 +363,31 @@ _BOXES: Final = (
     (
         "scales_through_logarithms",
         "scales are the exponential of their logarithm, and a scale of 0 has a gradient of NaN",
-        _through(lambda s: s.log().exp(), "scales"),
+        passing(lambda s: s.log().exp(), "scales"),
         "test_agreement:gradients_are_the_oracles",
     ),
     (
         "opacities_through_logits",
         "opacities are the sigmoid of their logit, and an opacity of 0 or 1 has a gradient of NaN",
-        _through(lambda o: _torch().sigmoid(_torch().logit(o)), "opacities"),
+        passing(lambda o: _torch().sigmoid(_torch().logit(o)), "opacities"),
         "test_agreement:gradients_are_the_oracles",
     ),
     (
         "all_bands",
         "sh_degree is what the harmonics have, not what is asked for",
-        _given(_all_bands),
+        breaking(_all_bands),
         "test_signature_pairs:every_pair_of_arguments_draws_what_the_oracle_draws",
     ),
     (
         "colours_of_cameras",
         "where there are as many Gaussians as cameras, a colour a Gaussian is read as one a camera",
-        _given(_colours_of_cameras),
+        breaking(_colours_of_cameras),
         "test_signature_cameras:where_there_are_as_many_gaussians_as_cameras_a_colour_is_a_gaussians",
     ),
     (
         "alphas_snap_to_one",
         "alpha over 0.99 is told as 1",
-        _told(_alphas_snap),
+        telling(_alphas_snap),
         "test_signature_pairs:every_pair_of_arguments_draws_what_the_oracle_draws",
     ),
 )
