@@ -115,6 +115,7 @@ def test_it_is_compiled_once_and_older_versions_go(fresh: Path, pop: Pop) -> Non
     assert library.stat().st_mtime_ns == made
 
 
+@pytest.mark.slow  # it compiles the kernels
 @needs_compiler
 def test_a_run_that_has_it_loaded_goes_on_when_an_update_removes_it(fresh: Path, pop: Pop) -> None:
     assert pop("build-cpu").status == 0

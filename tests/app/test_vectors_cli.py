@@ -113,6 +113,7 @@ def test_what_the_index_does_not_know_is_said(pop: Pop, shared_vectors: Path, po
     assert "unknown, not judged: notes.txt, golden.npz: v_mean" in outcome.out
 
 
+@pytest.mark.slow  # it makes every vector
 def test_an_export_says_what_it_wrote_and_leaves_an_existing_folder_alone(
     pop: Pop, vectors: Path, shared_vectors: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -73,7 +73,7 @@ def _read(page: str) -> _Reader:
 SHORT = ("1", "2", "3", "4", "4b", "5", "5b")
 
 
-@pytest.mark.parametrize(
+each_chapter = pytest.mark.parametrize(
     "path",
     [
         path if chapter_number(path) in SHORT else pytest.param(path, marks=pytest.mark.slow, id=path.stem)
@@ -81,6 +81,9 @@ SHORT = ("1", "2", "3", "4", "4b", "5", "5b")
     ],
     ids=lambda path: path.stem,
 )
+
+
+@each_chapter
 def test_a_chapter_runs_and_holds_what_a_chapter_must(path: Path) -> None:
     chapter, outcomes = ran(path)
     # chapter 0 shows what is not yet explained
@@ -145,7 +148,7 @@ def test_what_a_chapter_concludes_holds_for_other_sizes_and_starts_too(name: str
     _run_otherwise(*OTHERWISE[name])
 
 
-@pytest.mark.parametrize("path", CHAPTERS, ids=lambda path: path.stem)
+@each_chapter
 def test_a_chapter_becomes_a_page(path: Path) -> None:
     chapter, outcomes = ran(path)
     every = [read_chapter(each) for each in CHAPTERS]

@@ -424,6 +424,7 @@ def test_who_has_written_all_trains_on_a_picture_of_ones_own_above_20_db_and_get
     assert np.allclose(plt.imread(mine / "trained_film.png").shape[:2], (256, 512))
 
 
+@pytest.mark.slow  # it trains in NumPy
 def test_density_control_ends_at_half_time_and_the_toy_learns(mine: Path) -> None:
     _written(mine)
     told_ = list(train(read_work(mine), the_toy(24), 24, every=1))
@@ -508,6 +509,7 @@ def test_what_is_no_grade_is_not_read_as_one(printed: str) -> None:
     assert read_grade(printed) is None
 
 
+@pytest.mark.slow  # every stage's laws, for several submissions
 def test_a_class_is_graded_whatever_one_submission_does(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("anna", "bert", "cleo", "dora", "emil"):
         stubs.start(tmp_path / name)
