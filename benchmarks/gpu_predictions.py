@@ -110,7 +110,7 @@ def predictions() -> str:
     """Make the table of predicted times, and what the card of the last check took."""
     found = read_json(MEASURED / "kernels.json")
     case = found["cases"]["270k_1.6MP"]
-    card, by_kernel = found["gpu"], case["pixel_parallel_by_kernel"]
+    card, by_kernel = f"{found['gpu']}, commit {found['commit'][:8]}", case["pixel_parallel_by_kernel"]
     head = ["step", "bound by", "floor at full use, ms", f"{', '.join(OTHER_TIMES)}, ms", "predicted, ms"]
     head += [f"measured, {card}, ms", "its floor there, ms"]
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]

@@ -19,7 +19,18 @@ from typing import Any, Final
 from paper_repro.scales import SCALES
 from pop_fast.errors import PopError
 
-__all__ = ["BINS", "LPIPS_VARIANTS", "SCHEMA", "UNTIMED", "Result", "from_line", "run_id", "settings_hash", "to_line"]
+__all__ = [
+    "BINS",
+    "COMMIT",
+    "LPIPS_VARIANTS",
+    "SCHEMA",
+    "UNTIMED",
+    "Result",
+    "from_line",
+    "run_id",
+    "settings_hash",
+    "to_line",
+]
 
 SCHEMA: Final = 2
 LPIPS_VARIANTS: Final = ("vgg_01", "alex_norm", "alex_01")
@@ -47,6 +58,7 @@ _PROTOCOL: Final = {
 # and of one that took its first steps from another run: that run's id
 _BASE: Final = "base"
 _RUN: Final = (r"[0-9a-f]{12}", "twelve hex digits")
+COMMIT: Final = r"[0-9a-f]{7,40}(?:-dirty)?"
 _HASH: Final = (r"[0-9a-f]{64}", "a SHA-256 in hex digits")
 _AGAIN: Final = "train the row again with pop-repro run --again"
 
@@ -302,7 +314,7 @@ def _result(take: _Fields) -> Result:
         scene=take.text("scene", name, lower),
         seed=take.whole("seed", 0),
         run=take.text("run", *_RUN),
-        commit=take.text("commit", r"[0-9a-f]{7,40}(?:-dirty)?", "a git commit or null", or_none=True),
+        commit=take.text("commit", COMMIT, "a git commit or null", or_none=True),
         config_hash=take.text("config_hash", *_HASH),
         data_hash=take.text("data_hash", *_HASH),
         machine=take.text("machine"),

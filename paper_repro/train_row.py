@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import json
 import os
+import re
 import shutil
 import subprocess
 import time
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 from paper_repro import results
 from paper_repro.base import begin_from_base, keep_for_others, remove_what_was_kept, steps_for_others
 from paper_repro.jobs import WORK, Job
+from paper_repro.record import COMMIT
 from paper_repro.results import Result
 from paper_repro.scenes import MADE, PaperScene, find_folder
 from pop_fast.errors import PopError
@@ -167,9 +169,15 @@ def commit() -> str | None:
     """Return the commit of the clone that this runs from, "-dirty" where its files differ from it; None outside one.
 
     What the environment says comes first (`POP_COMMIT`, as for `cuda_ext.gpu_check`): files that were sent to a node.
+
+    Raises:
+        PopError: it says something else than a commit.
     """
-    if os.environ.get("POP_COMMIT"):
-        return os.environ["POP_COMMIT"]
+    told = os.environ.get("POP_COMMIT", "")
+    if told:
+        if re.fullmatch(COMMIT, told) is None:
+            raise PopError(f"POP_COMMIT is {told!r}; it must be 7 to 40 hex digits of a git commit, or unset")
+        return told
     here = Path(__file__).resolve().parents[1]
     git = ["git", "-C", str(here)]
     try:

@@ -79,8 +79,11 @@ def test_seconds_of_a_machine_with_other_work_are_kept_and_not_compared(made, tm
     assert (alone.is_timed, shared.is_timed) == (True, False)
     assert shared.protocol["timing"].startswith(alone.protocol["timing"])
     assert shared.seconds["cpu"] > 0.0
-    # that of files without their clone
+    # that of files without their clone; what is none is told before the training, not after it
     assert shared.commit == "c0ffee1"
+    monkeypatch.setenv("POP_COMMIT", "yesterday")
+    with pytest.raises(PopError, match="POP_COMMIT is 'yesterday'; it must be 7 to 40 hex digits"):
+        commit()
 
 
 def test_a_curve_has_every_densification_step_and_the_held_out_views_of_every_fifteenth(made):
