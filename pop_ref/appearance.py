@@ -5,13 +5,20 @@ the scene, takes that up: `y = A c + b` with the 3x4 matrix [A | b]. A held-out 
 compared twice, plainly and after the render's channels have been fitted to the photograph's.
 
 A background of another colour at every step keeps Gaussians from leaving holes that happen to show the right colour.
+
+Exposures and corrections of cameras are learned with the scene, by an Adam of their own whose rates fall.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
 from pop_ref._shapes import Float64
+from pop_ref.optimizer import MAX_STEPS, adam_step
+from pop_ref.refinement import without_common_motion
+from pop_ref.settings import APPEARANCE_RATES, AppearanceRates
 
 # SplitMix64: the odd number nearest to 2^64 over the golden ratio, and the multipliers of its finalizer
 _GOLDEN = 0x9E3779B97F4A7C15
@@ -99,6 +106,75 @@ def centred_exposures(exposures: Float64[np.ndarray, "V 3 4"]) -> Float64[np.nda
         array([0., 2.])
     """
     return exposures - (np.mean(exposures, axis=0) - np.eye(3, 4))
+
+
+def appearance_rates(
+    step: int, max_steps: int = MAX_STEPS, rates: AppearanceRates = APPEARANCE_RATES
+) -> dict[str, float]:
+    """Decay the rates of exposures and of cameras log-linearly: `rate decay^(step / max_steps)`.
+
+    Source: Kerbl et al., gaussian-splatting since October 2024 (`exposure_scheduler_args`); gsplat's trainer, whose
+        `pose_opt` decays by 0.01.
+    Departs: Inria's exposures start after a delay, which by its defaults has no length.
+
+    Args:
+        step: from 0.
+        max_steps: length of the training.
+        rates: at the start, and their decays.
+
+    Returns:
+        Rates of `exposures` and `cameras` at the step.
+
+    Example:
+        >>> {name: f"{rate:.0e}" for name, rate in appearance_rates(15_000).items()}
+        {'exposures': '3e-03', 'cameras': '1e-06'}
+    """
+    share = step / max_steps
+    return {
+        "exposures": rates.exposures * rates.exposures_decay**share,
+        "cameras": rates.cameras * rates.cameras_decay**share,
+    }
+
+
+def appearance_steps(
+    grads: Sequence[Mapping[str, Float64[np.ndarray, "V ..."]]],
+    viewmats: Float64[np.ndarray, "V 4 4"],
+    max_steps: int = MAX_STEPS,
+    rates: AppearanceRates = APPEARANCE_RATES,
+) -> dict[str, Float64[np.ndarray, "V ..."]]:
+    """Learn exposures from [I | 0] and corrections of cameras from 0, by the gradients of a training's first steps.
+
+    After each of Adam's updates what the loss says nothing of is taken out again: the mean of the exposures, and the
+    motion that all cameras share.
+
+    Source: gsplat's trainer and Inria's, which have an Adam for each.
+    Departs: both let exposures and cameras drift together.
+
+    Args:
+        grads: of each step, the gradients of what is learned: `exposures` [V, 3, 4], `cameras` [V, 6], or one of them.
+        viewmats: world -> camera, of the photographs before they are corrected.
+        max_steps: length of the training.
+        rates: at the start, and their decays.
+
+    Returns:
+        What is learned after the last of the steps, by the same names.
+
+    Example:
+        >>> opposite = np.ones((2, 3, 4)) * np.array([1.0, -1.0])[:, None, None]
+        >>> appearance_steps([{"exposures": opposite}], np.stack([np.eye(4)] * 2))["exposures"][:, 0, 0].round(9)
+        array([0.99, 1.01])
+    """
+    n = len(viewmats)
+    starts = {"exposures": np.tile(np.eye(3, 4), (n, 1, 1)), "cameras": np.zeros((n, 6))}
+    moved = {name: starts[name] for name in grads[0]} if grads else {}
+    m, v = ({name: np.zeros_like(array) for name, array in moved.items()} for _ in range(2))
+    for step, given in enumerate(grads):
+        moved, m, v = adam_step(moved, given, m, v, step + 1, appearance_rates(step, max_steps, rates))
+        if "exposures" in moved:
+            moved["exposures"] = centred_exposures(moved["exposures"])
+        if "cameras" in moved:
+            moved["cameras"] = without_common_motion(moved["cameras"], viewmats)
+    return moved
 
 
 def color_correct(image: Float64[np.ndarray, "P 3"], target: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, "P 3"]:

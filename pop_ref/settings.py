@@ -241,6 +241,7 @@ class AppearanceRates:
     cameras_decay: float = 0.01
 
 
+APPEARANCE_RATES: Final = AppearanceRates()
 POP: Final = DensityConfig()
 GSPLAT: Final = DensityConfig(blur_stop_iter=-1, reset_every=3000, prune_too_big=True)
 # whose opacities move half as fast since October 2024

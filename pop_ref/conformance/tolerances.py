@@ -163,6 +163,7 @@ TABLE: Final[dict[str, Tolerance]] = {
     "few_photographs.depth": Tolerance(units=5, worst=0.61),
     "few_photographs.depth_vjp": Tolerance(units=8, worst=0.9),
     "few_photographs.exposures": Tolerance(units=4, worst=0.38),
+    "few_photographs.learned": Tolerance(units=2.7, worst=0.27),
     "few_photographs.motion": Tolerance(units=12, worst=1.2),
     "few_photographs.places": Tolerance(units=0.9, worst=0.087),
     "fisher.log_det": Tolerance(units=1, worst=0.12),

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import importlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,7 +18,7 @@ from pop_ref.conformance import torch_strategy
 from pop_ref.conformance.strategy_script import Script
 from pop_ref.conformance.torch_strategy import ScriptedPasses, arrays_of
 from pop_ref.density_config import DensityConfig
-from pop_ref.settings import LearningRates, Recipe, UpdateRules
+from pop_ref.settings import AppearanceRates, LearningRates, Recipe, UpdateRules
 
 # `pop_ref.optimizer.adam_step` on tensors
 Adam = Callable[..., tuple[dict[str, Any], dict[str, Any], dict[str, Any]]]
@@ -61,7 +61,7 @@ def training_stages(package: str, adam: Adam | None = None) -> dict[str, Callabl
 
 
 class Trainer:
-    """A trainer with the modules `density`, `density.rows`, `train.model`, `train.schedule` and `train.config`.
+    """A trainer with `density` and `density.rows`, and with `appearance`, `config`, `model` and `schedule` in `train`.
 
     Every method has the name, the parameters and the meaning of a function of the oracle, on tensors.
     """
@@ -74,6 +74,7 @@ class Trainer:
         self._schedule: Any = importlib.import_module(f"{package}.train.schedule")
         self._config: Any = importlib.import_module(f"{package}.train.config")
         self._presets: Any = importlib.import_module(f"{package}.train.presets")
+        self._appearance: Any = importlib.import_module(f"{package}.train.appearance")
         self._passes: Any = importlib.import_module(f"{package}.density.passes")
         self._Draws: Any = importlib.import_module(f"{package}.density.protocol").Draws
         self._Strategy: Any = importlib.import_module(f"{package}.density").POPStrategy
@@ -223,6 +224,26 @@ class Trainer:
     def means_learning_rate(self, step: int, scene_scale: float) -> float:
         """See `pop_ref.optimizer.means_learning_rate`."""
         return self.learning_rates(step, scene_scale)["means"]
+
+    def appearance_steps(
+        self,
+        grads: Sequence[Mapping[str, Any]],
+        viewmats: Any,
+        max_steps: int | None = None,
+        rates: AppearanceRates | None = None,
+    ) -> dict[str, Any]:
+        """See `pop_ref.appearance.appearance_steps`; what is left out is the trainer's own."""
+        config = self._config.TrainConfig()
+        learned = grads[0] if grads else ()
+        chosen = {"exposure": "exposures" in learned, "refine_cameras": "cameras" in learned}
+        given = {"max_steps": max_steps or config.max_steps, "appearance_lr": rates or config.appearance_lr}
+        views = [SimpleNamespace(viewmat=viewmat[None]) for viewmat in viewmats]
+        appearance = self._appearance.Appearance(replace(config, **chosen, **given), views)
+        for step, grad in enumerate(grads):
+            for name, param in appearance.params.items():
+                param.grad = grad[name].to(param.dtype)
+            appearance.update(step)
+        return {name: param.detach() for name, param in appearance.params.items()}
 
     def sh_degree_at(
         self, step: int, interval: int | None = None, max_degree: int | None = None, start: int = 0

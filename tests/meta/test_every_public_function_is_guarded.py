@@ -130,6 +130,7 @@ SCHEDULE = "test_density.test_schedule_has_144_densification_steps_41_with_blur_
 VISIBLE = "density:the_density_statistic_averages_ndc_gradients_over_the_views_that_showed_the_gaussian"
 OUTCOME = "thresholds:at_a_depth_tie_the_order_is_one_of_the_two_and_by_index_where_the_tie_is_exact"
 IMPORTANCE = "mini_splatting:importance_is_weight_indoors_and_weight_a_pixel_for_who_dominates_outdoors"
+RATES = "few_photographs:rates_of_exposures_and_cameras_fall_from_step_to_step_and_not_as_one_another"
 ADDED_IMPORTANCE = "mini_splatting:importance_adds_over_views_and_is_none_where_no_pixel_is_dominated"
 
 LAWS = {
@@ -199,6 +200,8 @@ LAWS = {
     "optimizer.means_learning_rate": "optimizer:the_position_rate_falls_log_linearly_to_a_hundredth",
     "optimizer.learning_rates": "optimizer:every_other_rate_stays_as_it_is",
     "optimizer.sh_degree_at": "optimizer:a_band_is_added_every_thousand_steps_up_to_the_third",
+    "appearance.appearance_rates": RATES,
+    "appearance.appearance_steps": RATES,
     "pixel.rows_from_splats": "compositing:a_round_splat_on_the_axis_looks_as_the_formula_says",
     "pixel.stops": "compositing:the_stop_itself_ends_a_pixel_where_the_profile_includes_it",
     "pixel.composite_pixel": "compositing:a_round_splat_on_the_axis_looks_as_the_formula_says",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 from hypothesis import strategies as st
 
@@ -10,6 +12,7 @@ from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.law import law
 from pop_ref.conformance.strategies import arrays_of, dyadic, viewmats
 from pop_ref.records import Camera
+from pop_ref.settings import AppearanceRates
 
 ORACLE = OracleAdapter()
 H, W = 4, 6
@@ -97,6 +100,45 @@ def test_centred_exposures_change_nothing_on_average_and_differ_as_before(backen
     found = backend.stage("centred_exposures")(exposures)
     assert_close("few_photographs.exposures", np.mean(found, 0), np.eye(3, 4), 4.0, backend.dtype)
     assert_close("few_photographs.exposures", found[1:] - found[0], exposures[1:] - exposures[0], 4.0, backend.dtype)
+
+
+# of a training of eight steps, in which both rates fall by powers of two and neither as the other
+FALLING = AppearanceRates(exposures=2.0**-4, exposures_decay=2.0**-8, cameras=2.0**-6, cameras_decay=2.0**-16)
+SHAPES = {"exposures": (3, 4), "cameras": (6,)}
+
+
+@law("few_photographs", "appearance_steps")
+def test_rates_of_exposures_and_cameras_fall_from_step_to_step_and_not_as_one_another(backend):
+    # under a gradient that stays, each of Adam's updates is as long as its rate; opposite ones have nothing in common
+    signs = np.array([1.0, -1.0])
+    for learned, n in product((("exposures",), ("cameras",), tuple(SHAPES)), (1, 2, 5)):
+        grads = {name: np.multiply.outer(signs, np.ones(SHAPES[name])) for name in learned}
+        found = backend.stage("appearance_steps")([grads] * n, np.stack([np.eye(4)] * 2), 8, FALLING)
+        assert set(found) == set(learned)
+        for name in learned:
+            falls = 0.5 if name == "exposures" else 0.25
+            length = getattr(FALLING, name) * sum(falls**step for step in range(n))
+            start = np.eye(3, 4) if name == "exposures" else np.zeros(6)
+            expected = start - length * grads[name]
+            assert_close("few_photographs.learned", found[name], expected, 1.0 + length, backend.dtype)
+
+
+@law(
+    "few_photographs",
+    "appearance_steps",
+    viewmat=viewmats(),
+    exposures=arrays_of((3, 2, 3, 4)),
+    cameras=arrays_of((3, 2, 6)),
+)
+def test_exposures_and_cameras_learn_as_the_oracles_do(backend, viewmat, exposures, cameras):
+    grads = [{"exposures": e, "cameras": c} for e, c in zip(exposures, cameras, strict=True)]
+    seen = (grads, np.stack([viewmat, np.eye(4)]), 8, FALLING)
+    expected, found = ORACLE.stage("appearance_steps")(*seen), backend.stage("appearance_steps")(*seen)
+    # a quotient of moments is off by roundings of the largest, of which what cameras share is taken out
+    size = {"exposures": 1.0, "cameras": FALLING.cameras * (1.0 + float(np.sum(viewmat[:3, 3] ** 2)))}
+    for name, numbers in expected.items():
+        size_of = 8.0 * size[name]
+        assert_close("few_photographs.learned", found[name], numbers, size_of, backend.dtype, against_oracle=True)
 
 
 @law("few_photographs", "background_at", step=st.integers(0, 2**31), seed=st.integers(0, 2**63))

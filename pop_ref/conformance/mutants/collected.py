@@ -1,4 +1,4 @@
-"""Mutants of what a training's steps collect for density control, and of what its passes over photographs sum."""
+"""Mutants of what a training's steps collect for density control and learn of photographs, and of what passes sum."""
 
 from __future__ import annotations
 
@@ -84,6 +84,22 @@ _LINES: Final = (
         'background = self._background.to(raw["means"])',
         'background = torch.zeros_like(raw["means"][0])',
         f"{_LAWS}:passes_over_photographs_sum_what_their_views_show",
+    ),
+    (
+        "appearance_does_not_decay",
+        "exposures and cameras are learned at their first rates to the end",
+        "train/appearance.py",
+        "rate * decay**share",
+        "rate",
+        "test_few_photographs:rates_of_exposures_and_cameras_fall_from_step_to_step_and_not_as_one_another",
+    ),
+    (
+        "cameras_drift_together",
+        "the motion that all cameras share is left in them: the scene turns away from its held-out views",
+        "train/appearance.py",
+        'if "cameras" in self.params:\n            self.params["cameras"].copy_',
+        'if "none" in self.params:\n            self.params["cameras"].copy_',
+        "test_few_photographs:exposures_and_cameras_learn_as_the_oracles_do",
     ),
 )
 
