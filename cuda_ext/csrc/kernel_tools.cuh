@@ -75,6 +75,23 @@ __device__ __forceinline__ T* pinned_shared(T* address) {
 #endif
 }
 
+// Begin to copy a float into shared memory, or 0 in its place. Where the card can (sm_80), no register holds it and the
+// thread goes on; copies_arrive waits for the thread's own.
+__device__ __forceinline__ void begin_copy(float* shared, const float* from, bool there) {
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+    const unsigned to = unsigned(__cvta_generic_to_shared(shared));
+    asm volatile("cp.async.ca.shared.global [%0], [%1], 4, %2;" ::"r"(to), "l"(from), "r"(there ? 4 : 0) : "memory");
+#else
+    *shared = there ? __ldg(from) : 0.0f;
+#endif
+}
+
+__device__ __forceinline__ void copies_arrive() {
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+    asm volatile("cp.async.wait_all;" ::: "memory");
+#endif
+}
+
 // Sum N values over 2 MASK lanes with N + about 4 shuffles: at every step half of the values go to the other half of the
 // lanes, and one that is left over is summed in both. Afterwards a lane holds the sum that sum_index tells.
 template <int N, int MASK>

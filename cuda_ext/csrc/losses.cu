@@ -2,10 +2,11 @@
 // A block owns 32 x 32 pixels and blurs one channel at a time in two one-dimensional passes through shared memory. The
 // photograph's blurred values do not change, so they may be kept from an earlier visit.
 //
-// What bounds both kernels is the issue of instructions, about 380 a pixel and channel (0.06 ms for 1.6 million pixels
+// What bounds both kernels is the issue of instructions, about 410 a pixel and channel (0.06 ms for 1.6 million pixels
 // of an H200), nearly half of them the blurs' multiply-adds: 33 a value down, 43 across with the surroundings of the
 // block. A thread therefore makes a run of four neighbouring values in each pass, from 14 values read instead of 44,
-// and finds the pixels that it reads once for all channels. Memory comes close: 46 bytes a pixel and channel, 0.05 ms.
+// and finds the pixels that it reads once for all channels. Memory comes close: 46 bytes a pixel and channel, 0.05 ms,
+// and so what the next channel needs is read while a channel's runs down are made.
 //
 // No bank of shared memory is asked twice at a time. Across, the eight threads of a quarter-warp read one row, 16 bytes
 // each, 128 bytes in one piece; a pitch of 44 floats keeps the pieces of every row at multiples of 16 bytes. Down, and
@@ -155,17 +156,30 @@ __device__ __forceinline__ Sums block_sums(Sums value) {
 template <bool RENDER, bool TARGET>
 constexpr int N_MAPS = (RENDER ? N_OF_RENDER : 0) + (TARGET ? N_OF_TARGET : 0);
 
-// one channel of render and photograph; `keep` has the bits of the thread's pixels that no mask leaves out
-template <bool RENDER>
-__device__ __forceinline__ void fill_tiles(const Halo& halo, unsigned keep, const float* image,
-                                           const uint8_t* photograph, float* render, float* target) {
+// Begin to read one channel of the render.
+__device__ __forceinline__ void begin_render(const Halo& halo, const float* image, float* render) {
 #pragma unroll
     for (int k = 0; k < SLOTS; ++k) {
-        float2 p = {0.0f, 0.0f};
-        if (halo.pixel[k] >= 0) p = compared(image, photograph, value_of(halo.pixel[k]), (keep >> k) & 1u);
+        const bool there = halo.pixel[k] >= 0;
+        if (Halo::fills(k)) begin_copy(render + Halo::place(k), image + value_of(there ? halo.pixel[k] : 0), there);
+    }
+}
+
+// One channel of the photograph, whose bytes the channel before has brought near, and of the render what is left to do:
+// `keep` has the bits of the thread's pixels that no mask leaves out; of the others the render is the photograph.
+template <bool RENDER>
+__device__ __forceinline__ void finish_tiles(const Halo& halo, unsigned keep, const uint8_t* photograph, float* render,
+                                             float* target) {
+    float values[SLOTS] = {};
+#pragma unroll
+    for (int k = 0; k < SLOTS; ++k)
+        if (halo.pixel[k] >= 0) values[k] = float(__ldg(photograph + value_of(halo.pixel[k]))) * BYTE;
+    if (RENDER) copies_arrive();
+#pragma unroll
+    for (int k = 0; k < SLOTS; ++k) {
         if (!Halo::fills(k)) continue;
-        if (RENDER) render[Halo::place(k)] = p.x;
-        target[Halo::place(k)] = p.y;
+        target[Halo::place(k)] = values[k];
+        if (RENDER && !((keep >> k) & 1u)) render[Halo::place(k)] = values[k];
     }
 }
 
@@ -222,13 +236,33 @@ __global__ void __launch_bounds__(THREADS, 4)
     const uint8_t* photograph = photo.image;
     float *mu_y = photo.moments, *yy = mu_y + CHANNELS * plane;
     float *v_mu = loss.windows, *v_xx = v_mu + plane, *v_xy = v_xx + plane;
+    if (RENDER) begin_render(halo, image, render);
     for (int c = 0; c < CHANNELS; ++c) {  // per channel of four pixels, 3 times
-        fill_tiles<RENDER>(halo, keep, image, photograph, render, target);
+        finish_tiles<RENDER>(halo, keep, photograph, render, target);
         __syncthreads();
         blur_across<MAPS>(rows, [&](int at, float (&values)[MAPS][4]) {
             four_products<RENDER, TARGET>(render + (RENDER ? at : 0), target + at, values);
         });
+#pragma unroll
+        for (int k = 0; RENDER && k < RUN; ++k) {
+            if (k >= rows_inside) break;
+            const int at = PITCH * (row + k + SSIM_REACH) + col + SSIM_REACH;
+            const float d = render[at] - target[at], e = clamped(render[at], 0.0f, 1.0f) - target[at];
+            sums.difference += settings.pixelwise == Pixelwise::l2 ? d * d : fabsf(d);
+            sums.square += e * e;
+        }
         __syncthreads();
+        // what is next is on its way while this channel's runs down are made
+        ++image, ++photograph;
+        if (RENDER && c + 1 < CHANNELS) begin_render(halo, image, render);
+        float of_target[N_OF_TARGET][RUN] = {};
+#pragma unroll
+        for (int k = 0; !TARGET && k < RUN; ++k) {
+            if (k >= rows_inside) break;
+            const unsigned pixel = first_pixel + unsigned(k * loss.width);
+            of_target[Y][k] = __ldg(mu_y + pixel);
+            of_target[YY][k] = __ldg(yy + pixel);
+        }
         float blur[MAPS][RUN] = {};
         blur_down<MAPS>(rows, col, row, blur);
 #pragma unroll
@@ -241,21 +275,15 @@ __global__ void __launch_bounds__(THREADS, 4)
                 continue;
             }
             WindowMoments<float> w = {blur[X][k], 0.0f, blur[XX][k], 0.0f, blur[XY][k]};
-            w.mu_y = TARGET ? blur[FIRST_OF_TARGET + Y][k] : __ldg(mu_y + pixel);
-            w.yy = TARGET ? blur[FIRST_OF_TARGET + YY][k] : __ldg(yy + pixel);
+            w.mu_y = TARGET ? blur[FIRST_OF_TARGET + Y][k] : of_target[Y][k];
+            w.yy = TARGET ? blur[FIRST_OF_TARGET + YY][k] : of_target[YY][k];
             const bool count = (counts >> k) & 1u;
             const WindowSsim<float> s = compare_window(w);
             v_mu[pixel] = count ? s.v_mu : 0.0f;
             v_xx[pixel] = count ? s.v_xx : 0.0f;
             v_xy[pixel] = count ? s.v_xy : 0.0f;
-            const int at = PITCH * (row + k + SSIM_REACH) + col + SSIM_REACH;
-            const float d = render[at] - target[at], e = clamped(render[at], 0.0f, 1.0f) - target[at];
             sums.similarity += count ? s.S : 0.0f;
-            sums.difference += settings.pixelwise == Pixelwise::l2 ? d * d : fabsf(d);
-            sums.square += e * e;
         }
-        __syncthreads();
-        ++image, ++photograph;
         mu_y += plane, yy += plane;
         v_mu += CHANNELS * plane, v_xx += CHANNELS * plane, v_xy += CHANNELS * plane;
     }
@@ -288,7 +316,21 @@ __device__ __forceinline__ void tell_values(const Photograph& photo, const LossA
     loss.values[V_SQUARE] = sums.square * photo.pixel_share;
 }
 
-__global__ void __launch_bounds__(THREADS)
+// of one channel of every map, what a block's pixels are blurred from
+template <int MAPS>
+__device__ __forceinline__ void begin_derivatives(const Halo& halo, const float* const (&windows)[MAPS],
+                                                  float (*derivatives)[HALO * PITCH]) {
+#pragma unroll
+    for (int k = 0; k < SLOTS; ++k) {
+        if (!Halo::fills(k)) continue;
+        const bool there = halo.pixel[k] >= 0;
+#pragma unroll
+        for (int d = 0; d < MAPS; ++d)
+            begin_copy(&derivatives[d][Halo::place(k)], windows[d] + unsigned(there ? halo.pixel[k] : 0), there);
+    }
+}
+
+__global__ void __launch_bounds__(THREADS, 4)
     pixels_kernel(Photographs photographs, LossArrays loss, LossSettings settings, const DeviceState* state) {
     constexpr int MAPS = 3;
     alignas(16) __shared__ float derivatives[MAPS][HALO * PITCH];
@@ -310,43 +352,40 @@ __global__ void __launch_bounds__(THREADS)
     const float *image = loss.image, *windows[MAPS] = {loss.windows, loss.windows + plane, loss.windows + 2 * plane};
     const uint8_t* photograph = photo.image;
     float* v_image = loss.v_image;
+    begin_derivatives(halo, windows, derivatives);
     for (int c = 0; c < CHANNELS; ++c) {  // per channel of four pixels, 3 times
-#pragma unroll
-        for (int k = 0; k < SLOTS; ++k) {
-            float v[MAPS] = {};
-            if (halo.pixel[k] >= 0)
-#pragma unroll
-                for (int d = 0; d < MAPS; ++d) v[d] = windows[d][unsigned(halo.pixel[k])];
-            if (!Halo::fills(k)) continue;
-#pragma unroll
-            for (int d = 0; d < MAPS; ++d) derivatives[d][Halo::place(k)] = v[d];
-        }
+        copies_arrive();
         __syncthreads();
         blur_across<MAPS>(rows, [&](int at, float (&values)[MAPS][4]) {
 #pragma unroll
             for (int d = 0; d < MAPS; ++d) four_of(derivatives[d] + at, values[d]);
         });
         __syncthreads();
+        // what is next is on its way while this channel's runs down are made
+#pragma unroll
+        for (int d = 0; d < MAPS; ++d) windows[d] += CHANNELS * plane;
+        if (c + 1 < CHANNELS) begin_derivatives(halo, windows, derivatives);
+        float2 p[RUN] = {};
+#pragma unroll
+        for (int k = 0; k < RUN; ++k)
+            if (k < rows_inside)
+                p[k] = compared(image, photograph, value_of(first_pixel + unsigned(k * loss.width)), (keep >> k) & 1u);
         float v[MAPS][RUN] = {};
         blur_down<MAPS>(rows, col, row, v);
 #pragma unroll
         for (int k = 0; k < RUN; ++k) {
             if (k >= rows_inside) break;
             const unsigned value = value_of(first_pixel + unsigned(k * loss.width));
-            const float2 p = compared(image, photograph, value, (keep >> k) & 1u);
-            const float difference = p.x - p.y;
+            const float difference = p[k].x - p[k].y;
             // B4: sign(0) = 0
             const float sign = float(difference > 0.0f) - float(difference < 0.0f);
             const float of_pixel = settings.pixelwise == Pixelwise::l2 ? 2.0f * difference : sign;
-            const float of_windows = pixel_from_windows(p.x, p.y, v[0][k], v[1][k], v[2][k]);
+            const float of_windows = pixel_from_windows(p[k].x, p[k].y, v[0][k], v[1][k], v[2][k]);
             const float sum = settings.pixelwise_weight * photo.pixel_share * of_pixel -
                               settings.ssim_weight * photo.window_share * of_windows;
             v_image[value] = (keep >> k) & 1u ? sum : 0.0f;
         }
-        __syncthreads();
         ++image, ++photograph, ++v_image;
-#pragma unroll
-        for (int d = 0; d < MAPS; ++d) windows[d] += CHANNELS * plane;
     }
 }
 
