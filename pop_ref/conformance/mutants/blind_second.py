@@ -11,8 +11,6 @@ from typing import Final
 from pop_ref.conformance.mutants.copies import PROGRAM as PACKAGE
 from pop_ref.conformance.mutants.copies import Mutant
 
-_UNKNOWN: Final = "?"
-
 _ORACLE: Final = (
     (
         "saturated_sigmoid",
@@ -20,7 +18,7 @@ _ORACLE: Final = (
         "activations.py",
         "opacities_from_logits(logit_opacities) * opacities_from_logits(-logit_opacities) * v_opacities",
         "opacities_from_logits(logit_opacities) * (1.0 - opacities_from_logits(logit_opacities)) * v_opacities",
-        _UNKNOWN,
+        "test_activations:the_slope_of_an_opacity_is_the_same_at_both_poles",
     ),
     (
         "cotangents_taken_as_symmetric",
@@ -28,7 +26,7 @@ _ORACLE: Final = (
         "camera.py",
         "V @ R @ covars[i].T + V.T @ R @ covars[i]",
         "2.0 * V @ R @ covars[i]",
-        _UNKNOWN,
+        "test_agreement:covars_cam_from_covars_vjp_is_the_transpose",
     ),
     (
         "margin_of_the_other_focal_length",
@@ -36,7 +34,7 @@ _ORACLE: Final = (
         "projection.py",
         "0.5 * height / fy",
         "0.5 * height / fx",
-        _UNKNOWN,
+        "test_agreement:projection_jacobians_is_the_oracles",
     ),
     (
         "sides_exchanged_in_the_cull",
@@ -44,7 +42,7 @@ _ORACLE: Final = (
         "footprint.py",
         "radii < [width, height]",
         "radii < [height, width]",
-        _UNKNOWN,
+        "test_footprint:a_splat_is_kept_exactly_while_its_extent_overlaps_the_image",
     ),
     (
         "squares_about_the_corner",
@@ -52,7 +50,7 @@ _ORACLE: Final = (
         "tiles.py",
         "index = center - 0.5",
         "index = center",
-        _UNKNOWN,
+        "test_footprint:the_square_extent_is_kept_while_it_meets_a_tile",
     ),
     (
         "visits_are_blends",
@@ -60,7 +58,7 @@ _ORACLE: Final = (
         "pixel.py",
         "transmittances, n_traversed)",
         "transmittances, len(blended))",
-        _UNKNOWN,
+        "test_compositing:a_pixel_ends_before_the_splat_that_would_pass_the_stop",
     ),
     (
         "loss_of_alpha_lost_beside_expected_depth",
@@ -68,7 +66,7 @@ _ORACLE: Final = (
         "render.py",
         "v_T if v_T_final is None else v_T_final + v_T",
         "v_T",
-        _UNKNOWN,
+        "test_signature_depth:the_expected_depth_is_the_accumulated_one_over_the_opacity",
     ),
     (
         "all_directions_count_too_much",
@@ -76,7 +74,7 @@ _ORACLE: Final = (
         "harmonics.py",
         "uniform / (4.0 * math.pi) * np.eye(n_sh)",
         "uniform * np.eye(n_sh)",
-        _UNKNOWN,
+        "test_harmonics:a_band_less_is_made_up_for_where_a_view_shows_it_by_its_weight",
     ),
     (
         "equal_pixels_pull",
@@ -84,7 +82,7 @@ _ORACLE: Final = (
         "losses.py",
         "v_l1 * np.sign(difference)",
         "v_l1 * np.where(difference < 0.0, -1.0, 1.0)",
-        _UNKNOWN,
+        "test_agreement:l1_vjp_is_the_oracles",
     ),
     (
         "blur_alone_everywhere",
@@ -92,7 +90,7 @@ _ORACLE: Final = (
         "density.py",
         "(blurs_at(step, config) and not config.grow_on_gradient_in_blur_window)",
         "not config.grow_on_gradient_in_blur_window",
-        _UNKNOWN,
+        "test_strategies:a_training_is_the_oracles_under_every_reading",
     ),
     (
         "refinement_starts_at_its_start",
@@ -100,7 +98,7 @@ _ORACLE: Final = (
         "density_config.py",
         "config.refine_start_iter < step",
         "config.refine_start_iter <= step",
-        _UNKNOWN,
+        "test_density:the_gaussians_change_every_hundred_steps_and_opacities_are_reset_where_that_is_asked_for",
     ),
     (
         "first_restart_alone",
@@ -108,7 +106,7 @@ _ORACLE: Final = (
         "optimizer.py",
         "1 + max((restart",
         "1 + min((restart",
-        _UNKNOWN,
+        "test_optimizer:adam_counts_the_updates_that_the_rules_leave_each_parameter",
     ),
     (
         "opacities_decay_with_the_others",
@@ -116,7 +114,7 @@ _ORACLE: Final = (
         "optimizer.py",
         'rate if name == "opacities" else decay * rate',
         "decay * rate",
-        _UNKNOWN,
+        "test_optimizer:rates_rewind_and_fall_in_rounds_as_the_rules_say",
     ),
     (
         "depth_weighed_without_the_scene",
@@ -124,7 +122,7 @@ _ORACLE: Final = (
         "training.py",
         "depth_samples(points, camera), recipe.depth_lambda * scene_scale",
         "depth_samples(points, camera), recipe.depth_lambda",
-        _UNKNOWN,
+        "test_few_photographs:the_depth_of_sparse_points_weighs_in_units_of_the_scene",
     ),
     (
         "smaller_extent_scores",
@@ -132,7 +130,7 @@ _ORACLE: Final = (
         "taming.py",
         "np.max(radii, axis=1, initial=0)",
         "np.min(radii, axis=1, initial=2**31 - 1)",
-        _UNKNOWN,
+        "test_taming:a_views_score_is_nine_terms_and_nothing_for_what_it_does_not_show",
     ),
     (
         "diagonal_unpacked_twice",
@@ -140,7 +138,7 @@ _ORACLE: Final = (
         "fisher.py",
         "M = M + M.T - np.diag(np.diag(M))",
         "M = M + M.T",
-        _UNKNOWN,
+        "test_fisher:fisher_blocks_are_the_oracles",
     ),
     (
         "regression_of_the_other_picture",
@@ -148,7 +146,7 @@ _ORACLE: Final = (
         "appearance.py",
         "float(np.mean(t * t) - np.mean(t) ** 2)",
         "float(np.mean(c * c) - np.mean(c) ** 2)",
-        _UNKNOWN,
+        "test_agreement:color_correct_is_the_oracles",
     ),
     (
         "series_of_the_slope_before",
@@ -156,7 +154,7 @@ _ORACLE: Final = (
         "refinement.py",
         "b_slope = -sum((k + 1) * (-s) ** k / math.factorial(2 * k + 4)",
         "b_slope = -sum((k + 1) * (-s) ** k / math.factorial(2 * k + 3)",
-        _UNKNOWN,
+        "test_agreement:refined_viewmat_vjp_is_the_oracles",
     ),
     (
         "rightmost_by_the_wrong_diagonal",
@@ -164,7 +162,7 @@ _ORACLE: Final = (
         "tight_tiles.py",
         "-B * math.sqrt(t / (C * det))",
         "-B * math.sqrt(t / (A * det))",
-        _UNKNOWN,
+        "test_tight_tiles:a_tile_is_kept_exactly_if_it_meets_the_ellipse_of_what_can_be_seen",
     ),
     (
         "rays_through_the_given_centre",
@@ -172,7 +170,7 @@ _ORACLE: Final = (
         "chord.py",
         'profile.principal_point == "centred"',
         'profile.principal_point == "centered"',
-        _UNKNOWN,
+        "test_chord:where_the_profile_centres_the_principal_point_rays_pass_about_the_middle_of_the_picture",
     ),
 )
 
@@ -183,7 +181,7 @@ _PROGRAM: Final = (
         "density/control.py",
         'state["count"].add_(visible.sum(0))',
         'state["count"].add_(visible.any(0))',
-        _UNKNOWN,
+        "test_strategies:a_training_is_the_oracles_under_every_reading",
     ),
     (
         "views_counted_by_steps",
@@ -191,7 +189,7 @@ _PROGRAM: Final = (
         "density/control.py",
         'state["views"] += cameras',
         'state["views"] += 1',
-        _UNKNOWN,
+        "test_strategies:a_training_is_the_oracles_under_every_reading",
     ),
     (
         "resets_hurry",
@@ -199,7 +197,7 @@ _PROGRAM: Final = (
         "density/control.py",
         "{name: max(_scaled(getattr(self, name), factor), getattr(self, name)) for name in _RECOVERY}",
         "{name: _scaled(getattr(self, name), factor) for name in _RECOVERY}",
-        _UNKNOWN,
+        "test_collected:a_shorter_schedule_changes_the_gaussians_less_often_and_resets_no_sooner",
     ),
     (
         "last_prune_by_the_usual_bound",
@@ -207,7 +205,7 @@ _PROGRAM: Final = (
         "density/control.py",
         ".sigmoid() < self.final_prune_opa",
         ".sigmoid() < self.prune_opa",
-        _UNKNOWN,
+        "test_strategies:a_training_is_the_oracles_under_every_reading",
     ),
     (
         "large_on_screen_go_at_once",
@@ -215,7 +213,7 @@ _PROGRAM: Final = (
         "density/control.py",
         "if self.prune_too_big_after < context.step < self.refine_scale2d_stop_iter",
         "if context.step < self.refine_scale2d_stop_iter",
-        _UNKNOWN,
+        "test_strategies:a_training_is_the_oracles_under_every_reading",
     ),
     (
         "first_view_scores_twice",
@@ -223,7 +221,7 @@ _PROGRAM: Final = (
         "density/rows.py",
         "for index in range(1, context.views.n_views)",
         "for index in range(context.views.n_views)",
-        _UNKNOWN,
+        "test_strategies:a_training_by_speedy_splat_is_the_oracles_at_every_step",
     ),
     (
         "passes_are_classic",
@@ -231,7 +229,7 @@ _PROGRAM: Final = (
         "density/passes.py",
         "PassInput(gaussians, camera, sh_degree, background, self._profile, self._antialiased)",
         "PassInput(gaussians, camera, sh_degree, background, self._profile, False)",
-        _UNKNOWN,
+        "test_collected:passes_over_photographs_sum_what_their_views_show",
     ),
     (
         "parabola_a_post_too_long",
@@ -239,7 +237,7 @@ _PROGRAM: Final = (
         "density/taming.py",
         "(self.refine_stop_iter - self.refine_start_iter) // self.refine_every",
         "(self.refine_stop_iter - self.refine_start_iter) // self.refine_every + 1",
-        _UNKNOWN,
+        "test_strategies:a_training_by_taming_is_the_oracles_at_every_step",
     ),
     (
         "pruning_takes_the_resets_place",
@@ -247,7 +245,7 @@ _PROGRAM: Final = (
         "density/speedy_splat.py",
         "return self.reset(context, done)",
         "return done if share > 0.0 else self.reset(context, done)",
-        _UNKNOWN,
+        "test_strategies:a_training_by_speedy_splat_is_the_oracles_at_every_step",
     ),
     (
         "grey_background_of_the_score",
@@ -255,15 +253,7 @@ _PROGRAM: Final = (
         "stages/contributions.py",
         "behind.sum(0, keepdim=True)",
         "behind.mean(0, keepdim=True)",
-        _UNKNOWN,
-    ),
-    (
-        "flat_gaussians_compete",
-        "a Gaussian with one scale of 0 competes for a pixel's point",
-        "stages/chord.py",
-        "(scales == 0.0).any(1, keepdim=True)",
-        "(scales == 0.0).all(1, keepdim=True)",
-        _UNKNOWN,
+        "test_collected:passes_over_photographs_sum_what_their_views_show",
     ),
     (
         "factor_off_diagonal_twice",
@@ -271,7 +261,7 @@ _PROGRAM: Final = (
         "stages/projection.py",
         "v_xy = -(v_det + v_det_blurred) * xy",
         "v_xy = -2.0 * (v_det + v_det_blurred) * xy",
-        _UNKNOWN,
+        "test_agreement:compensations_vjp_is_the_oracles",
     ),
     (
         "restarts_update",
@@ -279,7 +269,7 @@ _PROGRAM: Final = (
         "train/schedule.py",
         "moved[[*edits, *restarts]] = False",
         "moved[edits] = False",
-        _UNKNOWN,
+        "test_optimizer:adam_counts_the_updates_that_the_rules_leave_each_parameter",
     ),
     (
         "opacities_that_stop_at_once",
@@ -287,7 +277,7 @@ _PROGRAM: Final = (
         "train/schedule.py",
         "if rules.opacities_stop_iter >= 0:",
         "if rules.opacities_stop_iter > 0:",
-        _UNKNOWN,
+        "test_optimizer:adam_counts_the_updates_that_the_rules_leave_each_parameter",
     ),
     (
         "every_epoch_alike",
@@ -295,7 +285,7 @@ _PROGRAM: Final = (
         "train/schedule.py",
         "self._order = torch.randperm(self._n, generator=self._generator).tolist()",
         "self._order = self._order or torch.randperm(self._n, generator=self._generator).tolist()",
-        _UNKNOWN,
+        "test_collected:every_epoch_shows_every_view_once_in_an_order_of_its_own",
     ),
     (
         "sizes_regularized_as_logarithms",
@@ -303,7 +293,7 @@ _PROGRAM: Final = (
         "train/torch_stepper.py",
         'mean_activation(scales_from_log_scales(self._params["scales"]))',
         'mean_activation(self._params["scales"])',
-        _UNKNOWN,
+        "test_collected:the_mean_opacity_and_the_mean_scale_pull_at_opacities_and_at_scales",
     ),
     (
         "photographs_over_unexposed_backgrounds",
@@ -311,7 +301,7 @@ _PROGRAM: Final = (
         "train/appearance.py",
         "return self.exposed(background.to(self._viewmats)[None, None], index)[0, 0]",
         "return background.to(self._viewmats)",
-        _UNKNOWN,
+        "test_collected:where_nothing_is_drawn_and_a_photograph_is_clear_both_are_the_same_background",
     ),
     (
         "rows_counted_by_entries",
@@ -319,7 +309,7 @@ _PROGRAM: Final = (
         "api/meta.py",
         "row += len(depth)",
         "row += len(found.ids)",
-        _UNKNOWN,
+        "test_signature_meta:the_tile_lists_that_meta_shows_run_front_to_back_and_hold_who_is_blended",
     ),
     (
         "written_and_computed_all_the_same",
@@ -327,7 +317,7 @@ _PROGRAM: Final = (
         "api/meta.py",
         "        self._pending.pop(key, None)\n        self._values[key] = value",
         "        self._values[key] = value",
-        _UNKNOWN,
+        "test_collected:what_a_strategy_writes_into_meta_stays_whether_it_was_read_before_or_not",
     ),
     (
         "pruned_importance_keeps_momentum",
@@ -335,7 +325,7 @@ _PROGRAM: Final = (
         "density/mini_splatting.py",
         "        restart(context.params, context.optimizers)\n        return DensificationStep(pruned=pruned)",
         "        return DensificationStep(pruned=pruned)",
-        _UNKNOWN,
+        "test_strategies:a_training_by_mini_splatting_is_the_oracles_at_every_step",
     ),
 )
 

@@ -8,7 +8,6 @@ from typing import Any, Final
 from pop_ref.conformance.mutants.black_box import BlackBox, Rasterization
 from pop_ref.conformance.mutants.unseen_boxes import Breaks, Given, breaking, meta_telling, telling
 
-_UNKNOWN: Final = "?"
 _Told = tuple[Any, Any, Any]
 
 
@@ -166,121 +165,121 @@ _BOXES: Final = (
         "absolute_gradients_pile_up",
         "sums of absolute gradients go on from call to call: a buffer that nobody clears",
         _sums_pile_up(),
-        _UNKNOWN,
+        "test_agreement:gradients_are_the_oracles",
     ),
     (
         "unused_bands_learn",
         "bands beyond sh_degree have the first band's gradient, where memory is not cleared",
         breaking(_unused_bands_learn),
-        _UNKNOWN,
+        "test_gradients:gradients_ignore_the_coefficients_of_other_bands",
     ),
     (
         "portraits_are_cut_square",
         "rows below the width are not drawn: the grid has the width along both axes",
         telling(_square_part),
-        _UNKNOWN,
+        "test_agreement:the_image_is_one_of_the_oracles_outcomes",
     ),
     (
         "factor_not_in_the_gradient",
         "antialiased opacities have the gradient of classic ones",
         _factor_learns_nothing,
-        _UNKNOWN,
+        "test_agreement:antialiased_gradients_are_the_oracles",
     ),
     (
         "low_pass_of_zero_is_the_default",
         "eps2d=0 counts as not given",
         breaking(lambda given: {"eps2d": given["eps2d"] or 0.3}),
-        _UNKNOWN,
+        "test_signature_arguments:the_low_pass_is_as_wide_as_the_call_says",
     ),
     (
         "near_plane_of_zero_is_the_default",
         "near_plane=0 counts as not given",
         breaking(lambda given: {"near_plane": given["near_plane"] or 0.01}),
-        _UNKNOWN,
+        "test_signature_arguments:a_centre_on_the_far_plane_is_drawn_and_one_on_the_near_plane_as_the_profile_says",
     ),
     (
         "last_row_learns",
         "the constant last row of a view matrix has a gradient",
         breaking(_last_row_learns),
-        _UNKNOWN,
+        "test_agreement:gradients_are_the_oracles",
     ),
     (
         "pictures_share_a_buffer",
         "without gradients every picture of a size is written over the one before",
         _one_picture(),
-        _UNKNOWN,
+        "test_autograd:without_gradients_the_same_image_is_drawn_and_follows_nothing",
     ),
     (
         "culled_rows_keep_an_extent",
         "unpacked rows of what is culled have radii of 1, and count as visible",
         meta_telling(radii=lambda given, r: r if given["packed"] else r.clamp_min(1)),
-        _UNKNOWN,
+        "test_signature_meta:the_splats_that_meta_shows_are_the_oracles",
     ),
     (
         "absolute_gradients_of_the_first_camera",
         "all cameras have the first one's sums of absolute gradients",
         telling(_sums_of_the_first_camera),
-        _UNKNOWN,
+        "test_signature_arguments:without_a_background_it_is_black",
     ),
     (
         "near_by_distance",
         "the near plane is a sphere",
         breaking(_near_by_distance),
-        _UNKNOWN,
+        "test_agreement:the_image_that_training_draws_is_one_of_the_oracles_outcomes",
     ),
     (
         "four_channels_are_rgba",
         "of four channels the last one is taken for the opacity of the colour",
         breaking(_four_are_rgba),
-        _UNKNOWN,
+        "test_signature_arguments:colours_of_any_number_of_channels_are_drawn_alike",
     ),
     (
         "empty_tiles_stay_black",
         "tiles that nothing reaches have no background",
         telling(_empty_tiles_black),
-        _UNKNOWN,
+        "test_agreement:the_image_is_one_of_the_oracles_outcomes",
     ),
     (
         "low_pass_ignored_with_covariances",
         "eps2d is lost where covariances are given",
         breaking(lambda given: {} if given["covars"] is None else {"eps2d": 0.3}),
-        _UNKNOWN,
+        "test_signature_pairs:every_pair_of_arguments_draws_what_the_oracle_draws",
     ),
     (
         "principal_point_inside",
         "a principal point outside the picture is moved to its edge (crops of larger pictures)",
         breaking(_centre_inside),
-        _UNKNOWN,
+        "test_agreement:the_antialiased_image_is_one_of_the_oracles_outcomes",
     ),
     (
         "inference_mode_fails",
         "under torch.inference_mode a call ends in an error, as something is saved for the backward pass",
         _inference_fails,
-        _UNKNOWN,
+        "test_autograd:without_gradients_the_same_image_is_drawn_and_follows_nothing",
     ),
     (
         "colours_divided_like_depth",
         "beside the expected depth colours are divided by the opacity, too",
         telling(_colours_divided),
-        _UNKNOWN,
+        "test_signature_depth:the_expected_depth_is_the_accumulated_one_over_the_opacity",
     ),
     (
         "means_learn_absolutely",
         "with absgrad the gradient itself loses its sign, and centres move by it",
         telling(_absolute_learns),
-        _UNKNOWN,
+        "test_agreement:gradients_are_the_oracles",
     ),
     (
         "sides_told_exchanged",
         "meta has the height as width",
         telling(_sides_exchanged),
-        _UNKNOWN,
+        "test_signature_meta:meta_says_what_was_asked",
     ),
     (
         "cameras_told_are_images",
         "n_cameras of a batch is the number of all its images",
         telling(_all_are_cameras),
-        _UNKNOWN,
+        "test_signature_pairs:every_pair_of_arguments_lists_tiles_front_to_back",
     ),
 )
 
