@@ -25,8 +25,8 @@ def opacities_from_logits(logit_opacities: Tensor) -> Tensor:
 
 def opacities_from_logits_vjp(logit_opacities: Tensor, v_opacities: Tensor) -> Tensor:
     """See `pop_ref.activations.opacities_from_logits_vjp`. Optimizations: none."""
-    opacities = torch.sigmoid(logit_opacities)
-    return opacities * (1.0 - opacities) * v_opacities
+    # 1 - o is the opacity of the negated logit: no cancellation where o is near 1
+    return torch.sigmoid(logit_opacities) * torch.sigmoid(-logit_opacities) * v_opacities
 
 
 def unit_quats_from_quats(quats: Tensor) -> Tensor:

@@ -31,9 +31,7 @@ MODULES: Final = tuple(sorted({*STAGE_MODULES, "render", "splatting", "depth", "
 # by function: why no law reaches lines of it; a statement that refuses arguments needs none
 REASONS: Final[dict[str, str]] = {
     "training.py": "the oracle's own trainer: laws drive strategies by `scripted_steps`, tests hold trainers to this",
-    "harmonics.py: lower_degree": "fits trained harmonics to a budget: no rasterizer is asked; a test holds ours to it",
     "taming.py: taming_scores": "sums what laws of single views judge",
-    "chord.py: _ray_direction": "a principal point in the middle, which profile `inria` has",
     "margins.py: nearest": "read by reports of failures",
     "margins.py: near_threshold": "read by reports of failures",
     "margins.py: safe_pixels": "read by reports of failures",
@@ -55,9 +53,9 @@ LIMITS: Final[dict[str, str]] = {
     "camera z, world units": "negative is behind the camera; the far plane's default is 1e10",
     "norm of a quaternion": "directions do not depend on it, and 0 has none",
     "focal length, px": "scales with the picture's size",
-    "near_plane, world units": "the smallest default, one that culls, and both in scenes that are scaled",
+    "near_plane, world units": "none, the smallest default, one that culls, and both in scenes that are scaled",
     "far_plane, world units": "one that culls, the default, and both in scenes that are scaled",
-    "eps2d, px^2": "about the default, 0.3",
+    "eps2d, px^2": "none, and about the default, 0.3",
     "radius_clip, px": "0 leaves nobody out",
 }
 

@@ -176,6 +176,8 @@ def _differentiate(
     if ask.before in ("no_grad", "inference_mode"):
         with getattr(torch, ask.before)():
             still = drawn()[0]
+            # what is drawn after it is no matter of its
+            other()
     outputs: dict[str, Any] = dict(zip(("image", "alpha"), drawn(), strict=True))
     image = outputs["image"].detach().clone()
     if ask.before == "another":

@@ -41,6 +41,7 @@ class Watch:
         masked: whether views have pixels that do not count, those among them that rounding decides.
         antialiased: whether opacities make up for the low-pass.
         sh_interval: steps between bands.
+        regularizers: weights of the settings' own terms of the loss, by name; the oracle's gradients leave them out.
     """
 
     seed: int
@@ -50,6 +51,7 @@ class Watch:
     masked: bool = False
     antialiased: bool = False
     sh_interval: int = 2
+    regularizers: Mapping[str, float] = field(default_factory=dict[str, float])
 
     @property
     def steps(self) -> int:

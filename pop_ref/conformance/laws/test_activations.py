@@ -52,6 +52,16 @@ def test_extreme_logits_saturate_without_overflow(backend):
     assert_same_bits("saturated opacities", opacities, np.array([0.0, 1.0]))
 
 
+@law("activations", "opacities_from_logits_vjp", logit=st.sampled_from([0.0, 4.0, 12.0, 20.0, 30.0, 45.0]))
+def test_the_slope_of_an_opacity_is_the_same_at_both_poles(backend, logit):
+    # o (1 - o), which is no difference: what is all but opaque still learns
+    x = np.array([logit, -logit])
+    found = backend.stage("opacities_from_logits_vjp")(x, np.ones(2))
+    fall = np.exp(-logit)
+    expected = np.full(2, fall / (1.0 + fall) ** 2)
+    assert_close("activations.slope", found, expected, expected * (logit + 2.0), backend.dtype)
+
+
 @law("activations", "unit_quats_from_quats", quat=quats(), power=st.integers(-8, 8))
 def test_unit_quaternions_have_norm_one_and_forget_a_power_of_two(backend, quat, power):
     normalise = backend.stage("unit_quats_from_quats")

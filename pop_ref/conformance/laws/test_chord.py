@@ -14,6 +14,7 @@ from pop_ref.conformance.law import law
 from pop_ref.conformance.scenes import Scene
 from pop_ref.conformance.score_error_bounds import screened
 from pop_ref.conformance.strategies import arrays_of, plain_sizes, quats, scenes
+from pop_ref.constants import INRIA
 from pop_ref.records import Camera, Gaussians
 
 vectors = arrays_of((3,), -4.0, 4.0)
@@ -115,6 +116,20 @@ def test_a_gaussian_that_is_densest_behind_the_camera_gives_no_point(backend, si
     assert drawn.dominant_ids[2, 2] == 0
     assert expected.ids[2, 2] == found.ids[2, 2]
     assert found.ids[2, 2] != 0
+
+
+@law("chord", "dominant_points", cx=st.sampled_from([0.5, 1.75, 4.0]), cy=st.sampled_from([-1.0, 0.5, 3.25]))
+def test_where_the_profile_centres_the_principal_point_rays_pass_about_the_middle_of_the_picture(backend, cx, cy):
+    camera = Camera(np.eye(4), np.array([[4.0, 0, cx], [0, 8.0, cy], [0, 0, 1]]), 5, 4)
+    one = ([[0.0, 0.0, 4.0]], [[1.0, 0.0, 0.0, 0.0]], [[2.0, 2.0, 1.0]], [0.75], np.zeros((1, 1, 3)))
+    given = screened(backend, Scene(Gaussians(*map(np.array, one)), camera, profile=INRIA))
+    found, _ = _drawn(backend, given)
+    some = found.ids >= 0
+    assert np.any(some)
+    x, y = np.meshgrid(np.arange(5) + 0.5 - 2.5, np.arange(4) + 0.5 - 2.0)
+    p = found.points
+    for off in (4.0 * p[..., 0] - x * p[..., 2], 8.0 * p[..., 1] - y * p[..., 2]):
+        assert_close("chord.ray", off[some], 0.0 * off[some], 64.0, backend.dtype)
 
 
 @law("chord", "dominant_points", scene=scenes(anchored=True))

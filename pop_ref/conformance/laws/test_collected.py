@@ -6,6 +6,7 @@ Rounding decides nothing that is compared, so that counts and flags are equal ex
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import numpy as np
@@ -145,14 +146,71 @@ def test_a_training_whose_rates_are_zero_moves_nothing(backend):
             assert_same_bits(name, got["params"][name], value.astype(backend.dtype))
 
 
+@law("training", "collected_statistics")
+def test_the_mean_opacity_and_the_mean_scale_pull_at_opacities_and_at_scales(backend):
+    watch, found = dataclasses.replace(_watch(0), order=(0,)), []
+    for weight in (64.0, 192.0):
+        asked = dataclasses.replace(watch, regularizers={"opacity_reg": weight, "scale_reg": 2.0 * weight})
+        found.append(backend.stage("collected_statistics")(asked)[0]["first_moments"])
+    p, n = watch.params, len(watch.params["means"])
+    o = 1.0 / (1.0 + np.exp(-p["opacities"]))
+    # a tenth of the first gradient; whatever else pulls is there both times
+    slopes = {"opacities": o * (1.0 - o) / n, "scales": 2.0 * np.exp(p["scales"]) / (3.0 * n)}
+    for name, slope in slopes.items():
+        difference, size = found[1][name] - found[0][name], 19.2 * slope + 0.1
+        assert_close("training.regularizers", difference, 12.8 * slope, size, backend.dtype)
+
+
+@law("training", "written_meta")
+def test_what_a_strategy_writes_into_meta_stays_whether_it_was_read_before_or_not(backend):
+    # as counts inside a mask take the place of those of the whole picture
+    assert backend.stage("written_meta")(_watch(0)) == []
+
+
+@law("training", "blank_losses")
+def test_where_nothing_is_drawn_and_a_photograph_is_clear_both_are_the_same_background(backend):
+    # in the colours of the photograph, whatever its exposure
+    exposure = np.array([[0.5, 0.25, 0.0, 0.125], [0.0, 0.75, 0.0, 0.25], [0.25, 0.0, 1.0, -0.125]])
+    for loss in backend.stage("blank_losses")(_watch(0), exposure):
+        # the square of a rounding
+        assert loss <= (8.0 * np.finfo(backend.dtype).eps) ** 2, f"a loss of {loss} is left"
+
+
+@law("training", "view_order")
+def test_every_epoch_shows_every_view_once_in_an_order_of_its_own(backend):
+    n, epochs = 7, 6
+    drawn = backend.stage("view_order")(n, 3, n * epochs)
+    orders = [tuple(drawn[n * k : n * (k + 1)]) for k in range(epochs)]
+    assert all(sorted(order) == list(range(n)) for order in orders)
+    # of six orders of seven views hardly two are alike
+    assert len(set(orders)) >= epochs - 1
+    assert backend.stage("view_order")(n, 3, n * epochs) == drawn
+    assert backend.stage("view_order")(n, 4, n * epochs) != drawn
+
+
+@law("training", "scaled_settings")
+def test_a_shorter_schedule_changes_the_gaussians_less_often_and_resets_no_sooner(backend):
+    recovery = ("reset_every", "pause_refine_after_reset", "prune_too_big_after")
+    for method in ("pop", "3dgs"):
+        for factor in (0.125, 0.5, 2.0):
+            own, scaled = backend.stage("scaled_settings")(method, factor)
+            for name in ("refine_start_iter", "refine_stop_iter"):
+                assert scaled[name] == round(own[name] * factor), name
+            assert scaled["refine_every"] == max(round(own["refine_every"] * factor), min(100, own["refine_every"]))
+            for name in recovery:
+                assert scaled[name] == max(round(own[name] * factor), own[name]), name
+            for name in ("grow_grad2d", "prune_opa", "theta_blur"):
+                assert scaled[name] == own[name], name
+
+
 def _map(camera):
     return np.mod(np.arange(camera.height * camera.width, dtype=np.float64), 7.0).reshape(camera.height, camera.width)
 
 
 @law("training", "view_passes")
 def test_passes_over_photographs_sum_what_their_views_show(backend):
-    for masked in (False, True):
-        watch = _watch(0, masked=masked)
+    for asks in ({}, {"masked": True}, {"antialiased": True}):
+        watch = _watch(0, **asks)
         for view in range(VIEWS):
             found = backend.stage("view_passes")(watch, view, DIVISOR)
             given = screened(backend, watch.scene(view, watch.steps))

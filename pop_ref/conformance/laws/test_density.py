@@ -220,13 +220,14 @@ def test_the_faint_are_pruned_and_later_the_far_too_large(backend, opacity, scen
 
 @law("density", "densifies_at", "resets_at", step=st.integers(0, 170).map(lambda k: 100 * k), later=st.integers(-1, 1))
 def test_the_gaussians_change_every_hundred_steps_and_opacities_are_reset_where_that_is_asked_for(backend, step, later):
-    at = max(step + later, 0)
-    due = at % 100 == 0 and 500 < at < 15_000
-    for reset_every, at_zero, pause in ((0, False, 0), (0, True, 0), (3000, False, 0), (3000, True, 300)):
-        config = DensityConfig(reset_every=reset_every, reset_at_zero=at_zero, pause_refine_after_reset=pause)
-        resets = reset_every > 0 and at % 3000 == 0 and at < 15_000 and (at > 0 or at_zero)
-        assert backend.stage("densifies_at")(at, config) == (due and at % 3000 >= pause)
-        assert backend.stage("resets_at")(at, config) == resets
+    # with what is drawn, both ends, which hardly anything drawn hits
+    for at in (max(step + later, 0), 0, 500, 600, 14_900, 15_000):
+        due = at % 100 == 0 and 500 < at < 15_000
+        for reset_every, at_zero, pause in ((0, False, 0), (0, True, 0), (3000, False, 0), (3000, True, 300)):
+            config = DensityConfig(reset_every=reset_every, reset_at_zero=at_zero, pause_refine_after_reset=pause)
+            resets = reset_every > 0 and at % 3000 == 0 and at < 15_000 and (at > 0 or at_zero)
+            assert backend.stage("densifies_at")(at, config) == (due and at % 3000 >= pause)
+            assert backend.stage("resets_at")(at, config) == resets
 
 
 @law("density", "densify_and_prune", choices=choices, scene_scale=scene_scales)

@@ -12,7 +12,8 @@ from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.law import law
 from pop_ref.conformance.strategies import arrays_of, dyadic, viewmats
 from pop_ref.records import Camera
-from pop_ref.settings import AppearanceRates
+from pop_ref.settings import AppearanceRates, Recipe
+from pop_ref.training import start
 
 ORACLE = OracleAdapter()
 H, W = 4, 6
@@ -87,6 +88,23 @@ def test_points_behind_the_camera_outside_the_picture_or_left_out_by_a_mask_have
     expected = np.stack([u, v], 1)[shown]
     assert_close("few_photographs.places", places, expected, 256.0 * size, backend.dtype)
     assert_close("few_photographs.places", disparities, 1.0 / z[shown], 256.0 * size, backend.dtype)
+
+
+@law("few_photographs", "train_step", scene_scale=st.sampled_from([0.25, 2.0, 8.0]))
+def test_the_depth_of_sparse_points_weighs_in_units_of_the_scene(backend, scene_scale):
+    # one Gaussian at depth 4, where a point says 2: |1 / 4 - 1 / 2|
+    params = {
+        "means": np.array([[0.0, 0.0, 4.0]]), "quats": np.array([[1.0, 0.0, 0.0, 0.0]]), "scales": np.zeros((1, 3)),
+        "opacities": np.zeros(1), "sh0": np.zeros((1, 1, 3)),
+    }  # fmt: skip
+    camera = Camera(np.eye(4), np.array([[4.0, 0.0, 5.5], [0.0, 4.0, 5.5], [0.0, 0.0, 1.0]]), 11, 11)
+    seen = (start(params), camera, np.full((11, 11, 3), 0.5), scene_scale, lambda n: np.zeros((2, n, 3)))
+    losses = [
+        backend.stage("train_step")(*seen, Recipe(depth_lambda=weight), np.array([[0.0, 0.0, 2.0]]))[1]
+        for weight in (0.5, 1.5)
+    ]
+    expected = 0.25 * scene_scale
+    assert_close("few_photographs.depth", losses[1] - losses[0], expected, 1.0 + expected, backend.dtype)
 
 
 @law("few_photographs", "mean_activation", "mean_activation_vjp")

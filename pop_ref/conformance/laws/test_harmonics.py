@@ -134,3 +134,22 @@ def test_the_gradient_to_a_direction_is_orthogonal_to_it(backend, sh, direction)
     _, v_dirs = backend.stage("colors_from_sh_vjp")(sh, d, 3, np.ones((1, 3)))
     size = (1.0 + np.sum(np.abs(sh))) * 4.0
     assert_close("harmonics.orthogonal", np.sum(d * v_dirs), 0.0, size, backend.dtype)
+
+
+@law(
+    "harmonics",
+    "lower_degree",
+    sh=arrays_of((1, 4, 3), -1.0, 1.0),
+    direction=directions,
+    weight=st.sampled_from([0.0, 0.5, 1.0, 3.0]),
+    uniform=st.sampled_from([0.25, 1.0, 2.0]),
+)
+def test_a_band_less_is_made_up_for_where_a_view_shows_it_by_its_weight(backend, sh, direction, weight, uniform):
+    # of one view: the share w / (w + u) of what the dropped band showed it, in units of the first harmonic
+    d = _row(backend, direction)
+    x, y, z = d[0] / np.linalg.norm(d)
+    dropped = np.sqrt(3.0) * (-y * sh[0, 1] + z * sh[0, 2] - x * sh[0, 3])
+    found = backend.stage("lower_degree")(sh, d[None], np.array([[weight]]), 0, uniform)
+    expected = sh[:, :1] + weight / (weight + uniform) * dropped
+    size = 1.0 + np.sum(np.abs(sh), axis=1, keepdims=True)
+    assert_close("harmonics.lower", found, expected, size, backend.dtype)

@@ -83,11 +83,16 @@ def test_a_centre_on_the_far_plane_is_drawn_and_one_on_the_near_plane_as_the_pro
     for plane, drawn in (("far_plane", True), ("near_plane", not scene.profile.near_inclusive)):
         called = backend.call(Call(((Frame(scene, None),),), planes={plane: 3.0}))
         assert (called.alphas.max() > 0.25) == drawn, f"depth 3 at {plane}=3 is {'culled' if drawn else 'drawn'}"
+    # nearer than any default; 0 is a plane like any other, and none that was left out
+    nearer = {"means": np.array([[0.0, 0.0, 2.0**-10]]), "scales": np.full((1, 3), 2.0**-12)}
+    called = backend.call(Call(((Frame(scene.with_overrides(**nearer), None),),), planes={"near_plane": 0.0}))
+    assert called.alphas.max() > 0.25, "depth 2^-10 at near_plane=0 is culled"
 
 
 @law("signature", *JUDGED, PLANES)
 def test_the_low_pass_is_as_wide_as_the_call_says(backend):
-    for eps2d in (0.0625, 2.0):
+    # 0 is a width like any other, and none that was left out
+    for eps2d in (0.0625, 2.0, 0.0):
         call = Call((frames(backend, 6),), planes={"eps2d": eps2d})
         _assert_it_matters(backend, call, planes={})
         assert_call_is_the_oracles(backend, call)

@@ -28,10 +28,10 @@ def _conic(a, c, leaning):
     return np.array([c, -b, a]) / (a * c - b * b)
 
 
-def _least_exponent(mean2d, conic, x, y):
+def _least_exponent(mean2d, conic, x, y, size=SIZE):
     """Return the least exponent over a closed tile: at the centre, or on an edge, along which it is a parabola."""
     (A, B, C), (u, v) = conic, mean2d
-    left, right, top, bottom = x * SIZE - u, (x + 1) * SIZE - u, y * SIZE - v, (y + 1) * SIZE - v
+    left, right, top, bottom = x * size - u, (x + 1) * size - u, y * size - v, (y + 1) * size - v
     if left <= 0.0 <= right and top <= 0.0 <= bottom:
         return 0.0
     ends = [(dx, min(max(-B * dx / C, top), bottom)) for dx in (left, right)]
@@ -69,12 +69,18 @@ def test_a_splat_that_cannot_be_seen_has_no_box_and_no_tiles_under_the_floor(bac
 def test_a_tile_is_kept_exactly_if_it_meets_the_ellipse_of_what_can_be_seen(backend, at, a, c, leaning, opacity):
     conic = _conic(a, c, leaning)
     at, conic = rounded((at, conic), backend.dtype)
-    tiles = backend.stage("accutile")(at, conic, opacity, (0, 0, ACROSS, DOWN), SIZE)
+    # the smaller the tiles, the nearer an end of a row has to be
+    for size in (SIZE, 1):
+        _assert_kept(backend, at, conic, opacity, ACROSS * SIZE // size, DOWN * SIZE // size, size)
+
+
+def _assert_kept(backend, at, conic, opacity, across, down, size):
+    tiles = backend.stage("accutile")(at, conic, opacity, (0, 0, across, down), size)
     kept = {(int(x), int(y)) for x, y in tiles}
     assert len(kept) == len(tiles)
-    for x in range(ACROSS):
-        for y in range(DOWN):
-            least = _least_exponent(at, conic, x, y)
+    for x in range(across):
+        for y in range(down):
+            least = _least_exponent(at, conic, x, y, size)
             slack = least - math.log(opacity / PAPER.alpha_floor)
             # a tile that is met at a point is met or not by rounding
             if abs(slack) > 2.0**14 * np.finfo(backend.dtype).eps * (1.0 + least):

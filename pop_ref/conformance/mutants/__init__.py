@@ -4,6 +4,8 @@ from pop_ref.conformance.mutants.baselines import BASELINES
 from pop_ref.conformance.mutants.black_box import BLACK_BOXES as SINGLE
 from pop_ref.conformance.mutants.black_box import BlackBox
 from pop_ref.conformance.mutants.blind import BLIND, BLIND_BOXES, BLIND_PROGRAM
+from pop_ref.conformance.mutants.blind_second import BLIND_SECOND, BLIND_SECOND_PROGRAM
+from pop_ref.conformance.mutants.blind_second_boxes import BLIND_SECOND_BOXES
 from pop_ref.conformance.mutants.collected import COLLECTED
 from pop_ref.conformance.mutants.combined import COMBINED
 from pop_ref.conformance.mutants.copies import Mutant, living
@@ -19,10 +21,13 @@ from pop_ref.conformance.mutants.unseen import UNSEEN
 from pop_ref.conformance.mutants.unseen_boxes import UNSEEN_BOXES
 
 # of the oracle, and of the program that trains
-MUTANTS = (*GEOMETRY, *PIXELS, *TRAINING, *BASELINES, *METHOD_MUTANTS, *BLIND)
-PROGRAM = (*LINES, *TRAINERS, *COLLECTED, *STRANGERS, *UNSEEN, *BLIND_PROGRAM)
+MUTANTS = (*GEOMETRY, *PIXELS, *TRAINING, *BASELINES, *METHOD_MUTANTS, *BLIND, *BLIND_SECOND)
+PROGRAM = (*LINES, *TRAINERS, *COLLECTED, *STRANGERS, *UNSEEN, *BLIND_PROGRAM, *BLIND_SECOND_PROGRAM)
 # behind gsplat's signature: one argument broken, several together; autograd, memory, size
-BLACK_BOXES = (*SINGLE, *COMBINED, *SEAMS, *TRAINERS_BOXES, *STRANGERS_BOXES, *UNSEEN_BOXES, *BLIND_BOXES)
+BLACK_BOXES = (
+    *(*SINGLE, *COMBINED, *SEAMS, *TRAINERS_BOXES, *STRANGERS_BOXES, *UNSEEN_BOXES),
+    *(*BLIND_BOXES, *BLIND_SECOND_BOXES),
+)
 
 # they are counted apart: what the kit has to see from outside says nothing of what stages show
 FAMILIES = {"stages of the oracle": MUTANTS, "the program that trains": PROGRAM, "whole rasterizers": BLACK_BOXES}
