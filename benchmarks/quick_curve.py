@@ -25,7 +25,7 @@ import numpy as np
 if __package__ in (None, ""):
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.record import machine, read_json, with_table, write_json
+from benchmarks.record import commit, machine, read_json, with_table, write_json
 from pop_fast.data import Capture, load_capture
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.choose import choose_backend
@@ -138,6 +138,7 @@ def main(words: list[str] | None = None) -> int:
                 done = kept["runs"].setdefault(name, {}).setdefault(str(seed), {})
                 if kind not in done:
                     done[kind] = curve(kind, capture, args.capture, seed)
+                    kept.setdefault("commits", {})[name] = commit(Path(__file__).resolve().parent)
                     write_json(args.json, kept)
     text = "\n".join([*ends_table(kept["runs"]), "", *curve_table(kept["runs"])])
     notes = Path(__file__).resolve().parent / "NOTES.md"
