@@ -127,10 +127,14 @@ def work(loads: Loads) -> dict[str, tuple[float, float]]:
     return {
         # 36 bytes for the lists, and a packed splat where one is seen
         "project": (4 * (GEOMETRY * (n - seen) + PARAMETERS * seen) + 36 * n + ROW * seen, 0.0),
-        # four passes of an 8-byte pair over 32-bit depths, extents read, counts written
-        "count_instances": ((4 * 16 + ROW + 8) * n, WARP * issued_per(COUNT, "32 tiles")[0] * loads.tried / WARP),
+        # what a tile is tried by, a count for each splat and a bit for each tile that was tried
+        "count_tiles": ((32 + 4) * n + loads.tried / 8, issued_per(COUNT, "32 tiles tried")[0] * loads.tried),
+        # depths and extents read, four passes of an 8-byte pair over 32-bit depths
+        "sort_by_depth": ((8 + 8 + 4 * 16) * n, 0.0),
+        # the order read twice, counts read, first slots written
+        "number_instances": (4 * 4 * n, 0.0),
         # emitted once, two passes of a 6-byte pair over 16-bit tiles, ids and slots written
-        "make_tile_lists": ((6 + 2 * 12 + 12) * entries, WARP * issued_per(EMIT, "32 tiles")[0] * loads.tried / WARP),
+        "make_tile_lists": ((6 + 2 * 12 + 12) * entries, issued_per(EMIT, "32 tiles listed")[0] * loads.tried),
         "blend_forward": ((ROW + 4) * entries + 20 * pixels, WARP * blend_work("blend_forward", loads)[0]),
         # a pixel and channel: 215 for its window, 162 for its gradient
         "photometric": (8 * 12 * pixels, (215.0 + 162.0) * 3 * pixels),

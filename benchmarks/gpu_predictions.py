@@ -41,8 +41,10 @@ USED, NODE = 0.7, 0.004
 NODES = {
     "begin_step": 1,
     "project": 1,
-    "count_instances": 14,
-    "make_tile_lists": 13,
+    "count_tiles": 1,
+    "sort_by_depth": 13,
+    "number_instances": 2,
+    "make_tile_lists": 11,
     "blend_forward": 1,
     "photometric": 2,
     "blend_backward": 2,

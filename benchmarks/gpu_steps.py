@@ -15,6 +15,7 @@ from gpu_profile import kernel_sums
 from gpu_visits import count_tried, count_visits
 from torch import Tensor
 
+from cuda_ext.render import lists
 from cuda_ext.training import step_program
 from cuda_ext.training.resident import ResidentViews
 from cuda_ext.training.train_step import FusedTrainer
@@ -24,8 +25,8 @@ from pop_fast.train.steps import Phase, StepSettings
 PLAIN, POP = Phase(3, False, False, False), Phase(3, True, True, True)
 # what a step launches, in order (`StepProgram.launch`)
 KERNELS = (
-    *("begin_step", "project", "count_instances", "make_tile_lists", "blend_forward", "photometric"),
-    *("blend_backward", "count_important", "update", "end_step"),
+    *("begin_step", "project", "count_tiles", "sort_by_depth", "number_instances", "make_tile_lists"),
+    *("blend_forward", "photometric", "blend_backward", "count_important", "update", "end_step"),
 )
 HEAD_START = 5_000_000  # cycles the GPU waits before a step, longer than Python needs to launch one
 
@@ -122,11 +123,13 @@ class _TimedKernels:
 def _timed_kernels() -> Iterator[_TimedKernels]:
     load = step_program.load
     timed = _TimedKernels(load())
-    step_program.load = lambda: timed
+    for module in (step_program, lists):
+        module.load = lambda: timed
     try:
         yield timed
     finally:
-        step_program.load = load
+        for module in (step_program, lists):
+            module.load = load
 
 
 def kernel_times(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -119,6 +121,34 @@ def empty(
 def stream_of(device: torch.device) -> int:
     """Return the address of torch's current stream, on which every kernel runs."""
     return torch.cuda.current_stream(device).cuda_stream
+
+
+class SideStream:
+    """A stream beside the current one, for kernels that need nothing of each other.
+
+    Args:
+        device: where.
+        used: False, or a device without streams: all kernels are asked for in turn.
+    """
+
+    def __init__(self, device: torch.device, used: bool = True) -> None:
+        self._device = device
+        self._stream = torch.cuda.Stream(device) if used and device.type == "cuda" else None
+
+    @contextmanager
+    def beside(self) -> Iterator[None]:
+        """Ask for what follows beside what the current stream is asked for next, after what it was asked for before."""
+        if self._stream is None:
+            yield
+            return
+        self._stream.wait_stream(torch.cuda.current_stream(self._device))
+        with torch.cuda.stream(self._stream):
+            yield
+
+    def join(self) -> None:
+        """Let the current stream wait for what was asked for beside it."""
+        if self._stream is not None:
+            torch.cuda.current_stream(self._device).wait_stream(self._stream)
 
 
 def new_state(device: torch.device) -> Tensor:

@@ -104,8 +104,7 @@ void bind_blend(nb::module_& m) {
     pointer_pair(lists, "order_unsorted", "order", &TileLists::order);
     pointer_pair(lists, "tile_keys", "tile_keys_sorted", &TileLists::tile_keys);
     pointer_pair(lists, "slots_unsorted", "slots", &TileLists::slots);
-    POINTER(lists, TileLists, counts);
-    POINTER(lists, TileLists, offsets);
+    POINTER(lists, TileLists, hits);
     POINTER(lists, TileLists, slot_splat);
     POINTER(lists, TileLists, listed);
     POINTER(lists, TileLists, tile_begin);
@@ -178,8 +177,15 @@ void bind_functions(nb::module_& m) {
         pack_records(n, channels, s, alpha_floor, reinterpret_cast<float*>(records), as_stream(stream));
     });
     m.def("tile_workspace", &tile_workspace);
-    m.def("count_instances", [](const TileLists& l, const SplatArrays& s, const Profile<float>& p, P state, P stream) {
-        count_instances(l, s, p, as_state(state), as_stream(stream));
+    m.def("hit_words", &hit_words);
+    m.def("sort_by_depth", [](const TileLists& l, const SplatArrays& s, P stream) {
+        sort_by_depth(l, s, as_stream(stream));
+    });
+    m.def("count_tiles", [](const TileLists& l, const SplatArrays& s, const Profile<float>& p, P stream) {
+        count_tiles(l, s, p, as_stream(stream));
+    });
+    m.def("number_instances", [](const TileLists& l, P state, P stream) {
+        number_instances(l, as_state(state), as_stream(stream));
     });
     m.def("make_tile_lists", [](const TileLists& l, const SplatArrays& s, const Profile<float>& p, P dominant_counts,
                                 P state, P stream) {

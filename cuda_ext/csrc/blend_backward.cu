@@ -34,19 +34,33 @@ __device__ __forceinline__ float* row_of(const TileLists& lists, const BlendBack
     return blend.rows + RECORD * (slot * tile.parts + tile.part);
 }
 
-// Entries behind every pixel's last splat have no gradient, but their slots are read. A lane clears a row, and asks for
-// the next slot without waiting for the stores.
-__device__ __forceinline__ void clear_unused(const TileLists& lists, const BlendBackward& blend, const WarpTile& tile,
-                                             int last, int end, int lane) {
-    const float4 zero = {0.0f, 0.0f, 0.0f, 0.0f};
-#pragma unroll 2
-    for (int entry = last + lane; entry < end; entry += WARP) {  // per 32 unused entries
-        const size_t slot = __ldg(lists.slots[1] + entry);
-        float4* row = reinterpret_cast<float4*>(blend.rows + RECORD * (slot * tile.parts + tile.part));
+// Entries behind every pixel's last splat have no gradient, but their slots are read. A lane clears rows; the slots of a
+// list's last entries are asked for before it is known which of them are behind.
+struct LastSlots {
+    static constexpr int EACH = 4;
+    unsigned slots[EACH];
+
+    __device__ __forceinline__ LastSlots(const TileLists& lists, int begin, int end, int lane) {
 #pragma unroll
-        for (int k = 0; k < RECORD / 4; ++k) row[k] = zero;
+        for (int j = 0; j < EACH; ++j)
+            slots[j] = end > begin ? read_here(lists.slots[1] + max(end - 1 - lane - WARP * j, begin)) : 0u;
     }
-}
+
+    __device__ __forceinline__ void clear_from(const TileLists& lists, const BlendBackward& blend,
+                                               const WarpTile& tile, int last, int end, int lane) const {
+#pragma unroll
+        for (int j = 0; j < EACH; ++j)
+            if (end - 1 - lane - WARP * j >= last) clear(blend, tile, slots[j]);
+        for (int entry = last + lane; entry < end - EACH * WARP; entry += WARP)  // per 32 unused entries
+            clear(blend, tile, __ldg(lists.slots[1] + entry));
+    }
+
+    static __device__ __forceinline__ void clear(const BlendBackward& blend, const WarpTile& tile, unsigned slot) {
+        float4* row = reinterpret_cast<float4*>(blend.rows + RECORD * (size_t(slot) * tile.parts + tile.part));
+#pragma unroll
+        for (int k = 0; k < RECORD / 4; ++k) row[k] = {0.0f, 0.0f, 0.0f, 0.0f};
+    }
+};
 
 // Read what a lane's pixels start from; returns the end of the list for them.
 template <int CH>
@@ -125,9 +139,12 @@ __global__ void __launch_bounds__(WARP* SUM_WARPS, CH < 4 && !ABS ? 10 : 0)
     const float px = float(x) + 0.5f, py = float(y) + 0.5f;
     const int begin = lists.tile_begin[tile.list], end = lists.tile_end[tile.list];
     BackwardColumn<float, CH, COLUMN_ROWS> column;
+    const LastSlots last_slots(lists, begin, ATOMIC ? begin : end, lane);
     const QuarterEnds ends(load_column(lists, blend, x, y, column));
     const int last = begin + ends.of_tile();
-    if (!ATOMIC) clear_unused(lists, blend, tile, last, end, lane);
+    // of the batch to come: a record waits for its number, and this only for the batch before
+    unsigned next_splat = last > begin ? read_here(lists.listed + max(last - 1 - lane, begin)) : 0u;
+    if (!ATOMIC) last_slots.clear_from(lists, blend, tile, last, end, lane);
     if (lane == 0) sums.batch.put(WARP, Record{});
 
     const unsigned* queue = sums.queues.words + Queues::WORDS * quarter_of(lane);
@@ -136,8 +153,9 @@ __global__ void __launch_bounds__(WARP* SUM_WARPS, CH < 4 && !ABS ? 10 : 0)
         unsigned quarters = 0;
         float* row = nullptr;
         __syncwarp();
+        const unsigned splat = next_splat;
+        next_splat = read_here(lists.listed + max(entry - WARP, begin));
         if (entry >= begin) {
-            const unsigned splat = lists.listed[entry];
             const Record record = load_record(blend.records, splat);
             sums.batch.put(lane, record);
             row = ATOMIC ? blend.sums + size_t(RECORD) * splat : row_of(lists, blend, tile, entry);
@@ -259,48 +277,113 @@ __global__ void __launch_bounds__(WARP* WARPS_PER_BLOCK)
     }
 }
 
-constexpr int SPLATS = 4;  // of a warp
+constexpr int SUM_BLOCK = 256, SPLATS = 4, AT_ONCE = 2;  // splats of a warp; rounds of 8 slots that are read at once
+constexpr int PIECES = RECORD / 4, SLOTS = WARP / 4;     // float4 of a row; of a round
+constexpr unsigned LONG = 128;                           // slots with which a splat is a block's
 
 __device__ __forceinline__ void add(float4& total, const float4& v) {
     total = {total.x + v.x, total.y + v.y, total.z + v.z, total.w + v.w};
 }
 
-// One warp four splats: of each eight rows at a time, three float4 a row, added in a fixed order. Most splats have few
-// rows, and what is waited for is where they lie and the first of them: of four splats together, not one by one.
-__global__ void sum_slots_kernel(TileLists lists, BlendBackward blend, int parts) {
-    constexpr int PIECES = RECORD / 4, STRIDE = PIECES * WARP / 4;
-    const int first = (blockIdx.x * blockDim.x + threadIdx.x) / WARP * SPLATS, lane = threadIdx.x & (WARP - 1);
-    const size_t most = size_t(lists.capacity) * parts;
-    const float4* rows = reinterpret_cast<const float4*>(blend.rows);
-    float4* sums = reinterpret_cast<float4*>(blend.sums) + PIECES * size_t(first);
-    const float4 *row[SPLATS], *end[SPLATS];
-    float4 total[SPLATS] = {};
-    bool any[SPLATS];
-#pragma unroll
-    for (int k = 0; k < SPLATS; ++k) {
-        const size_t begin = first + k < lists.n ? size_t(lists.splat_begin[first + k]) * parts : 0;
-        const size_t count = first + k < lists.n ? size_t(lists.splat_count[first + k]) * parts : 0;
-        any[k] = count > 0;
-        end[k] = rows + PIECES * (begin + count < most ? begin + count : most);
-        row[k] = (lane & 3) < PIECES ? rows + PIECES * (begin + lane / 4) + (lane & 3) : end[k];
+// the rows of a splat as a lane reads them: a piece of every eighth
+struct SlotRows {
+    const float4* rows;
+    size_t begin, end;
+
+    __device__ __forceinline__ SlotRows(const TileLists& lists, const BlendBackward& blend, int parts, unsigned first,
+                                        unsigned count) {
+        const int lane = threadIdx.x & (WARP - 1);
+        const size_t most = size_t(lists.capacity) * parts, past = (size_t(first) + count) * parts;
+        rows = reinterpret_cast<const float4*>(blend.rows) + (lane & 3);
+        begin = size_t(first) * parts + lane / 4;
+        end = (lane & 3) < PIECES ? (past < most ? past : most) : 0;
     }
+    __device__ __forceinline__ float4 at(size_t row) const { return read_here(rows + PIECES * row, row < end); }
+};
+
+// over the eight lanes that have the same piece
+__device__ __forceinline__ void sum_over_lanes(float4& total) {
 #pragma unroll
-    for (int k = 0; k < SPLATS; ++k)
-        if (row[k] < end[k]) add(total[k], *row[k]);
+    for (int mask = 4; mask < WARP; mask *= 2) {
+        total.x += __shfl_xor_sync(FULL_WARP, total.x, mask);
+        total.y += __shfl_xor_sync(FULL_WARP, total.y, mask);
+        total.z += __shfl_xor_sync(FULL_WARP, total.z, mask);
+        total.w += __shfl_xor_sync(FULL_WARP, total.w, mask);
+    }
+}
+
+// The splats of a block that have many slots, all warps on one after the other: a warp alone would be waited for.
+__device__ __forceinline__ void sum_long_splats(const TileLists& lists, const BlendBackward& blend, int parts) {
+    constexpr int WARPS = SUM_BLOCK / WARP;
+    static_assert(WARPS * SPLATS == WARP, "a lane asks for a splat of the block");
+    __shared__ float4 of_warps[WARPS][PIECES];
+    const int lane = threadIdx.x & (WARP - 1), warp = threadIdx.x / WARP, first = blockIdx.x * WARP;
+    const unsigned own = first + lane < lists.n ? lists.splat_count[first + lane] : 0u;
+    for (unsigned left = __ballot_sync(FULL_WARP, own >= LONG); left; left &= left - 1) {
+        const int splat = first + __ffs(int(left)) - 1;
+        const SlotRows rows(lists, blend, parts, lists.splat_begin[splat], lists.splat_count[splat]);
+        float4 total = {0.0f, 0.0f, 0.0f, 0.0f};
+        const size_t end = rows.end;
+#pragma unroll 1
+        for (size_t row = rows.begin + SLOTS * warp; row < end; row += 4 * WARPS * SLOTS) {  // per 32 slots
+            float4 read[4];
 #pragma unroll
-    for (int k = 0; k < SPLATS; ++k) {
-        if (any[k]) {
-            for (row[k] += STRIDE; row[k] < end[k]; row[k] += STRIDE) add(total[k], *row[k]);  // per 8 slots
+            for (int j = 0; j < 4; ++j) read[j] = rows.at(row + WARPS * SLOTS * j);
 #pragma unroll
-            for (int mask = 4; mask < WARP; mask *= 2) {
-                total[k].x += __shfl_xor_sync(FULL_WARP, total[k].x, mask);
-                total[k].y += __shfl_xor_sync(FULL_WARP, total[k].y, mask);
-                total[k].z += __shfl_xor_sync(FULL_WARP, total[k].z, mask);
-                total[k].w += __shfl_xor_sync(FULL_WARP, total[k].w, mask);
-            }
+            for (int j = 0; j < 4; ++j) add(total, read[j]);
         }
-        if (first + k < lists.n && lane < PIECES) sums[PIECES * k + lane] = total[k];
+        sum_over_lanes(total);
+        if (lane < PIECES) of_warps[warp][lane] = total;
+        __syncthreads();
+        if (threadIdx.x < PIECES) {
+            for (int k = 1; k < WARPS; ++k) add(total, of_warps[k][lane]);
+            reinterpret_cast<float4*>(blend.sums)[PIECES * size_t(splat) + lane] = total;
+        }
+        __syncthreads();
     }
+}
+
+// One warp four splats: of each eight rows at a time, three float4 a row, added in a fixed order. Most splats have few
+// rows, and what is waited for is where they lie and the first of them: so the first rounds of all four are asked for
+// together.
+__global__ void __launch_bounds__(SUM_BLOCK, 4) sum_slots_kernel(TileLists lists, BlendBackward blend, int parts) {
+    const int first = (blockIdx.x * SUM_BLOCK + threadIdx.x) / WARP * SPLATS, lane = threadIdx.x & (WARP - 1);
+    float4* sums = reinterpret_cast<float4*>(blend.sums) + PIECES * size_t(first);
+    unsigned begin[SPLATS], count[SPLATS];
+#pragma unroll
+    for (int k = 0; k < SPLATS; ++k) {
+        const int splat = min(first + k, lists.n - 1);
+        begin[k] = read_here(lists.splat_begin + splat);
+        count[k] = read_here(lists.splat_count + splat);
+    }
+    float4 read[SPLATS][AT_ONCE];
+#pragma unroll
+    for (int k = 0; k < SPLATS; ++k) {
+        const SlotRows rows(lists, blend, parts, begin[k], count[k] < LONG ? count[k] : 0u);
+#pragma unroll
+        for (int j = 0; j < AT_ONCE; ++j) read[k][j] = rows.at(rows.begin + SLOTS * j);
+    }
+#pragma unroll
+    for (int k = 0; k < SPLATS; ++k) {
+        float4 total = read[k][0];
+#pragma unroll
+        for (int j = 1; j < AT_ONCE; ++j) add(total, read[k][j]);
+        if (count[k] >= LONG) continue;
+        if (count[k] > 0) {
+            const SlotRows rows(lists, blend, parts, begin[k], count[k]);
+#pragma unroll 1
+            for (size_t row = rows.begin + AT_ONCE * SLOTS; row < rows.end; row += AT_ONCE * SLOTS) {  // per 16 slots
+                float4 next[AT_ONCE];
+#pragma unroll
+                for (int j = 0; j < AT_ONCE; ++j) next[j] = rows.at(row + SLOTS * j);
+#pragma unroll
+                for (int j = 0; j < AT_ONCE; ++j) add(total, next[j]);
+            }
+            sum_over_lanes(total);
+        }
+        if (first + k < lists.n && lane < PIECES) sums[PIECES * k + lane] = total;
+    }
+    sum_long_splats(lists, blend, parts);
 }
 
 template <int CH, bool ABS, bool PASS, bool ATOMIC>
@@ -321,7 +404,7 @@ void launch(const TileLists& lists, const BlendBackward& blend, const BlendConst
     if (!ATOMIC && lists.n > 0) {
         const int parts = (lists.grid.tile_w / WARP_TILE_W) * (lists.grid.tile_h / WARP_TILE_H);
         const long long warps = (lists.n + SPLATS - 1) / SPLATS;
-        sum_slots_kernel<<<blocks_for(warps * WARP, 256), 256, 0, stream>>>(lists, blend, parts);
+        sum_slots_kernel<<<blocks_for(warps * WARP, SUM_BLOCK), SUM_BLOCK, 0, stream>>>(lists, blend, parts);
         POP_LAUNCHED("sum_slots_kernel");
     }
 }

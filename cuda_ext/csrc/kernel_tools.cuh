@@ -92,6 +92,43 @@ __device__ __forceinline__ void copies_arrive() {
 #endif
 }
 
+// Reads of what no thread writes meanwhile, made here and not later: the compiler moves a plain load down to where it is
+// needed, behind a branch or the wait for another one, so that a warp waits for one after the other.
+__device__ __forceinline__ float read_here(const float* from) {
+#ifdef __CUDA_ARCH__
+    float value;
+    asm volatile("ld.global.nc.f32 %0, [%1];" : "=f"(value) : "l"(from));
+    return value;
+#else
+    return *from;
+#endif
+}
+
+__device__ __forceinline__ unsigned read_here(const unsigned* from) {
+#ifdef __CUDA_ARCH__
+    unsigned value;
+    asm volatile("ld.global.nc.u32 %0, [%1];" : "=r"(value) : "l"(from));
+    return value;
+#else
+    return *from;
+#endif
+}
+
+// or zeros
+__device__ __forceinline__ float4 read_here(const float4* from, bool there) {
+#ifdef __CUDA_ARCH__
+    float4 v;
+    asm volatile(
+        "{ .reg .pred p; setp.ne.s32 p, %5, 0; mov.f32 %0, 0f00000000; mov.f32 %1, 0f00000000; mov.f32 %2, 0f00000000; "
+        "mov.f32 %3, 0f00000000; @p ld.global.nc.v4.f32 {%0, %1, %2, %3}, [%4]; }"
+        : "=f"(v.x), "=f"(v.y), "=f"(v.z), "=f"(v.w)
+        : "l"(from), "r"(int(there)));
+    return v;
+#else
+    return there ? *from : float4{0.0f, 0.0f, 0.0f, 0.0f};
+#endif
+}
+
 // Sum N values over 2 MASK lanes with N + about 4 shuffles: at every step half of the values go to the other half of the
 // lanes, and one that is left over is summed in both. Afterwards a lane holds the sum that sum_index tells.
 template <int N, int MASK>

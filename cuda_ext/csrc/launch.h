@@ -70,8 +70,7 @@ struct TileLists {
     TileGrid grid;
     unsigned* depth_keys[2];   // [n]
     unsigned* order[2];        // [n], splats front to back in order[1]
-    unsigned* counts;          // [n], tiles of the splat at each rank
-    unsigned* offsets;         // [n]
+    unsigned* hits;            // [hit_words(n)], a bit for each tile that was tried while counting; null if not exact
     void* tile_keys[2];        // [capacity], 16 or 32 bits
     unsigned* slots[2];        // [capacity]
     unsigned* slot_splat;      // [capacity], splat of an instance slot
@@ -169,10 +168,13 @@ void project(const GaussianArrays& gaussians, const ViewArrays& view, const Proj
 void pack_records(int n, int channels, const SplatArrays& splats, float alpha_floor, float* records,
                   cudaStream_t stream);
 size_t tile_workspace(int n, int capacity, int n_tiles);
-// Sorts by depth and counts; make_tile_lists continues from there. state->n_instances is written by the first where the
-// lists have no capacity yet, else by the second; it stops at INT_MAX.
-void count_instances(const TileLists& lists, const SplatArrays& splats, const Profile<float>& profile,
-                     DeviceState* state, cudaStream_t stream);
+size_t hit_words(int n);
+// Two that need nothing of each other, and number_instances, which needs both; make_tile_lists continues from there.
+// state->n_instances is written by number_instances where the lists have no capacity yet, else by make_tile_lists; it
+// stops at INT_MAX.
+void sort_by_depth(const TileLists& lists, const SplatArrays& splats, cudaStream_t stream);
+void count_tiles(const TileLists& lists, const SplatArrays& splats, const Profile<float>& profile, cudaStream_t stream);
+void number_instances(const TileLists& lists, DeviceState* state, cudaStream_t stream);
 // dominant_counts: [n], set to zero on the way for blend_forward; null for none
 void make_tile_lists(const TileLists& lists, const SplatArrays& splats, const Profile<float>& profile,
                      int* dominant_counts, DeviceState* state, cudaStream_t stream);

@@ -51,10 +51,23 @@ __device__ __forceinline__ bool kept(const Photograph& photo, unsigned pixel) {
 // takes one instruction, a 64-bit index about three.
 __device__ __forceinline__ unsigned value_of(unsigned pixel) { return unsigned(CHANNELS) * pixel; }
 
-// render and photograph; the photograph where the mask leaves the render out
-__device__ __forceinline__ float2 compared(const float* image, const uint8_t* photograph, unsigned value, bool keep) {
-    const float target = float(__ldg(photograph + value)) * BYTE;
-    return {keep ? __ldg(image + value) : target, target};
+// A pixel of the photograph in one word: its three bytes, and LEFT_OUT where a mask leaves it out.
+constexpr unsigned LEFT_OUT = 1u << 31;
+
+__device__ __forceinline__ unsigned word_of(const Photograph& photo, unsigned pixel) {
+    const uint8_t* p = photo.image + value_of(pixel);
+    const unsigned bytes = unsigned(__ldg(p)) | unsigned(__ldg(p + 1)) << 8 | unsigned(__ldg(p + 2)) << 16;
+    return kept(photo, pixel) ? bytes : bytes | LEFT_OUT;
+}
+
+struct Compared {
+    float render, target;
+};
+
+// one channel of render and photograph; the photograph where the mask leaves the render out
+__device__ __forceinline__ Compared compared(float render, unsigned word, int channel) {
+    const float target = float((word >> 8 * channel) & 0xffu) * BYTE;
+    return {word & LEFT_OUT ? target : render, target};
 }
 
 // The pixels of a block and around it, as a thread meets them while the tile is filled: it fills floats THREADS apart
@@ -165,42 +178,50 @@ __device__ __forceinline__ void begin_render(const Halo& halo, const float* imag
     }
 }
 
-// One channel of the photograph, whose bytes the channel before has brought near, and of the render what is left to do:
-// `keep` has the bits of the thread's pixels that no mask leaves out; of the others the render is the photograph.
-template <bool RENDER>
-__device__ __forceinline__ void finish_tiles(const Halo& halo, unsigned keep, const uint8_t* photograph, float* render,
-                                             float* target) {
-    float values[SLOTS] = {};
+// Read the photograph, all of its channels. Every byte is on its way before the first is waited for, so that some pixel's
+// are read also where there is none.
+__device__ __forceinline__ void read_photograph(const Halo& halo, const Photograph& photo, unsigned* words) {
+    unsigned read[SLOTS];
+#pragma unroll
+    for (int k = 0; k < SLOTS; ++k) read[k] = word_of(photo, unsigned(max(halo.pixel[k], 0)));
 #pragma unroll
     for (int k = 0; k < SLOTS; ++k)
-        if (halo.pixel[k] >= 0) values[k] = float(__ldg(photograph + value_of(halo.pixel[k]))) * BYTE;
-    if (RENDER) copies_arrive();
+        if (Halo::fills(k)) words[Halo::place(k)] = halo.pixel[k] >= 0 ? read[k] : 0u;
+}
+
+// Begin to read what is kept of one channel of the photograph: two values of each of the thread's own pixels.
+__device__ __forceinline__ void begin_moments(const Photograph& photo, size_t plane, int channel, unsigned first_pixel,
+                                              int width, int rows_inside, float (&moments)[N_OF_TARGET][RUN][THREADS]) {
+    const float *mu_y = photo.moments + channel * plane, *yy = mu_y + CHANNELS * plane;
 #pragma unroll
-    for (int k = 0; k < SLOTS; ++k) {
-        if (!Halo::fills(k)) continue;
-        target[Halo::place(k)] = values[k];
-        if (RENDER && !((keep >> k) & 1u)) render[Halo::place(k)] = values[k];
+    for (int k = 0; k < RUN; ++k) {
+        const bool there = k < rows_inside;
+        const unsigned pixel = there ? first_pixel + unsigned(k * width) : 0u;
+        begin_copy(&moments[Y][k][threadIdx.x], mu_y + pixel, there);
+        begin_copy(&moments[YY][k][threadIdx.x], yy + pixel, there);
     }
 }
 
 // what is blurred, of four neighbouring values
 template <bool RENDER, bool TARGET>
-__device__ __forceinline__ void four_products(const float* render, const float* target,
+__device__ __forceinline__ void four_products(const float* render, const unsigned* words, int channel,
                                               float (&values)[N_MAPS<RENDER, TARGET>][4]) {
     constexpr int FIRST_OF_TARGET = N_MAPS<RENDER, TARGET> - N_OF_TARGET;
-    float x[4], y[4];
-    if (RENDER) four_of(render, x);
-    four_of(target, y);
+    float drawn[4] = {};
+    if (RENDER) four_of(render, drawn);
+    const uint4 piece = *reinterpret_cast<const uint4*>(words);
+    const unsigned of_pixels[4] = {piece.x, piece.y, piece.z, piece.w};
 #pragma unroll
     for (int j = 0; j < 4; ++j) {
+        const Compared p = compared(drawn[j], of_pixels[j], channel);
         if (RENDER) {
-            values[X][j] = x[j];
-            values[XX][j] = x[j] * x[j];
-            values[XY][j] = x[j] * y[j];
+            values[X][j] = p.render;
+            values[XX][j] = p.render * p.render;
+            values[XY][j] = p.render * p.target;
         }
         if (TARGET) {
-            values[FIRST_OF_TARGET + Y][j] = y[j];
-            values[FIRST_OF_TARGET + YY][j] = y[j] * y[j];
+            values[FIRST_OF_TARGET + Y][j] = p.target;
+            values[FIRST_OF_TARGET + YY][j] = p.target * p.target;
         }
     }
 }
@@ -211,8 +232,10 @@ __global__ void __launch_bounds__(THREADS, 4)
     windows_kernel(Photographs photographs, LossArrays loss, LossSettings settings, const DeviceState* state) {
     constexpr int MAPS = N_MAPS<RENDER, TARGET>, FIRST_OF_TARGET = MAPS - N_OF_TARGET;
     alignas(16) __shared__ float render[RENDER ? HALO * PITCH : 4];
-    alignas(16) __shared__ float target[HALO * PITCH];
+    alignas(16) __shared__ unsigned words[HALO * PITCH];
     alignas(16) __shared__ float rows[MAPS][HALO][SIDE];
+    // the photograph's, of this channel and the next; a thread copies those of its own pixels
+    __shared__ float moments[TARGET ? 1 : 2][N_OF_TARGET][RUN][TARGET ? 1 : THREADS];
     if (halted(state)) return;
     const Photograph photo = photograph_of(photographs, state);
     const int left = blockIdx.x * SIDE, top = blockIdx.y * SIDE, m = settings.margin;
@@ -220,11 +243,12 @@ __global__ void __launch_bounds__(THREADS, 4)
     const size_t plane = size_t(loss.width) * loss.height;
     const unsigned first_pixel = unsigned(top + row) * loss.width + x;
     const Halo halo(left, top, loss.width, loss.height);
-    unsigned keep = 0, counts = 0;
-#pragma unroll
-    for (int k = 0; k < SLOTS; ++k)
-        if (halo.pixel[k] >= 0 && kept(photo, halo.pixel[k])) keep |= 1u << k;
+    const float* image = loss.image;
     const int rows_inside = x < loss.width ? min(RUN, loss.height - top - row) : 0;
+    if (RENDER) begin_render(halo, image, render);
+    if constexpr (!TARGET) begin_moments(photo, plane, 0, first_pixel, loss.width, rows_inside, moments[0]);
+    read_photograph(halo, photo, words);
+    unsigned counts = 0;
 #pragma unroll
     for (int k = 0; k < RUN; ++k) {
         const int y = top + row + k;
@@ -232,37 +256,29 @@ __global__ void __launch_bounds__(THREADS, 4)
         if (inner && kept(photo, first_pixel + unsigned(k * loss.width))) counts |= 1u << k;
     }
     Sums sums = {0.0f, 0.0f, 0.0f};
-    const float* image = loss.image;
-    const uint8_t* photograph = photo.image;
-    float *mu_y = photo.moments, *yy = mu_y + CHANNELS * plane;
     float *v_mu = loss.windows, *v_xx = v_mu + plane, *v_xy = v_xx + plane;
-    if (RENDER) begin_render(halo, image, render);
     for (int c = 0; c < CHANNELS; ++c) {  // per channel of four pixels, 3 times
-        finish_tiles<RENDER>(halo, keep, photograph, render, target);
+        if (RENDER) copies_arrive();
         __syncthreads();
         blur_across<MAPS>(rows, [&](int at, float (&values)[MAPS][4]) {
-            four_products<RENDER, TARGET>(render + (RENDER ? at : 0), target + at, values);
+            four_products<RENDER, TARGET>(render + (RENDER ? at : 0), words + at, c, values);
         });
 #pragma unroll
         for (int k = 0; RENDER && k < RUN; ++k) {
             if (k >= rows_inside) break;
             const int at = PITCH * (row + k + SSIM_REACH) + col + SSIM_REACH;
-            const float d = render[at] - target[at], e = clamped(render[at], 0.0f, 1.0f) - target[at];
+            const Compared p = compared(render[at], words[at], c);
+            const float d = p.render - p.target, e = clamped(p.render, 0.0f, 1.0f) - p.target;
             sums.difference += settings.pixelwise == Pixelwise::l2 ? d * d : fabsf(d);
             sums.square += e * e;
         }
         __syncthreads();
         // what is next is on its way while this channel's runs down are made
-        ++image, ++photograph;
+        ++image;
         if (RENDER && c + 1 < CHANNELS) begin_render(halo, image, render);
-        float of_target[N_OF_TARGET][RUN] = {};
-#pragma unroll
-        for (int k = 0; !TARGET && k < RUN; ++k) {
-            if (k >= rows_inside) break;
-            const unsigned pixel = first_pixel + unsigned(k * loss.width);
-            of_target[Y][k] = __ldg(mu_y + pixel);
-            of_target[YY][k] = __ldg(yy + pixel);
-        }
+        if constexpr (!TARGET)
+            if (c + 1 < CHANNELS)
+                begin_moments(photo, plane, c + 1, first_pixel, loss.width, rows_inside, moments[(c + 1) % 2]);
         float blur[MAPS][RUN] = {};
         blur_down<MAPS>(rows, col, row, blur);
 #pragma unroll
@@ -270,13 +286,14 @@ __global__ void __launch_bounds__(THREADS, 4)
             if (k >= rows_inside) break;
             const unsigned pixel = first_pixel + unsigned(k * loss.width);
             if (!RENDER) {
-                mu_y[pixel] = blur[FIRST_OF_TARGET + Y][k];
-                yy[pixel] = blur[FIRST_OF_TARGET + YY][k];
+                float* moments_of_pixel = photo.moments + c * plane + pixel;
+                moments_of_pixel[0] = blur[FIRST_OF_TARGET + Y][k];
+                moments_of_pixel[CHANNELS * plane] = blur[FIRST_OF_TARGET + YY][k];
                 continue;
             }
             WindowMoments<float> w = {blur[X][k], 0.0f, blur[XX][k], 0.0f, blur[XY][k]};
-            w.mu_y = TARGET ? blur[FIRST_OF_TARGET + Y][k] : of_target[Y][k];
-            w.yy = TARGET ? blur[FIRST_OF_TARGET + YY][k] : of_target[YY][k];
+            w.mu_y = TARGET ? blur[FIRST_OF_TARGET + Y][k] : moments[c % 2][Y][k][threadIdx.x];
+            w.yy = TARGET ? blur[FIRST_OF_TARGET + YY][k] : moments[c % 2][YY][k][threadIdx.x];
             const bool count = (counts >> k) & 1u;
             const WindowSsim<float> s = compare_window(w);
             v_mu[pixel] = count ? s.v_mu : 0.0f;
@@ -284,7 +301,6 @@ __global__ void __launch_bounds__(THREADS, 4)
             v_xy[pixel] = count ? s.v_xy : 0.0f;
             sums.similarity += count ? s.S : 0.0f;
         }
-        mu_y += plane, yy += plane;
         v_mu += CHANNELS * plane, v_xx += CHANNELS * plane, v_xy += CHANNELS * plane;
     }
     if (!RENDER) return;
@@ -345,14 +361,14 @@ __global__ void __launch_bounds__(THREADS, 4)
     const unsigned first_pixel = unsigned(top + row) * loss.width + x;
     const int rows_inside = x < loss.width ? min(RUN, loss.height - top - row) : 0;
     const Halo halo(left, top, loss.width, loss.height);
-    unsigned keep = 0;
+    const float* windows[MAPS] = {loss.windows, loss.windows + plane, loss.windows + 2 * plane};
+    begin_derivatives(halo, windows, derivatives);
+    unsigned words[RUN];
 #pragma unroll
     for (int k = 0; k < RUN; ++k)
-        if (k < rows_inside && kept(photo, first_pixel + unsigned(k * loss.width))) keep |= 1u << k;
-    const float *image = loss.image, *windows[MAPS] = {loss.windows, loss.windows + plane, loss.windows + 2 * plane};
-    const uint8_t* photograph = photo.image;
+        words[k] = word_of(photo, k < rows_inside ? first_pixel + unsigned(k * loss.width) : 0u);
+    const float* image = loss.image;
     float* v_image = loss.v_image;
-    begin_derivatives(halo, windows, derivatives);
     for (int c = 0; c < CHANNELS; ++c) {  // per channel of four pixels, 3 times
         copies_arrive();
         __syncthreads();
@@ -365,27 +381,27 @@ __global__ void __launch_bounds__(THREADS, 4)
 #pragma unroll
         for (int d = 0; d < MAPS; ++d) windows[d] += CHANNELS * plane;
         if (c + 1 < CHANNELS) begin_derivatives(halo, windows, derivatives);
-        float2 p[RUN] = {};
+        float drawn[RUN];
 #pragma unroll
         for (int k = 0; k < RUN; ++k)
-            if (k < rows_inside)
-                p[k] = compared(image, photograph, value_of(first_pixel + unsigned(k * loss.width)), (keep >> k) & 1u);
+            drawn[k] = read_here(image + (k < rows_inside ? value_of(first_pixel + unsigned(k * loss.width)) : 0u));
         float v[MAPS][RUN] = {};
         blur_down<MAPS>(rows, col, row, v);
 #pragma unroll
         for (int k = 0; k < RUN; ++k) {
             if (k >= rows_inside) break;
             const unsigned value = value_of(first_pixel + unsigned(k * loss.width));
-            const float difference = p[k].x - p[k].y;
+            const Compared p = compared(drawn[k], words[k], c);
+            const float difference = p.render - p.target;
             // B4: sign(0) = 0
             const float sign = float(difference > 0.0f) - float(difference < 0.0f);
             const float of_pixel = settings.pixelwise == Pixelwise::l2 ? 2.0f * difference : sign;
-            const float of_windows = pixel_from_windows(p[k].x, p[k].y, v[0][k], v[1][k], v[2][k]);
+            const float of_windows = pixel_from_windows(p.render, p.target, v[0][k], v[1][k], v[2][k]);
             const float sum = settings.pixelwise_weight * photo.pixel_share * of_pixel -
                               settings.ssim_weight * photo.window_share * of_windows;
-            v_image[value] = (keep >> k) & 1u ? sum : 0.0f;
+            v_image[value] = words[k] & LEFT_OUT ? 0.0f : sum;
         }
-        ++image, ++photograph, ++v_image;
+        ++image, ++v_image;
     }
 }
 

@@ -28,8 +28,8 @@ template <class Real>
 POP_HD void adam_one(Real& param, Real& m, Real& v, Real g, const AdamStep<Real>& step) {
     m = m + step.beta1_rest * (g - m);
     v = step.beta2 * v + step.beta2_rest * g * g;
-    const Real denominator = sqrt(v) * step.root + step.eps;
-    param = param - step.rate * m / denominator;
+    const Real denominator = square_root(v) * step.root + step.eps;
+    param = param - quotient(step.rate * m, denominator);
 }
 
 }  // namespace pop

@@ -124,6 +124,31 @@ POP_HD float reciprocal(float x) {
 
 POP_HD double reciprocal(double x) { return 1.0 / x; }
 
+// a / b where |b| is below 2^126; on the device two instructions, within 2 ulp, where the rounded quotient takes ten and a
+// call of a subroutine for a numerator of 0
+POP_HD float quotient(float a, float b) {
+#ifdef __CUDA_ARCH__
+    return a * reciprocal(b);
+#else
+    return a / b;
+#endif
+}
+
+POP_HD double quotient(double a, double b) { return a / b; }
+
+// the root of x >= 0; on the device one instruction, within 2 ulp, and 0 below 2^-126
+POP_HD float square_root(float x) {
+#ifdef __CUDA_ARCH__
+    float y;
+    asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+    return y;
+#else
+    return sqrtf(x);
+#endif
+}
+
+POP_HD double square_root(double x) { return sqrt(x); }
+
 // a float's bits: of two that are not negative the larger has the larger bits, and negative ones and NaN have larger
 // bits than any number that is neither
 POP_HD unsigned bits_of(float x) {

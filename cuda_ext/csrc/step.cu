@@ -30,40 +30,37 @@ __global__ void begin_step_kernel(Schedule schedule, StepConstants* constants, D
         adam_step_at<float>(schedule.numbers[at], schedule.rates[at], schedule.beta1, schedule.beta2, schedule.eps);
 }
 
-// three sums over a block in a fixed order; valid in thread 0
-__device__ __forceinline__ Vec3<float> block_sums(Vec3<float> value) {
-    __shared__ Vec3<float> shared[SUM_BLOCK];
-    shared[threadIdx.x] = value;
+// sums over a block in a fixed order; valid in thread 0
+template <int N>
+__device__ __forceinline__ void sum_over_block(float (&values)[N]) {
+    __shared__ float of_warps[SUM_BLOCK / WARP][N];
+#pragma unroll
+    for (int mask = WARP / 2; mask > 0; mask /= 2)
+#pragma unroll
+        for (int k = 0; k < N; ++k) values[k] += __shfl_xor_sync(FULL_WARP, values[k], mask);
+    if ((threadIdx.x & (WARP - 1)) == 0)
+        for (int k = 0; k < N; ++k) of_warps[threadIdx.x / WARP][k] = values[k];
     __syncthreads();
-    for (int half = SUM_BLOCK / 2; half > 0; half /= 2) {
-        if (threadIdx.x < half) {
-            shared[threadIdx.x].x += shared[threadIdx.x + half].x;
-            shared[threadIdx.x].y += shared[threadIdx.x + half].y;
-            shared[threadIdx.x].z += shared[threadIdx.x + half].z;
-        }
-        __syncthreads();
-    }
-    return shared[0];
+    if (threadIdx.x > 0) return;
+    for (int warp = 1; warp < SUM_BLOCK / WARP; ++warp)
+        for (int k = 0; k < N; ++k) values[k] += of_warps[warp][k];
 }
 
 __global__ void __launch_bounds__(SUM_BLOCK) end_step_kernel(StepRecord record, DeviceState* state) {
     if (halted(state)) return;
-    Vec3<float> sums = {0.0f, 0.0f, 0.0f};
+    float sums[3] = {};
     if (record.pop_sums != nullptr) {
         const int blocks = (record.n + SUM_BLOCK - 1) / SUM_BLOCK;
-        for (int k = threadIdx.x; k < blocks; k += SUM_BLOCK) {
-            sums.x += record.pop_sums[3 * k];
-            sums.y += record.pop_sums[3 * k + 1];
-            sums.z += record.pop_sums[3 * k + 2];
-        }
+        for (int k = threadIdx.x; k < blocks; k += SUM_BLOCK)
+            for (int term = 0; term < 3; ++term) sums[term] += record.pop_sums[3 * k + term];
     }
-    sums = block_sums(sums);
+    sum_over_block(sums);
     if (threadIdx.x > 0) return;
     const int important = state->n_important, others = state->n_others;
     record.values[V_POP] =
         record.pop_sums == nullptr
             ? 0.0f
-            : record.lambda_pop * (sums.x / float(max(important, 1)) + sums.y / float(max(others, 1))) + sums.z;
+            : record.lambda_pop * (sums[0] / float(max(important, 1)) + sums[1] / float(max(others, 1))) + sums[2];
     for (int k = 0; k < N_VALUES; ++k) record.history[size_t(N_VALUES) * state->step + k] = record.values[k];
     ++state->step;
 }
@@ -81,26 +78,28 @@ __device__ __forceinline__ float regularizers_of(const PopTerm& term, int i) {
 }
 
 __global__ void __launch_bounds__(SUM_BLOCK) count_important_kernel(PopTerm term, DeviceState* state) {
-    const int i = blockIdx.x * blockDim.x + threadIdx.x;
+    const int i = blockIdx.x * blockDim.x + threadIdx.x, row = min(i, term.n - 1);
+    // all that is read is on its way before the first of it is waited for
+    const float logit = term.logits[row];
+    const int count = term.dominant_counts != nullptr ? term.dominant_counts[row] : 0;
+    const int before = term.window_counts != nullptr ? term.window_counts[row] : 0;
+    const bool shown = term.radii == nullptr || term.radii[2 * size_t(row)] > 0;
     PopSide side = PopSide::absent;
-    if (i < term.n && term.dominant_counts != nullptr && (term.radii == nullptr || term.radii[2 * i] > 0)) {
-        const bool before = term.window_counts != nullptr && term.window_counts[i] > 0;
-        side = before || term.dominant_counts[i] > 0 ? PopSide::important : PopSide::other;
-    }
+    if (i < term.n && term.dominant_counts != nullptr && shown)
+        side = before > 0 || count > 0 ? PopSide::important : PopSide::other;
     if (i < term.n) term.sides[i] = uint8_t(side);
-    const bool important = side == PopSide::important;
-    const unsigned up = __ballot_sync(FULL_WARP, important), down = __ballot_sync(FULL_WARP, side == PopSide::other);
-    // integers: the order of additions does not matter
-    if ((threadIdx.x & (WARP - 1)) == 0 && up) atomicAdd(&state->n_important, __popc(up));
-    if ((threadIdx.x & (WARP - 1)) == 0 && down) atomicAdd(&state->n_others, __popc(down));
+    const bool important = side == PopSide::important, other = side == PopSide::other;
     // 1 - o is the opacity of the negated logit
-    const float o = side == PopSide::absent ? 0.0f : opacity_from_logit(important ? -term.logits[i] : term.logits[i]);
-    const float own = i < term.n ? regularizers_of(term, i) : 0.0f;
-    const Vec3<float> sums = block_sums(important ? Vec3<float>{o, 0.0f, own} : Vec3<float>{0.0f, o, own});
+    const float o = opacity_from_logit(important ? -logit : logit);
+    // numbers of a block, which a float holds exactly: one addition a block, since all of them go to one address
+    float sums[5] = {important ? o : 0.0f, other ? o : 0.0f, i < term.n ? regularizers_of(term, i) : 0.0f,
+                     important ? 1.0f : 0.0f, other ? 1.0f : 0.0f};
+    sum_over_block(sums);
     if (threadIdx.x > 0) return;
-    term.sums[3 * blockIdx.x] = sums.x;
-    term.sums[3 * blockIdx.x + 1] = sums.y;
-    term.sums[3 * blockIdx.x + 2] = sums.z;
+    for (int k = 0; k < 3; ++k) term.sums[3 * blockIdx.x + k] = sums[k];
+    // integers: the order of additions does not matter
+    if (sums[3] > 0.0f) atomicAdd(&state->n_important, int(sums[3]));
+    if (sums[4] > 0.0f) atomicAdd(&state->n_others, int(sums[4]));
 }
 
 }  // namespace

@@ -14,6 +14,7 @@ from cuda_ext.arrays import (
     NOT_BAD,
     CudaMemoryError,
     Settings,
+    SideStream,
     empty,
     fill,
     new_state,
@@ -47,9 +48,11 @@ class TileBuffers:
         self.struct.set_grid(width, height, *tile)
         self.n_tiles: int = self.struct.n_tiles
         self._kept: dict[str, Tensor] = {}
-        names = ("depth_keys", "depth_keys_sorted", "order_unsorted", "order", "counts", "offsets")
-        for name in (*names, "splat_begin", "splat_count"):
+        names = ("depth_keys", "depth_keys_sorted", "order_unsorted", "order", "splat_begin", "splat_count")
+        for name in names:
             self._allocate(name, (n,))
+        if exact:
+            self._allocate("hits", (load().hit_words(n),))
         for name in ("tile_begin", "tile_end", "tile_order"):
             self._allocate(name, (self.n_tiles,))
         self.capacity = -1
@@ -133,6 +136,27 @@ def list_tile(settings: Settings, counted: bool) -> tuple[tuple[int, int], bool]
     return (settings.tile_size, settings.tile_size), False
 
 
+def count_instances(
+    lists: Any, splats: Any, profile: Any, state: int, device: torch.device, side: SideStream | None = None
+) -> None:
+    """Sort splats by depth, count the tiles of each, and number its instances, front to back.
+
+    Args:
+        lists: the kernels' `TileLists`.
+        splats: the kernels' view of projected Gaussians.
+        profile: of the kernels.
+        state: address of the device's flags.
+        device: where.
+        side: tiles are counted beside the sort, since they do not depend on the order; None takes turns.
+    """
+    kernels, side = load(), side or SideStream(device, used=False)
+    with side.beside():
+        kernels.count_tiles(lists, splats, profile, stream_of(device))
+    kernels.sort_by_depth(lists, splats, stream_of(device))
+    side.join()
+    kernels.number_instances(lists, state, stream_of(device))
+
+
 def make_lists(
     settings: Settings,
     splats: Any,
@@ -153,7 +177,7 @@ def make_lists(
     buckets = settings.backward == "gaussian_parallel" and tile == WARP_TILE
     buffers = TileBuffers(n, settings.width, settings.height, tile, exact, device, buckets)
     profile = settings.kernel_profile()
-    kernels.count_instances(buffers.struct, splats, profile, state.data_ptr(), stream)
+    count_instances(buffers.struct, splats, profile, state.data_ptr(), device)
     values = state.tolist()
     if values[BAD_ROW] != NOT_BAD:
         raise ValueError(

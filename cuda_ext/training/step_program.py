@@ -7,8 +7,9 @@ from typing import Any
 from torch import Tensor
 
 from cuda_ext import load
-from cuda_ext.arrays import fill, pointer, stream_of
+from cuda_ext.arrays import SideStream, fill, pointer, stream_of
 from cuda_ext.render.capacity import Size
+from cuda_ext.render.lists import count_instances
 from cuda_ext.train_settings import Phase, StepSettings
 from cuda_ext.training.resident import MARGIN
 from cuda_ext.training.step_buffers import FrameBuffers, RowBuffers, Rows, Shared, SplatBuffers
@@ -34,6 +35,8 @@ class DrawProgram:
         self._photographs, self._objective = shared.views.photographs(), _objective(phase)
         self._loss = _loss(shared, frame)
         self._forward, self._backward = _blends(shared, drawn, frame, phase)
+        # where nothing is replayed, single kernels are told apart by time, so that none runs beside another there
+        self.side = SideStream(shared.device, used=shared.settings.replay)
         self.counts: Tensor | None = frame.render_stats["dominant_counts"] if phase.dominance else None
 
     def launch(self) -> None:
@@ -41,7 +44,7 @@ class DrawProgram:
         kernels, shared, splats, profile = load(), self._shared, self._splats, self._profile
         lists, stream = self._frame.lists.struct, stream_of(shared.device)
         state = pointer("state", shared.state, "int32")
-        kernels.count_instances(lists, splats, profile, state, stream)
+        count_instances(lists, splats, profile, state, shared.device, self.side)
         kernels.make_tile_lists(lists, splats, profile, pointer("dominant_counts", self.counts, "int32"), state, stream)
         kernels.blend_forward(lists, self._forward, profile, stream)
         kernels.photometric(self._photographs, self._loss, self._objective, state, stream)
@@ -79,8 +82,11 @@ class StepProgram:
         self._draw.launch()
         if self._term is not None:
             kernels.count_important(self._term, state, stream)
+        # what a step notes is known before the update, and read by no one in it
+        with self._draw.side.beside():
+            kernels.end_step(self._record, state, stream_of(shared.device))
         kernels.update(self._update, view, self._project, splats, state, stream)
-        kernels.end_step(self._record, state, stream)
+        self._draw.side.join()
 
 
 def view_of(shared: Shared, size: Size) -> Any:

@@ -148,12 +148,13 @@ def test_each_engine_moves_whom_the_rules_move_and_nobody_else(engine: Any, tmp_
     run = rules_run_of(UPDATES, tmp_path, engine, torch.float32)
     idle = 0
     for step in range(10):
-        before = {key: run.params[key].detach().clone() for key in KEYS}
+        before = {key: run.params[key].detach().cpu().clone() for key in KEYS}
         densification = run.take_steps(step + 1).densification
         if densification is not None:
             continue
         for key in KEYS:
-            moved = not torch.equal(before[key], run.params[key].detach())
+            # an engine on a card takes parameters there with its first step
+            moved = not torch.equal(before[key], run.params[key].detach().cpu())
             # bands beyond the first have no gradient before they are drawn
             wanted = is_updated(key, step, UPDATES) and (key != "shN" or step > RULES.sh_start_iter)
             assert moved == wanted, f"{key} at step {step}"

@@ -70,8 +70,8 @@ def test_every_number_of_the_benchmark_is_measured(bench, gpu, monkeypatch, tmp_
     timed = found["pixel_parallel_by_kernel"]["kernels"]
     assert set(timed) == set(KERNELS)
     assert {name for name, entry in timed.items() if "floor_ms" in entry} == {
-        *("project", "count_instances", "make_tile_lists", "blend_forward", "photometric"),
-        *("blend_backward", "update"),
+        *("project", "count_tiles", "sort_by_depth", "number_instances", "make_tile_lists"),
+        *("blend_forward", "photometric", "blend_backward", "update"),
     }
     for backward in ("pixel_parallel", "pixel_parallel_atomic", "gaussian_parallel", "gaussian_parallel_atomic"):
         assert found[backward]["step_with_pop_ms"] > 0.0

@@ -25,8 +25,8 @@ def wide_splats(gpu, n, lists):
     lists.n, lists.exact = n, False
     lists.set_grid(16 * ACROSS, 8 * ACROSS, 16, 8)
     assert lists.n_tiles == PER_SPLAT
-    names = ("depth_keys", "depth_keys_sorted", "order_unsorted", "order", "counts", "offsets")
-    for name in (*names, "splat_begin", "splat_count"):
+    names = ("depth_keys", "depth_keys_sorted", "order_unsorted", "order", "splat_begin", "splat_count")
+    for name in names:
         fill(lists, **{name: torch.zeros(n, dtype=torch.int32, device=gpu)})
     lists.workspace_bytes = kernels.tile_workspace(n, 1024, PER_SPLAT)
     fill(lists, workspace=torch.zeros(lists.workspace_bytes, dtype=torch.uint8, device=gpu))
@@ -44,12 +44,13 @@ def wide_splats(gpu, n, lists):
 @pytest.mark.parametrize("n", [2, 3, 4, 5, 6, 9, 10])
 def test_instances_beyond_an_int_are_the_largest_int_and_not_few(gpu, n):
     from cuda_ext import load
-    from cuda_ext.arrays import N_INSTANCES, kernel_profile, new_state, stream_of
+    from cuda_ext.arrays import N_INSTANCES, kernel_profile, new_state
+    from cuda_ext.render.lists import count_instances
 
     kernels, state = load(), new_state(gpu)
     lists = kernels.TileLists()
     splats = wide_splats(gpu, n, lists)
-    kernels.count_instances(lists, splats, kernel_profile(PAPER, 16), state.data_ptr(), stream_of(gpu))
+    count_instances(lists, splats, kernel_profile(PAPER, 16), state.data_ptr(), gpu)
     assert state[N_INSTANCES] == min(n * PER_SPLAT, INT_MAX)
 
 
@@ -61,21 +62,20 @@ def test_a_count_that_passes_an_int_halts_the_device_and_lists_nothing(gpu, befo
     state, buffers, splats = counted(gpu)
     buffers.reserve(1024)
     # the last splat's slots as they are behind a multitude of others
-    offsets = buffers.tensor("offsets")
-    offsets[-1] = before if before <= INT_MAX else before - 2**32
-    buffers.tensor("counts")[-1] = 45
+    last = int(buffers.tensor("order")[-1])
+    buffers.tensor("splat_begin")[last] = before if before <= INT_MAX else before - 2**32
+    buffers.tensor("splat_count")[last] = 45
     kernels, profile = load(), kernel_profile(PAPER, 16)
     kernels.make_tile_lists(buffers.struct, splats, profile, 0, state.data_ptr(), stream_of(gpu))
     assert state[OVERFLOW] == state[N_INSTANCES] == INT_MAX
-    for name in ("splat_count", "tile_begin", "tile_end"):
+    for name in ("tile_begin", "tile_end"):
         assert not buffers.tensor(name).any(), name
 
 
 def counted(gpu):
     """Return the state, the lists and the splats of the training scene, which has been counted."""
-    from cuda_ext import load
-    from cuda_ext.arrays import kernel_profile, new_state, stream_of
-    from cuda_ext.render.lists import TileBuffers, splat_struct
+    from cuda_ext.arrays import kernel_profile, new_state
+    from cuda_ext.render.lists import TileBuffers, count_instances, splat_struct
 
     g = torch.Generator().manual_seed(0)
     made = {
@@ -88,7 +88,7 @@ def counted(gpu):
     splats = splat_struct(**{name: value.to(gpu) for name, value in made.items()}, colors=None)
     state, buffers = new_state(gpu), TileBuffers(N, 48, 36, (16, 8), True, gpu, buckets=False)
     profile = kernel_profile(PAPER, 16)
-    load().count_instances(buffers.struct, splats, profile, state.data_ptr(), stream_of(gpu))
+    count_instances(buffers.struct, splats, profile, state.data_ptr(), gpu)
     return state, buffers, splats
 
 
@@ -180,7 +180,7 @@ def test_the_share_that_blurs_is_of_the_pixels_that_a_view_keeps(gpu):
 def test_exact_lists_hold_the_tiles_that_a_splat_reaches_and_no_others(gpu):
     from cuda_ext import load
     from cuda_ext.arrays import N_INSTANCES, kernel_profile, new_state, stream_of
-    from cuda_ext.render.lists import TileBuffers, splat_struct
+    from cuda_ext.render.lists import TileBuffers, count_instances, splat_struct
 
     # rectangles of no tile, of one and of the whole image, and needles, in one warp and over the end of another
     g = torch.Generator().manual_seed(4)
@@ -201,7 +201,7 @@ def test_exact_lists_hold_the_tiles_that_a_splat_reaches_and_no_others(gpu):
     state, buffers = new_state(gpu), TileBuffers(n, width, height, (16, 8), True, gpu, buckets=False)
     kernels, profile, stream = load(), kernel_profile(PAPER, 16), stream_of(gpu)
     splats = splat_struct(*rows, None)
-    kernels.count_instances(buffers.struct, splats, profile, state.data_ptr(), stream)
+    count_instances(buffers.struct, splats, profile, state.data_ptr(), gpu)
     total = int(state[N_INSTANCES])
     buffers.reserve(total)
     kernels.make_tile_lists(buffers.struct, splats, profile, 0, state.data_ptr(), stream)
@@ -236,7 +236,7 @@ def test_exact_lists_hold_the_tiles_that_a_splat_reaches_and_no_others(gpu):
 def test_rows_of_a_rectangle_are_exact_where_a_float_cannot_number_its_tiles(gpu):
     from cuda_ext import load
     from cuda_ext.arrays import kernel_profile, new_state, stream_of
-    from cuda_ext.render.lists import TileBuffers, splat_struct
+    from cuda_ext.render.lists import TileBuffers, count_instances, splat_struct
 
     # a band of 3 px over 12 million tiles, of which it reaches those of its rows alone
     across, down = 6_001, 2_000
@@ -249,7 +249,7 @@ def test_rows_of_a_rectangle_are_exact_where_a_float_cannot_number_its_tiles(gpu
     }
     buffers = TileBuffers(1, 16 * across, 8 * down, (16, 8), True, gpu, buckets=False)
     state, profile, splats = new_state(gpu), kernel_profile(PAPER, 16), splat_struct(**rows, colors=None)
-    load().count_instances(buffers.struct, splats, profile, state.data_ptr(), stream_of(gpu))
+    count_instances(buffers.struct, splats, profile, state.data_ptr(), gpu)
     buffers.reserve(2 * across)
     load().make_tile_lists(buffers.struct, splats, profile, 0, state.data_ptr(), stream_of(gpu))
     begin, end = buffers.tensor("tile_begin"), buffers.tensor("tile_end")

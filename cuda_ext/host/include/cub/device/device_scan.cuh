@@ -6,8 +6,8 @@
 namespace cub {
 
 struct DeviceScan {
-    template <class T, class Operation>
-    static cudaError_t ExclusiveScan(void* workspace, size_t& bytes, const T* in, T* out, Operation operation, T total,
+    template <class In, class Out, class T, class Operation>
+    static cudaError_t ExclusiveScan(void* workspace, size_t& bytes, In in, Out out, Operation operation, T total,
                                      int n, cudaStream_t = nullptr) {
         if (workspace == nullptr) {
             bytes = 1;
