@@ -79,7 +79,7 @@ def an_iteration(kernel: dict[str, Any]) -> str:
     """Say what an iteration of a kernel's loop over visits, steps or slots issues, or what its whole body does."""
     found: list[str] = []
     # an update has a loop over slots too, and much besides
-    told = () if kernel["kernel"].startswith("update") else ("visit", "step", "8 visits", "8 slots", "32 records")
+    told = () if kernel["kernel"].startswith("update") else ("visit", "step", "8 visits", "16 slots", "32 slots", "32 records")
     for unit in told:
         # what is unrolled has several loops of one unit
         spans = [[loop[name] / loop["iterations"] for name in ("always", "all")] for loop in kernel["loops"]]
@@ -154,17 +154,17 @@ def beside_gsplat() -> str:
 def counters() -> str:
     """Make the table of the hardware's counters of the kernels that take 10 us or more."""
     found = read_json(MEASURED / "counters.json")
-    head = "| kernel | us | instructions, millions | issue slots used | warps there | what its warps wait for most |"
-    lines = [head, "|---|---|---|---|---|---|"]
+    head = "| kernel | us | instructions, millions | processors busy | issue slots used | warps there "
+    lines = [head + "| what its warps wait for most |", "|---|---|---|---|---|---|---|"]
     for kernel in found["kernels"]:
         if kernel["us"] < LEAST_SHOWN:
             continue
         name = kernel["kernel"].removeprefix("void ").removeprefix("pop::")
         # a sort's arguments are lines of policy
-        name = f"cub::{name.split('<')[0]}" if name.startswith("radix_sort::") else name
+        name = f"cub::{name.split('<')[0]}" if name.startswith(("radix_sort::", "scan::")) else name
         waits = [f"{what.replace('_', ' ')} {share}" for what, share in kernel["warps_stalled_per_issue"].items()]
         waits = [words for words in waits if not words.startswith(("selected", "not selected"))]
-        shares = f"{kernel['issue_percent']} % | {kernel['warps_percent']} %"
+        shares = f"{kernel['busy_percent']} % | {kernel['issue_percent']} % | {kernel['warps_percent']} %"
         millions = kernel["instructions"] / 1e6
         lines.append(f"| `{name}` | {kernel['us']:.0f} | {millions:.1f} | {shares} | {', '.join(waits[:2])} |")
     return "\n".join(lines)

@@ -59,7 +59,7 @@ KERNELS = {
     "splats_kernel": ("bucket", 128),
     "split_rows_kernel": ("32 Gaussians", 256),
     "sum_slots_kernel": ("4 Gaussians", 256),
-    "tile_order_kernel": ("image", 1024),
+    "tile_order_kernel": ("image", 512),
     "total_kernel": ("step", 1),
     "update_kernel": ("32 Gaussians", 128),
     "update_views_kernel": ("32 Gaussians", 128),
