@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -19,14 +21,30 @@ def scales_from_log_scales_vjp(log_scales: Tensor, v_scales: Tensor) -> Tensor:
 
 
 def opacities_from_logits(logit_opacities: Tensor) -> Tensor:
-    """See `pop_ref.activations.opacities_from_logits`. Optimizations: none."""
-    return torch.sigmoid(logit_opacities)
+    """See `pop_ref.activations.opacities_from_logits`. Optimizations: none.
+
+    Differentiable; its slope is that of `opacities_from_logits_vjp`, where torch's own sigmoid has none in float32 from
+    logits of 17 on, so that an opacity which came there could not leave again.
+    """
+    return _Opacities.apply(logit_opacities)
 
 
 def opacities_from_logits_vjp(logit_opacities: Tensor, v_opacities: Tensor) -> Tensor:
     """See `pop_ref.activations.opacities_from_logits_vjp`. Optimizations: none."""
     # 1 - o is the opacity of the negated logit: no cancellation where o is near 1
     return torch.sigmoid(logit_opacities) * torch.sigmoid(-logit_opacities) * v_opacities
+
+
+class _Opacities(torch.autograd.Function):
+    @staticmethod
+    def forward(context: Any, logit_opacities: Tensor) -> Tensor:
+        context.save_for_backward(logit_opacities)
+        return torch.sigmoid(logit_opacities)
+
+    @staticmethod
+    def backward(context: Any, v_opacities: Tensor) -> Tensor:
+        (logit_opacities,) = context.saved_tensors
+        return opacities_from_logits_vjp(logit_opacities, v_opacities)
 
 
 def unit_quats_from_quats(quats: Tensor) -> Tensor:

@@ -178,6 +178,15 @@ def test_gradients_that_wait_are_summed_alike_by_every_engine(engine: Any, tmp_p
     torch.testing.assert_close(bands[0], bands[1], rtol=1e-3, atol=1e-3 * largest)
 
 
+def test_an_opacity_next_to_one_can_leave_again_by_every_engine(engine: Any, tmp_path: Path) -> None:
+    run = rules_run_of(UPDATES, tmp_path, engine, torch.float32)
+    # o (1 - o) is 2e-9 there, and 1 - o is 0 in float32
+    run.params["opacities"].data.fill_(20.0)
+    run.take_steps(1)
+    moments = run.optimizers["opacities"].state[run.params["opacities"]]["exp_avg"].cpu()
+    assert float(moments.abs().max()) > 0.0
+
+
 # The ladder of ten losses, climbed by the run that trains, on every engine.
 
 # float64 as the oracle itself (measured: 3e-16); float32 some ten times the worst rung's error
