@@ -9,8 +9,10 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import re
+import sys
 from types import ModuleType
 
+_MODULE = "cuda_ext._kernels"
 _could_run: list[bool] = []
 _BUILD = "run `pop build-cuda`"
 
@@ -32,7 +34,7 @@ def why_not() -> str | None:
 
 
 def _why_not() -> str | None:
-    if importlib.util.find_spec("cuda_ext._kernels") is None:
+    if importlib.util.find_spec(_MODULE) is None:
         return f"the CUDA extension is not built; {_BUILD}, which says what it needs"
     try:
         kernels = load()
@@ -65,7 +67,8 @@ def load() -> ModuleType:
     Raises:
         ImportError: it is not built, or does not load.
     """
-    return importlib.import_module("cuda_ext._kernels")
+    # a call of `rasterization` asks 17 times, and importlib takes longer to say what is loaded
+    return sys.modules.get(_MODULE) or importlib.import_module(_MODULE)
 
 
 def _named(version: int) -> str:

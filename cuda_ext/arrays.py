@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache, lru_cache
 from typing import Any
 
 import torch
@@ -57,15 +58,23 @@ def pointer(name: str, tensor: Tensor | None, dtypes: str = "float32") -> int:
         return 0
     if not on_gpu(tensor):
         raise ValueError(f"{name} is on {tensor.device}; backend 'cuda' needs it on the GPU: use {name}.cuda()")
-    found = str(tensor.dtype).removeprefix("torch.")
-    if found not in dtypes.split():
+    if not _is_one_of(tensor.dtype, dtypes):
         raise ValueError(
-            f"{name} has dtype {found}; the kernels read {' or '.join(dtypes.split())} there: "
+            f"{name} has dtype {_named(tensor.dtype)}; the kernels read {' or '.join(dtypes.split())} there: "
             f"use {name}.to(torch.{dtypes.split()[-1]})"
         )
     if not tensor.is_contiguous():
         raise ValueError(f"{name} is not contiguous; use {name}.contiguous()")
     return tensor.data_ptr()
+
+
+def _named(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")
+
+
+@cache
+def _is_one_of(dtype: torch.dtype, names: str) -> bool:
+    return _named(dtype) in names.split()
 
 
 def fill(struct: Any, **fields: Any) -> Any:
@@ -159,8 +168,13 @@ def new_state(device: torch.device) -> Tensor:
 
 
 def kernel_profile(profile: Profile, tile_size: int) -> Any:
-    """Return the kernels' form of a profile."""
-    made = load().Profile()
+    """Return the kernels' form of a profile, to be read only: it is one for all who ask."""
+    return _kernel_profile(load(), profile, tile_size)
+
+
+@lru_cache(maxsize=64)
+def _kernel_profile(kernels: Any, profile: Profile, tile_size: int) -> Any:
+    made = kernels.Profile()
     for name, value in {**profile.as_numbers(), "tile_size": tile_size}.items():
         setattr(made, name, value)
     return made

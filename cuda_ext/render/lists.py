@@ -24,6 +24,7 @@ from cuda_ext.render.capacity import MOST
 
 WARP_TILE = (16, 8)  # px, what a warp blends
 BUCKET = 32
+ALIGNED = 256  # entries that an array begins at a multiple of, as the driver's own pieces of memory do
 LOWER = "the number of Gaussians, their opacity extents or the image size"
 
 
@@ -48,13 +49,10 @@ class TileBuffers:
         self.struct.set_grid(width, height, *tile)
         self.n_tiles: int = self.struct.n_tiles
         self._kept: dict[str, Tensor] = {}
-        names = ("depth_keys", "depth_keys_sorted", "order_unsorted", "order", "splat_begin", "splat_count")
-        for name in names:
-            self._allocate(name, (n,))
+        self._allocate(n, "depth_keys", "depth_keys_sorted", "order_unsorted", "order", "splat_begin", "splat_count")
         if exact:
-            self._allocate("hits", (load().hit_words(n),))
-        for name in ("tile_begin", "tile_end", "tile_order"):
-            self._allocate(name, (self.n_tiles,))
+            self._allocate(load().hit_words(n), "hits")
+        self._allocate(self.n_tiles, "tile_begin", "tile_end", "tile_order")
         self.capacity = -1
         self.reserve(0)
 
@@ -73,16 +71,14 @@ class TileBuffers:
             )
         self.capacity = capacity
         self.struct.capacity = capacity
-        wide = self.n_tiles >= 0xFFFF
-        for name in ("tile_keys", "tile_keys_sorted"):
-            self._allocate(name, (capacity,), torch.int32 if wide else torch.int16)
-        for name in ("slots_unsorted", "slots", "slot_splat", "listed"):
-            self._allocate(name, (capacity,))
+        keys = torch.int32 if self.n_tiles >= 0xFFFF else torch.int16
+        self._allocate(capacity, "tile_keys", "tile_keys_sorted", dtype=keys)
+        self._allocate(capacity, "slots_unsorted", "slots", "slot_splat", "listed")
         if self.buckets:
-            self._allocate("bucket_begin", (self.n_tiles,))
-            self._allocate("bucket_tile", (self.max_buckets,))
+            self._allocate(self.n_tiles, "bucket_begin")
+            self._allocate(self.max_buckets, "bucket_tile")
         bytes_needed = load().tile_workspace(self.n, capacity, self.n_tiles)
-        self._allocate("workspace", (bytes_needed,), torch.uint8)
+        self._allocate(bytes_needed, "workspace", dtype=torch.uint8)
         self.struct.workspace_bytes = bytes_needed
 
     @property
@@ -99,9 +95,16 @@ class TileBuffers:
         """Return a buffer by the kernels' name for it."""
         return self._kept[name]
 
-    def _allocate(self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.int32) -> None:
-        self._kept[name] = empty(f"the tile lists ({name})", LOWER, shape, self.device, dtype)
-        fill(self.struct, **{name: self._kept[name]})
+    def _allocate(self, size: int, *names: str, dtype: torch.dtype = torch.int32) -> None:
+        """Make room for arrays of one size, in one piece: asking for many small ones takes longer than to fill them."""
+        pitch = -(-size // ALIGNED) * ALIGNED
+        # what was there goes first: both at a time would be twice the memory
+        for name in names:
+            self._kept.pop(name, None)
+        fill(self.struct, **dict.fromkeys(names))
+        made = empty(f"the tile lists ({names[0]})", LOWER, (len(names), pitch), self.device, dtype)
+        self._kept |= {name: made[k, :size] for k, name in enumerate(names)}
+        fill(self.struct, **{name: self._kept[name] for name in names})
 
 
 def splat_struct(

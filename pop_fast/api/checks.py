@@ -12,11 +12,15 @@ from dataclasses import dataclass, fields, replace
 from numbers import Integral
 from typing import Any, Final
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from pop_fast.api.backend import Backend
 from pop_ref.constants import GSPLAT_1_5, Profile, profile_named
+
+Array = npt.NDArray[Any]
 
 LARGEST_TILE: Final = 4096  # px; no image needs more, and what a tile works with grows with its square
 RENDER_MODES: Final = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
@@ -112,18 +116,18 @@ class _Rule:
 
     Attributes:
         name: of the tensor.
-        tensor: it.
-        probe: a few numbers of it, each made in a pass or two.
+        tensor: it, or an array of it that came from a GPU.
+        probe: a few numbers of it, each made in a pass or two: a tensor's or an array's.
         suspicious: whether these numbers leave room for a bad entry; only then it is looked at closely.
         bad: which entries or rows are.
         words: what it must be.
     """
 
     name: str
-    tensor: Tensor
-    probe: Callable[[], Sequence[Tensor]]
+    tensor: Tensor | Array
+    probe: Callable[[], Sequence[Any]]
     suspicious: Callable[..., bool]
-    bad: Callable[[], Tensor]
+    bad: Callable[[], Tensor | Array]
     words: str
 
 
@@ -225,13 +229,13 @@ class Checks:
         n = viewmats.shape[-3]
         given = self.tensor("viewmats", viewmats, (*batch, n, 4, 4)), self.tensor("Ks", Ks, (*batch, n, 3, 3))
         check_sizes(width, height, tile_size)
-        # a few numbers, of which every question is a launch on a GPU and next to nothing here
+        # a few numbers, of which every question is a launch on a GPU and some microseconds in torch
         V, K = _on_host(*given)
-        self.finite("viewmats", V)
-        self.finite("Ks", K)
+        for name, array in (("viewmats", V), ("Ks", K)):
+            self._each(name, array, lambda array=array: ~np.isfinite(array), "must be finite")
         rows = "must be rigid: an orthonormal 3x3 rotation with determinant +1"
         self._each("viewmats", V, lambda: _not_rigid(V[..., :3, :3]), rows)
-        last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=V.dtype, device=V.device)
+        last = (0.0, 0.0, 0.0, 1.0)
         self._each("viewmats", V, lambda: (V[..., 3, :] != last).any(-1), "must end in the row [0, 0, 0, 1]")
         positive = "must have focal lengths > 0"
         self._each("Ks", K, lambda: ~((K[..., 0, 0] > 0.0) & (K[..., 1, 1] > 0.0)), positive)
@@ -269,28 +273,28 @@ class Checks:
         """
         probes = [rule.probe() for rule in self._rules]
         # what is on a GPU comes in one copy
-        there = [number for numbers in probes for number in numbers if number.device.type != "cpu"]
+        there = [number for numbers in probes for number in numbers if _is_elsewhere(number)]
         read = iter(torch.stack(there).tolist() if there else ())
         for numbers, rule in zip(probes, self._rules, strict=True):
-            here = [number.item() if number.device.type == "cpu" else next(read) for number in numbers]
-            found = rule.bad().nonzero() if rule.suspicious(*here) else None
+            here = [next(read) if _is_elsewhere(number) else number.item() for number in numbers]
+            found = torch.as_tensor(rule.bad()).nonzero() if rule.suspicious(*here) else None
             if found is not None and len(found):
                 index = found[0].tolist()
                 raise ValueError(f"{rule.name}{index} is {rule.tensor[tuple(index)].tolist()}; it {rule.words}")
 
-    def _each(self, name: str, tensor: Tensor, bad: Callable[[], Tensor], words: str) -> None:
-        self._rule(name, tensor, lambda: (bad().any(),), bool, bad, words)
+    def _each(self, name: str, array: Array, bad: Callable[[], Array], words: str) -> None:
+        self._rule(name, array, lambda: (bad().any(),), bool, bad, words)
 
     def _rule(
         self,
         name: str,
-        tensor: Tensor,
-        probe: Callable[[], Sequence[Tensor]],
+        tensor: Tensor | Array,
+        probe: Callable[[], Sequence[Any]],
         suspicious: Callable[..., bool],
-        bad: Callable[[], Tensor],
+        bad: Callable[[], Tensor | Array],
         words: str,
     ) -> None:
-        if tensor.numel():
+        if 0 not in tensor.shape:
             self._rules.append(_Rule(name, tensor, probe, suspicious, bad, words))
 
 
@@ -331,24 +335,27 @@ def _negative(least: float) -> bool:
     return least < 0.0
 
 
-def _on_host(*tensors: Tensor) -> list[Tensor]:
-    """Return small tensors of one device and type on the CPU, without their gradients, in one copy."""
+def _is_elsewhere(number: Any) -> bool:
+    return isinstance(number, Tensor) and number.device.type != "cpu"
+
+
+def _on_host(*tensors: Tensor) -> list[Array]:
+    """Return small tensors of one device and type as arrays, in one copy."""
     own = [tensor.detach() for tensor in tensors]
     if own[0].device.type == "cpu":
-        return own
-    joined = torch.cat([tensor.reshape(-1) for tensor in own]).cpu()
-    parts = joined.split([tensor.numel() for tensor in own])
+        return [tensor.numpy() for tensor in own]
+    joined = torch.cat([tensor.reshape(-1) for tensor in own]).cpu().numpy()
+    parts = np.split(joined, np.cumsum([tensor.numel() for tensor in own])[:-1])
     return [part.reshape(tensor.shape) for part, tensor in zip(parts, own, strict=True)]
 
 
-def _not_rigid(rotations: Tensor) -> Tensor:
-    # products of rows: no matrix library, which torch's deterministic mode would have an opinion on
-    R = rotations.double()
-    products = (R[..., :, None, :] * R[..., None, :, :]).sum(-1)
-    off = (products - torch.eye(3, dtype=R.dtype, device=R.device)).abs().amax((-1, -2))
-    right_handed = (torch.linalg.cross(R[..., 0, :], R[..., 1, :]) * R[..., 2, :]).sum(-1) > 0.0
-    return ~((off < 1e-3) & right_handed)
+def _not_rigid(rotations: Array) -> Array:
+    R = rotations.astype(np.float64)
+    # of what is not finite, which has a rule of its own
+    with np.errstate(all="ignore"):
+        off = np.abs(R @ R.swapaxes(-1, -2) - np.eye(3)).max((-1, -2))
+        return ~((off < 1e-3) & (np.linalg.det(R) > 0.0))
 
 
-def _skewed(K: Tensor) -> Tensor:
+def _skewed(K: Array) -> Array:
     return (K[..., 0, 1] != 0.0) | (K[..., 1, 0] != 0.0) | (K[..., 2, :2] != 0.0).any(-1) | (K[..., 2, 2] != 1.0)
