@@ -79,7 +79,8 @@ def an_iteration(kernel: dict[str, Any]) -> str:
     """Say what an iteration of a kernel's loop over visits, steps or slots issues, or what its whole body does."""
     found: list[str] = []
     # an update has a loop over slots too, and much besides
-    told = () if kernel["kernel"].startswith("update") else ("visit", "step", "8 visits", "16 slots", "32 slots", "32 records")
+    units = ("visit", "step", "8 visits", "16 slots", "32 slots", "32 records")
+    told = () if kernel["kernel"].startswith("update") else units
     for unit in told:
         # what is unrolled has several loops of one unit
         spans = [[loop[name] / loop["iterations"] for name in ("always", "all")] for loop in kernel["loops"]]

@@ -1,6 +1,6 @@
 """Everything that only a GPU can tell, in four jobs of limited length, on a bare GPU node: no network, pip or git.
 
-    python3 -m cuda_ext.gpu_check            job 1: build, a smoke of half a minute, the benchmark, gsplat's times
+    python3 -m cuda_ext.gpu_check            job 1: build, a half-minute smoke, times, counters, gsplat's times
     python3 -m cuda_ext.gpu_check --job 2    job 2: laws, steps, sanitizer, training
     python3 -m cuda_ext.gpu_check --job 3    job 3: rows of the paper's tables, on captures that were brought along
     python3 -m cuda_ext.gpu_check --job 4    job 4, on a node of several GPUs: steps shared by ranks, blocks at once

@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 import os
+import shutil
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from cuda_ext.gpu_check.several import blocks_stage, ranks_stage
-from cuda_ext.gpu_check.shared import NOTHING, ROOT, Command, Share, StageContext, python_path, read_json, skipped
+from cuda_ext.gpu_check.shared import (
+    MARGIN,
+    NOTHING,
+    ROOT,
+    Command,
+    Share,
+    StageContext,
+    python_path,
+    read_json,
+    skipped,
+)
 from cuda_ext.gpu_check.tests import (
     laws_of_gaussian_parallel_stage,
     laws_stage,
@@ -55,6 +66,20 @@ def build_stage(check: StageContext) -> dict[str, Any]:
 def bench_stage(check: StageContext) -> dict[str, Any]:
     """Time every kernel and the whole step."""
     return _benchmark(check, "gpu_kernels.py", check.seconds)
+
+
+def counters_stage(check: StageContext) -> dict[str, Any]:
+    """Ask the hardware's counters about every kernel of a step, and keep where its warps wait, line by line."""
+    if check.rehearsal:
+        return skipped("the hardware's counters are a GPU's")
+    if shutil.which("ncu") is None:
+        return skipped("ncu is not installed")
+    target, lines = check.out / "gpu_counters.json", check.out / "lines.csv.gz"
+    limit = str(max(check.seconds / 2 - MARGIN, 1.0))
+    script = str(ROOT / "benchmarks" / "gpu_counters.py")
+    path = python_path(ROOT, check.site, ROOT / "benchmarks")
+    words = check.python(script, str(target), "--lines", str(lines), "--limit-s", limit)
+    return check.run(words, check.seconds, {"PYTHONPATH": path}) | {"results": read_json(target)}
 
 
 def gsplat_stage(check: StageContext) -> dict[str, Any]:
@@ -128,6 +153,7 @@ STAGES: dict[str, Callable[[StageContext], dict[str, Any]]] = {
     "build": build_stage,
     "smoke": smoke_stage,
     "bench": bench_stage,
+    "counters": counters_stage,
     "gsplat": gsplat_stage,
     "laws": laws_stage,
     "steps": steps_stage,
@@ -146,6 +172,7 @@ SHARES = {
     "build": Share(100, 300),
     "smoke": Share(30, 90),
     "bench": Share(120, 330),
+    "counters": Share(40, 120),
     "gsplat": Share(60, 1e9),
     "laws": Share(90, 150),
     "steps": Share(45, 150),
@@ -157,7 +184,7 @@ SHARES = {
     "blocks": Share(120, 1e9),
 }
 JOBS = {
-    1: ("wheels", "build", "smoke", "bench", "gsplat"),
+    1: ("wheels", "build", "smoke", "bench", "counters", "gsplat"),
     2: ("wheels", "build", "laws", "steps", "sanitizer", "train", "laws_of_gaussian_parallel"),
     3: ("wheels", "build", "reproduce"),
     4: ("wheels", "build", "ranks", "blocks"),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cuda_ext.machine_code import count_sass
+from cuda_ext.machine_code import count_sass, hot_lines
 from cuda_ext.machine_code.check_ptxas import CSRC, KernelUse
 from cuda_ext.machine_code.count_sass import PROCESSORS, find_nvdisasm, kernel_entry, warps_per_processor
 from cuda_ext.machine_code.sass import CLASSES, Flow, class_of, find_loops, loop_line, outside_loops, parse_sass
@@ -171,3 +171,56 @@ def test_the_committed_counts_are_those_of_the_sources() -> None:
         pytest.skip(f"the counts were taken with nvcc {told['nvcc']}, this is {found['nvcc']}")
     same = [entry for entry in told["kernels"] if (entry["file"], entry["arch"]) == ("blend_forward.cu", "sm_90")]
     assert found["kernels"] == same
+
+
+# What a profile says of every instruction, laid on the source's lines.
+
+
+def profile_of(instructions, samples):
+    """Return the page of sources as ncu prints it, its table twice as ncu does."""
+    head = ["Address", "Source", "# Samples", "Instructions Executed", "stall_long_sb", "stall_wait"]
+    head += ["stall_wait (Not Issued)"]
+    rows = []
+    for k, (one, n) in enumerate(zip(instructions, samples, strict=True)):
+        source = f"@{one.predicate} {one.opcode}  {one.operands}" if one.predicate else f"      {one.opcode} R1"
+        rows.append([f"0x7f{k:02x}", source, n, 10, n, 0, 99])
+    table = [["Kernel Name", "void pop::<unnamed>::blend_kernel<(int)3>(int)", ""], head, *rows]
+    return [",".join(f'"{value}"' for value in row) for row in (*table, *table)]
+
+
+def test_samples_are_added_up_by_the_lines_of_the_source():
+    (code,) = parse_sass(FRAGMENT)
+    samples = list(range(len(code.instructions)))
+    (profiled,) = hot_lines.read_profile(profile_of(code.instructions, samples)).values()
+    found = hot_lines.by_line(profiled, code.instructions)
+    assert sum(line.samples for line in found.values()) == sum(samples)
+    of_three = [k for k, one in enumerate(code.instructions) if one.frames[0] == ("a.cu", 3)]
+    line = found["a.cu", 3]
+    assert line.samples == sum(of_three) > 0
+    assert line.executed == 10 * len(of_three)
+    assert dict(line.stalls) == {"long_sb": sum(of_three)}
+    shown = hot_lines.table(found, 1)
+    assert len(shown) == 2
+    assert "a.cu:" in shown[1]
+
+
+def test_another_source_than_the_profiled_one_is_told():
+    (code,) = parse_sass(FRAGMENT)
+    (profiled,) = hot_lines.read_profile(profile_of(code.instructions, [1] * len(code.instructions))).values()
+    with pytest.raises(ValueError, match=r"and number 1 differs; check out the commit that was profiled"):
+        hot_lines.by_line(profiled, [code.instructions[0], *code.instructions[2:], code.instructions[1]])
+    with pytest.raises(ValueError, match="instructions are compiled here"):
+        hot_lines.by_line(profiled, code.instructions[:-1])
+
+
+def test_a_profile_that_is_none_is_told_in_a_line(tmp_path, capsys):
+    path = tmp_path / "lines.csv"
+    path.write_text("no,table\n")
+    assert hot_lines.main([str(path)]) == 1
+    assert "there is no instruction in it" in capsys.readouterr().err
+    (code,) = parse_sass(FRAGMENT)
+    path.write_text("\n".join(profile_of(code.instructions, [2] * len(code.instructions))))
+    assert hot_lines.main([str(path)]) == 0
+    assert f"{2 * len(code.instructions)} samples  void pop" in capsys.readouterr().out
+    assert hot_lines.main([str(path), "--kernel", "missing"]) == 1
+    assert "0 kernels have 'missing' in their names" in capsys.readouterr().err

@@ -180,6 +180,47 @@ def test_a_packed_scene_is_what_the_run_left_behind(bench, gpu, tmp_path, capsys
         assert len(file["viewmats"]) == len(file["Ks"]) == len(file["sizes"])
 
 
+def ncu_table(gpu_counters, kernels):
+    """Return ncu's table of counters, one metric a line; every metric of a kernel has the same number."""
+    stalls = [f"smsp__average_warps_issue_stalled_{name}_per_issue_active.ratio" for name in ("wait", "barrier")]
+    metrics = [metric for metric, _ in gpu_counters.ASKED.values()] + stalls
+    rows = [["ID", "Kernel Name", "Metric Name", "Metric Value"]]
+    for k, (name, value) in enumerate(kernels.items()):
+        rows += [[k, name, metric, value if "barrier" not in metric else "n/a"] for metric in metrics]
+    return ["==PROF== Connected", *(",".join(f'"{cell}"' for cell in row) for row in rows)]
+
+
+def test_counters_are_read_kernel_by_kernel(bench):
+    import gpu_counters
+
+    blend = "void pop::<unnamed>::blend_forward_kernel<(int)3, (pop::Collect)1, (bool)0>(pop::TileLists, int)"
+    printed = ncu_table(gpu_counters, {blend: "1,000.26", "pop::begin_step_kernel(int)": "2"})
+    first, second = gpu_counters.of_kernels(printed)
+    assert (first["kernel"], second["kernel"]) == ("void pop::blend_forward_kernel<3, 1, 0>", "pop::begin_step_kernel")
+    assert (first["us"], first["instructions"], first["issue_percent"]) == (1.0, 1000, 1000.3)
+    assert first["warps_stalled_per_issue"] == {"wait": 1000.26, "barrier": 0.0}
+    assert second["busy_percent"] == 100.0
+    kept = json.loads(gpu_counters.as_json({"gpu": "a card"}, [first, second]))
+    assert kept == {"gpu": "a card", "kernels": [first, second]}
+    # what the table of NOTES.md is made of
+    committed = json.loads((BENCHMARKS / "results" / "gpu" / "counters.json").read_text(encoding="utf-8"))
+    assert all(set(kernel) == set(first) for kernel in committed["kernels"])
+
+
+def test_counters_that_are_absent_are_told(bench, monkeypatch, tmp_path, capsys):
+    import gpu_counters
+
+    short = [line for line in ncu_table(gpu_counters, {"pop::a(int)": "1"}) if "smsp__inst_executed" not in line]
+    with pytest.raises(ValueError, match=r"pop::a: ncu told nothing of smsp__inst_executed\.sum"):
+        gpu_counters.of_kernels(short)
+    with pytest.raises(ValueError, match="told of no kernel"):
+        gpu_counters.of_kernels(["==ERROR== no permission"])
+    monkeypatch.setattr(gpu_counters.shutil, "which", lambda name: None)
+    monkeypatch.setattr(sys, "argv", ["gpu_counters", str(tmp_path / "counters.json")])
+    assert gpu_counters.main() == 2
+    assert "ncu was not found" in capsys.readouterr().err
+
+
 # The benchmark's first case has the loads that times were predicted for, counted by the kernels themselves.
 
 # what the predictions in benchmarks/NOTES.md are for, of the whole image, and of each of its pixels
