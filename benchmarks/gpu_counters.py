@@ -28,6 +28,8 @@ from gpu_kernels import photograph_of
 from gpu_scenes import CASES, TINY, scenes
 from gpu_steps import POP, make_trainer
 
+from pop_fast.children import python_command
+
 WARM_UP: Final = 4  # steps before the one that is looked at
 WAITS: Final = 4  # reasons that are kept of a kernel
 # what is asked for: the name in the file, ncu's name, the factor to the file's unit
@@ -115,7 +117,7 @@ def as_json(head: dict[str, Any], kernels: list[dict[str, Any]]) -> str:
 
 def _watched(words: list[str], case: str, limit: float) -> str:
     """Run this script under ncu and return what is printed."""
-    command = [*NCU, *words, sys.executable, str(Path(__file__).resolve()), "--step", "--case", case]
+    command = [*NCU, *words, *python_command(str(Path(__file__).resolve()), "--step", "--case", case)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=limit)
     if done.returncode != 0:
         raise ValueError(f"ncu failed:\n{(done.stdout + done.stderr)[-1500:]}")
