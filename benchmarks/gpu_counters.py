@@ -14,6 +14,7 @@ import csv
 import gzip
 import io
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -28,6 +29,7 @@ from gpu_kernels import photograph_of
 from gpu_scenes import CASES, TINY, scenes
 from gpu_steps import POP, make_trainer
 
+from cuda_ext.gpu_check.shared import ROOT, python_path
 from pop_fast.children import python_command
 
 WARM_UP: Final = 4  # steps before the one that is looked at
@@ -118,7 +120,9 @@ def as_json(head: dict[str, Any], kernels: list[dict[str, Any]]) -> str:
 def _watched(words: list[str], case: str, limit: float) -> str:
     """Run this script under ncu and return what is printed."""
     command = [*NCU, *words, *python_command(str(Path(__file__).resolve()), "--step", "--case", case)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=limit)
+    # the scripts here import each other by their bare names
+    path = {"PYTHONPATH": python_path(ROOT, ROOT / "benchmarks")}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=limit, env=os.environ | path)
     if done.returncode != 0:
         raise ValueError(f"ncu failed:\n{(done.stdout + done.stderr)[-1500:]}")
     return done.stdout
