@@ -1,7 +1,7 @@
 """Make what a bare GPU node cannot fetch: trained scenes as npz, shrunk captures, wheels, and a list of all of it.
 
     python benchmarks/gpu_pack.py FOLDER [--runs out/garden_pop ...] [--captures data/garden ...] [--pixels 400000]
-                                         [--whole data/bear ...]
+                                         [--whole data/garden ...] [--prepared fox bear_512 --data data]
 
 `python3 -m cuda_ext.gpu_check --pack FOLDER` runs this; its help says what the folder holds.
 """
@@ -26,6 +26,12 @@ from scipy.spatial.transform import Rotation
 
 from cuda_ext.gpu_check.command import commit_of
 from cuda_ext.gpu_check.shared import ROOT, write_json
+from paper_repro import prepared
+from paper_repro.jobs import Job
+from paper_repro.rows import load_row
+from paper_repro.scales import SCALES
+from paper_repro.scenes import SCENES, find_folder
+from paper_repro.train_row import load_capture_of
 from pop_fast.children import python_command
 from pop_fast.data import Capture, View, load_capture
 from pop_fast.errors import PopError
@@ -107,6 +113,25 @@ def keep_capture(source: Path, folder: Path) -> Path:
     return target
 
 
+def prepare_capture(name: str, data: Path, folder: Path) -> Path:
+    """Write what rows of the paper's tables see of a scene, at the scale that decides claims.
+
+    Raises:
+        PopError: there is no such scene, it cannot be read, or its points depend on the seed of a row.
+    """
+    if name not in SCENES:
+        raise PopError(f"there is no scene {name!r}; they are {', '.join(SCENES)}")
+    scene, scale = SCENES[name], SCALES["small"]
+    captures: list[Capture] = []
+    for seed in (0, 1):
+        job = Job(load_row("pop"), scene, scale, seed)
+        config = job.config(data=str(find_folder(scene, data)), result_dir=str(folder), progress=False)
+        captures.append(load_capture_of(job, config)[0])
+    if not np.array_equal(captures[0].points, captures[1].points):
+        raise PopError(f"{name}: has no points of its own; those that are made up depend on the seed")
+    return prepared.write(captures[0], config, folder / scene.folder)
+
+
 def _shrunk(view: View, pixels: float) -> tuple[np.ndarray, np.ndarray]:
     by = min(1.0, math.sqrt(pixels / (view.width * view.height)))
     size = (max(round(by * view.width), 1), max(round(by * view.height), 1))
@@ -176,6 +201,8 @@ def main() -> int:
     parser.add_argument("--runs", nargs="*", type=Path, default=[], help="results of `pop train`")
     parser.add_argument("--captures", nargs="*", type=Path, default=[], help="captures to train on")
     parser.add_argument("--whole", nargs="*", type=Path, default=[], help="captures that keep their bytes, for rows")
+    parser.add_argument("--prepared", nargs="*", default=[], metavar="SCENE", help="scenes as rows see them, in a file")
+    parser.add_argument("--data", type=Path, default=Path("data"), help="the folder that holds these scenes")
     parser.add_argument("--pixels", type=float, default=4e5, help="of a packed photograph, at most")
     parser.add_argument("--no-wheels", action="store_true", help="download nothing")
     args = parser.parse_args()
@@ -191,6 +218,7 @@ def main() -> int:
         ("run", args.runs, lambda source: pack_scene(source, scenes)),
         ("capture", args.captures, lambda source: pack_capture(source, captures, args.pixels)),
         ("capture", args.whole, lambda source: keep_capture(source, captures)),
+        ("scene", list(map(Path, args.prepared)), lambda name: prepare_capture(str(name), args.data, captures)),
     )
     for what, sources, pack in packed:
         for source in sources:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from paper_repro import results
+from paper_repro import prepared, results
 from paper_repro.base import begin_from_base, keep_for_others, remove_what_was_kept, steps_for_others
 from paper_repro.jobs import WORK, Job
 from paper_repro.record import COMMIT
@@ -251,12 +251,16 @@ def _train(job: Job, options: Options, config: TrainConfig) -> None:
 
 
 def load_capture_of(job: Job, config: TrainConfig) -> tuple[Capture, float]:
-    """Read the photographs and cameras of a job, and say how many seconds that took."""
+    """Read the photographs and cameras of a job, or what was prepared of them, and say how many seconds that took."""
     from pop_fast.cli.train import arguments, open_capture
 
     images = [] if job.scene.images is None else ["--images", job.scene.images]
     start = time.perf_counter()
-    capture = open_capture(config, arguments([config.data, *images])[1])
+    made = prepared.path_of(Path(config.data), config)
+    if made.is_file():
+        capture = prepared.read(made, config)
+    else:
+        capture = open_capture(config, arguments([config.data, *images])[1])
     return capture, time.perf_counter() - start
 
 

@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 import torch
 
+from paper_repro import prepared
 from pop_fast.blocks.plan import Job, job_text, make_plan, write_plan
 from pop_fast.data.capture import Listing
 from pop_fast.data.colmap import read_model
@@ -189,6 +190,7 @@ def make_more(folder: Path) -> None:
     _write_exports(folder)
     _write_blocks(folder)
     _write_records(folder / "result", folder / "records")
+    _write_prepared(folder / "prepared", folder / "tracked")
     _write_vectors(folder / "vectors")
     _write_kit(folder)
 
@@ -336,6 +338,11 @@ def _write_records(result: Path, folder: Path) -> None:
     shutil.copy(repro / "configs" / "pop.toml", folder / "pop.toml")
     shutil.copy(repro / "scenes" / "fox.toml", folder / "fox.toml")
     shutil.copy(repro / "paper.toml", folder / "paper.toml")
+
+
+def _write_prepared(folder: Path, capture: Path) -> None:
+    shutil.rmtree(folder, ignore_errors=True)
+    prepared.write(load_capture(capture), TrainConfig(), folder)
 
 
 def _write_vectors(folder: Path) -> None:

@@ -18,7 +18,7 @@ import torch
 
 from cuda_ext.gpu_check.command import begun_report
 from cuda_ext.gpu_check.outcomes import outcomes
-from paper_repro import paper, results, rows, scenes
+from paper_repro import paper, prepared, results, rows, scenes
 from paper_repro.collect import collect
 from paper_repro.jobs import job_named
 from pop_fast.blocks.merge import read_round
@@ -269,6 +269,7 @@ _PAPER = {
     "row": Reader("records/pop.toml", "", _row, "text"),
     "scene of the paper": Reader("records/fox.toml", "", scenes.load_scene, "text"),
     "paper.toml": Reader("records/paper.toml", "", paper.load, "text"),
+    "prepared capture": Reader("prepared/prepared_1.npz", "", lambda path: prepared.read(path, TrainConfig()), "zip"),
     **{
         f"collected: {name}": Reader("result", name, _collected, kind)  # type: ignore[arg-type]
         for name, kind in _COLLECTED

@@ -13,7 +13,9 @@ built. A stage that fails or runs out of time is reported with the reason, and t
 What travels is made beforehand, where there is a network, by --pack FOLDER, and read by --packed FOLDER:
     scenes/NAME.npz    trained Gaussians and their cameras, of every folder under --runs
     captures/NAME/     photographs as JPEG, shrunk to --pixels, with cameras and points in COLMAP's text files, of every
-                       folder under --captures; with all their bytes of every folder under --whole, as job 3 needs
+                       folder under --captures; with all their bytes of every folder under --whole, or as rows see them
+                       of every scene under --prepared, in one file: job 3 needs one of the two, and photographs with
+                       distortion the second, since a bare node has no pycolmap
     wheels/*.whl       pure Python: beartype, plyfile, tyro, typeguard, docstring-parser, typing-extensions, jaxtyping,
                        wadler-lindig, gsplat (which compiles its kernels on the node)
     manifest.json      the commit, and every file's size and SHA-256
@@ -140,7 +142,7 @@ def _pack(folder: Path, args: argparse.Namespace) -> int:
     """Let the packing script, which needs the whole program, do its work."""
     words = [str(ROOT / "benchmarks" / "gpu_pack.py"), str(folder), "--pixels", str(args.pixels)]
     words += ["--runs", *map(str, args.runs), "--captures", *map(str, args.captures)]
-    words += ["--whole", *map(str, args.whole)]
+    words += ["--whole", *map(str, args.whole), "--data", str(args.data), "--prepared", *args.prepared]
     words += ["--no-wheels"] if args.no_wheels else []
     path = python_path(ROOT, ROOT / "benchmarks")
     done = subprocess.run(python_command(*words), env={**os.environ, "PYTHONPATH": path}, check=False)
@@ -162,6 +164,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--pack", type=Path, metavar="FOLDER", help="make what travels, and run nothing")
     parser.add_argument("--runs", nargs="*", type=Path, default=[], help="results of `pop train` to pack")
     parser.add_argument("--whole", nargs="*", type=Path, default=[], help="folders of captures to pack as they are")
+    parser.add_argument("--prepared", nargs="*", default=[], metavar="SCENE", help="scenes to pack as rows see them")
+    parser.add_argument("--data", type=Path, default=Path("data"), help="the folder of these scenes; default data")
     parser.add_argument("--pixels", type=float, default=4e5, help="of a packed photograph, at most; default 400,000")
     parser.add_argument("--no-wheels", action="store_true", help="pack no wheels: nothing is downloaded")
     return parser
