@@ -19,7 +19,7 @@ _ORACLE: Final = (
         "refinement.py",
         "return motion @ viewmat",
         "return viewmat @ motion",
-        "",
+        "test_agreement:refined_viewmat_is_the_oracles",
     ),
     (
         "the_threshold_stays",
@@ -27,7 +27,7 @@ _ORACLE: Final = (
         "selection.py",
         "return scores <= ascending[int(share * (len(ascending) - 1))]",
         "return scores < ascending[int(share * (len(ascending) - 1))]",
-        "",
+        "test_selection:the_lowest_go_up_to_the_score_at_the_share_of_the_last_index",
     ),
     (
         "hidden_score_too",
@@ -35,7 +35,7 @@ _ORACLE: Final = (
         "taming.py",
         "return np.where(visible, VIEW * photometric * terms, 0.0)",
         "return VIEW * photometric * terms",
-        "",
+        "test_strategies:a_training_by_taming_is_the_oracles_at_every_step",
     ),
     (
         "rays_from_the_given_point",
@@ -43,7 +43,7 @@ _ORACLE: Final = (
         "chord.py",
         'if profile.principal_point == "centred":',
         'if profile.principal_point == "given":',
-        "",
+        "test_chord:where_the_profile_centres_the_principal_point_rays_pass_about_the_middle_of_the_picture",
     ),
     (
         "appearance_a_step_ahead",
@@ -51,7 +51,7 @@ _ORACLE: Final = (
         "appearance.py",
         "share = step / max_steps",
         "share = (step + 1) / max_steps",
-        "",
+        "test_few_photographs:rates_of_exposures_and_cameras_fall_from_step_to_step_and_not_as_one_another",
     ),
     (
         "hidden_are_pushed_down",
@@ -59,7 +59,7 @@ _ORACLE: Final = (
         "polarization.py",
         "mask & taking_part, ~mask & taking_part",
         "mask & taking_part, ~mask",
-        "",
+        "test_polarization:restricting_the_prior_to_the_visible_is_the_prior_of_the_visible",
     ),
     (
         "sensitive_over_black",
@@ -67,7 +67,7 @@ _ORACLE: Final = (
         "sensitivity.py",
         "suffix_color = sum(black_or_given)",
         "suffix_color = 0.0",
-        "",
+        "test_sensitivity:sensitivities_are_the_oracles",
     ),
 )
 
@@ -78,7 +78,7 @@ _PROGRAM: Final = (
         "train/schedule.py",
         "moved[[*edits, *restarts]] = False",
         "moved[edits] = False",
-        "",
+        "test_optimizer:adam_counts_the_updates_that_the_rules_leave_each_parameter",
     ),
     (
         "first_share_again",
@@ -86,7 +86,7 @@ _PROGRAM: Final = (
         "density/pup.py",
         "self.prune_shares[self.adam_restarts.index(context.step)]",
         "self.prune_shares[0]",
-        "",
+        "test_strategies:a_training_by_pup_is_the_oracles_at_every_step",
     ),
     (
         "points_from_masked_pixels",
@@ -94,7 +94,7 @@ _PROGRAM: Final = (
         "density/mini_splatting.py",
         "shown = ids >= 0 if mask is None else (ids >= 0) & mask.to(ids.device)",
         "shown = ids >= 0",
-        "",
+        "test_strategies:a_training_by_mini_splatting_is_the_oracles_at_every_step",
     ),
 )
 
@@ -163,14 +163,54 @@ def _rows_of_16_bits(given: Given) -> Given:
 
 
 _BOXES: Final = (
-    ("no_tile_fits", "pictures smaller than a tile stay empty", telling(_no_tile_fits), ""),
-    ("last_camera_teaches", "shared colours learn from the last camera only", breaking(_last_camera_teaches), ""),
-    ("rows_as_stored", "strides of centres, opacities and colours are ignored", breaking(_rows_as_stored), ""),
-    ("cameras_as_stored", "strides of view matrices and intrinsics are ignored", breaking(_cameras_as_stored), ""),
-    ("normalized_in_place", "the caller's quaternions are normalised in place", _normalized_in_place, ""),
-    ("seeds_anew", "every call seeds torch's generator", _seeds_anew, ""),
-    ("tiles_of_16_bits", "tiles from number 32768 on stay empty", telling(_tiles_of_16_bits), ""),
-    ("rows_of_16_bits", "Gaussians from number 65536 on are not drawn", breaking(_rows_of_16_bits), ""),
+    (
+        "no_tile_fits",
+        "pictures smaller than a tile stay empty",
+        telling(_no_tile_fits),
+        "test_agreement:the_image_is_one_of_the_oracles_outcomes",
+    ),
+    (
+        "last_camera_teaches",
+        "shared colours learn from the last camera only",
+        breaking(_last_camera_teaches),
+        "test_signature_arguments:without_a_background_it_is_black",
+    ),
+    (
+        "rows_as_stored",
+        "strides of centres, opacities and colours are ignored",
+        breaking(_rows_as_stored),
+        "test_autograd:how_arguments_lie_in_memory_changes_no_gradient",
+    ),
+    (
+        "cameras_as_stored",
+        "strides of view matrices and intrinsics are ignored",
+        breaking(_cameras_as_stored),
+        "test_autograd:how_arguments_lie_in_memory_changes_no_gradient",
+    ),
+    (
+        "normalized_in_place",
+        "the caller's quaternions are normalised in place",
+        _normalized_in_place,
+        "test_agreement:gradients_are_the_oracles",
+    ),
+    (
+        "seeds_anew",
+        "every call seeds torch's generator",
+        _seeds_anew,
+        "test_autograd:without_gradients_the_same_image_is_drawn_and_follows_nothing",
+    ),
+    (
+        "tiles_of_16_bits",
+        "tiles from number 32768 on stay empty",
+        telling(_tiles_of_16_bits),
+        "test_whole:tiles_of_a_number_beyond_16_bits_are_drawn",
+    ),
+    (
+        "rows_of_16_bits",
+        "Gaussians from number 65536 on are not drawn",
+        breaking(_rows_of_16_bits),
+        "test_scale:the_image_of_seventy_thousand_is_the_oracles",
+    ),
 )
 
 BLIND_THIRD_MORE: Final = tuple(Mutant(*line) for line in _ORACLE)
