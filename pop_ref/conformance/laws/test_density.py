@@ -258,6 +258,25 @@ def test_a_densification_adds_clones_and_splits_and_takes_prunes_away(backend, c
     assert not np.any(fresh.blurred)
 
 
+@law("density", "densify_and_prune")
+def test_the_copy_of_a_gaussian_that_is_cloned_and_split_stays_whole(backend):
+    # the first is small and moves much, and is blurred, where what is blurred is split whatever its size
+    rows = tagged_rows(3)
+    rows.params["scales"][:] = np.log(0.125)
+    moves, blurred = np.array([1.0, 1.0, 0.0]), np.array([True, False, True])
+    window = Statistics(moves, np.ones(3, dtype=np.int64), 1, np.zeros(3, dtype=np.int64), blurred)
+    config = DensityConfig(grow_grad2d=0.5, grow_scale3d=0.25, blur_rule="split", grow_on_gradient_in_blur_window=True)
+
+    def at_the_centre(n_split):
+        return np.zeros((2, n_split, 3))
+
+    after, _ = backend.stage("densify_and_prune")(rows, window, 1.0, 5000, at_the_centre, config)
+    # who stays, copies, and two children each
+    assert_same_bits("tags", after.params["means"][:, 0], np.array([2.0, 1.0, 2.0, 1.0, 3.0, 1.0, 3.0]))
+    sizes = 0.125 / np.where(np.arange(7) < 3, 1.0, 1.6)
+    assert_close("density.split", np.exp(after.params["scales"]), np.repeat(sizes[:, None], 3, 1), 1.0, backend.dtype)
+
+
 readings = st.builds(
     DensityConfig,
     inclusive=st.booleans(),

@@ -123,6 +123,14 @@ def test_the_square_extent_is_three_deviations_of_the_longer_axis_whatever_the_o
     assert math.ceil(exact - slack) <= radii[0, 0] <= math.ceil(exact + slack)
 
 
+@law("footprint", "radii_from_covars2d", INRIAS)
+def test_known_square_extents_of_circles(backend):
+    # D2: the discriminant, 0 for a circle, is bounded by 0.1: 3 sqrt(c + sqrt(0.1)), which is not 3 sqrt(c)
+    covars = np.array([0.25, 1.0, 4.0, 9.0])[:, None, None] * np.eye(2)
+    radii = backend.stage("radii_from_covars2d")(covars, np.full(4, 0.5), INRIA)
+    assert_same_bits("extents", radii, np.array([[3, 3], [4, 4], [7, 7], [10, 10]]))
+
+
 @law("footprint", "radii_from_covars2d")
 def test_known_extents(backend):
     # sqrt(2 ln 255) = 3.329 deviations at full opacity, sqrt(2 ln 127.5) = 3.114 at one half, none at the floor

@@ -43,6 +43,18 @@ def test_where_there_are_as_many_gaussians_as_cameras_a_colour_is_a_gaussians(ba
     assert_call_is_the_oracles(backend, Call((few,)))
 
 
+@law("signature", *JUDGED, CAMERAS, CAMERA_COLORS)
+def test_where_there_are_as_many_gaussians_as_cameras_a_cameras_colours_are_its_own(backend):
+    for channels in (0, 3):
+        row = frames(backend, 3, 3, channels=channels, camera_colors=True)
+        call = Call((row,), camera_colors=True)
+        visible = [wanted.render.splats.visible for wanted in expectations(backend, call)[0]]
+        seen = np.flatnonzero(np.all(visible, axis=0))[:3]
+        assert len(seen) == 3, "no three Gaussians are seen by all cameras"
+        few = tuple(Frame(f.scene.rows(seen), None if f.colors is None else f.colors[seen]) for f in row)
+        assert_call_is_the_oracles(backend, Call((few,), camera_colors=True))
+
+
 @law("signature", *JUDGED, CAMERAS, BATCHES)
 def test_batch_entries_do_not_know_of_each_other(backend):
     rows = tuple(frames(backend, 4 + entry, 2, entry=entry) for entry in range(2))

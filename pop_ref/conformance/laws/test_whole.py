@@ -68,6 +68,22 @@ def test_any_tile_size_gives_the_same_image(backend, scene, size):
     _same_render("whole.tiles", backend, backend.render(seen.with_overrides(tile_size=size)), view, error_bounds)
 
 
+@law("whole", RENDER, EXTENTS)
+def test_tiles_of_a_number_beyond_16_bits_are_drawn(backend):
+    # 264 x 256 tiles of a pixel: splats about the middle, beyond tile 2^15, and in the last corner, beyond 2^16
+    camera = Camera(np.eye(4), np.array([[256.0, 0.0, 132.0], [0.0, 256.0, 128.0], [0.0, 0.0, 1.0]]), 264, 256)
+    at = ((8.0, 8.0), (132.0, 124.0), (250.0, 130.0), (260.0, 253.0))
+    splats = pack([Record(x=x, y=y, depth=2.0, size=(2.0, 2.0, 2.0), opacity=0.75) for x, y in at], camera)
+    scene = backend.sees(Scene(splats, camera, (0.25, 0.5, 0.75), tile_size=1))
+    view = backend.plainly(scene)
+    for x, y in at:
+        # nearly all of the opacity, next to the centre
+        assert view.T_final[int(y), int(x)] < 0.375, f"the splat at {x}, {y} of 264 x 256 tiles is not drawn"
+    whole = backend.plainly(scene.with_overrides(tile_size=16))
+    for name in ("image", "T_final"):
+        assert_close("whole.tiles", getattr(view, name), getattr(whole, name), 16.0, backend.dtype)
+
+
 @law("whole", RENDER, scene=plain, seed=st.randoms(use_true_random=False))
 def test_permuting_gaussians_permutes_ids_only(backend, scene, seed):
     # depths are made distinct: memory order decides ties (D4)
