@@ -101,8 +101,9 @@ def gsplat_stage(check: StageContext) -> dict[str, Any]:
 def reproduce_stage(check: StageContext) -> dict[str, Any]:
     """Train the rows of the paper's tables that the claims need, the cheapest first, as `pop-repro queue` does.
 
-    Of the scenes that were brought along (--whole, --prepared), at the scale that decides claims, one after the other: trainings that share a card take turns and gain nothing. A row that the time ends in is begun anew by the
-    next call, unless the folder survives. What was finished is one line each of rows.jsonl.
+    Of the scenes that were brought along (--whole, --prepared), at the scale that decides claims, one after the other:
+    trainings that share a card take turns and gain nothing. A row that the time ends in is begun anew by the next call,
+    unless the folder survives. What was finished is one line each of rows.jsonl.
     """
     folder = check.packed / "captures" if check.packed else check.captures[0].parent if check.captures else None
     if folder is None:

@@ -6,6 +6,13 @@ from pop_ref.conformance.mutants.black_box import BlackBox
 from pop_ref.conformance.mutants.blind import BLIND, BLIND_BOXES, BLIND_PROGRAM
 from pop_ref.conformance.mutants.blind_second import BLIND_SECOND, BLIND_SECOND_PROGRAM
 from pop_ref.conformance.mutants.blind_second_boxes import BLIND_SECOND_BOXES
+from pop_ref.conformance.mutants.blind_third import BLIND_THIRD, BLIND_THIRD_PROGRAM
+from pop_ref.conformance.mutants.blind_third_boxes import BLIND_THIRD_BOXES
+from pop_ref.conformance.mutants.blind_third_more import (
+    BLIND_THIRD_MORE,
+    BLIND_THIRD_MORE_BOXES,
+    BLIND_THIRD_MORE_PROGRAM,
+)
 from pop_ref.conformance.mutants.collected import COLLECTED
 from pop_ref.conformance.mutants.combined import COMBINED
 from pop_ref.conformance.mutants.copies import Mutant, living
@@ -21,12 +28,14 @@ from pop_ref.conformance.mutants.unseen import UNSEEN
 from pop_ref.conformance.mutants.unseen_boxes import UNSEEN_BOXES
 
 # of the oracle, and of the program that trains
-MUTANTS = (*GEOMETRY, *PIXELS, *TRAINING, *BASELINES, *METHOD_MUTANTS, *BLIND, *BLIND_SECOND)
-PROGRAM = (*LINES, *TRAINERS, *COLLECTED, *STRANGERS, *UNSEEN, *BLIND_PROGRAM, *BLIND_SECOND_PROGRAM)
+_BLIND = (*BLIND, *BLIND_SECOND, *BLIND_THIRD, *BLIND_THIRD_MORE)
+MUTANTS = (*GEOMETRY, *PIXELS, *TRAINING, *BASELINES, *METHOD_MUTANTS, *_BLIND)
+_BLIND_PROGRAM = (*BLIND_PROGRAM, *BLIND_SECOND_PROGRAM, *BLIND_THIRD_PROGRAM, *BLIND_THIRD_MORE_PROGRAM)
+PROGRAM = (*LINES, *TRAINERS, *COLLECTED, *STRANGERS, *UNSEEN, *_BLIND_PROGRAM)
 # behind gsplat's signature: one argument broken, several together; autograd, memory, size
 BLACK_BOXES = (
     *(*SINGLE, *COMBINED, *SEAMS, *TRAINERS_BOXES, *STRANGERS_BOXES, *UNSEEN_BOXES),
-    *(*BLIND_BOXES, *BLIND_SECOND_BOXES),
+    *(*BLIND_BOXES, *BLIND_SECOND_BOXES, *BLIND_THIRD_BOXES, *BLIND_THIRD_MORE_BOXES),
 )
 
 # they are counted apart: what the kit has to see from outside says nothing of what stages show
