@@ -76,7 +76,7 @@ _ORACLE: Final = (
         "test_agreement:dominant_weights_are_the_oracles",
     ),
     (
-        "points_behind_the_camera",
+        "points_behind_the_camera_seen",
         "a chord's middle behind the camera may dominate a pixel and become a point",
         "chord.py",
         "if depth_of[i] >= 0.0]",
@@ -151,7 +151,7 @@ _PROGRAM: Final = (
         "test_strategies:a_training_is_the_oracles_under_every_reading",
     ),
     (
-        "extents_by_the_width",
+        "extents_by_the_width_alone",
         "extents on the screen are shares of the width, also where the height is larger",
         "density/control.py",
         'max(int(info["width"]), int(info["height"]))',

@@ -246,7 +246,7 @@ _BOXES: Final = (
         "test_agreement:the_image_is_one_of_the_oracles_outcomes",
     ),
     (
-        "absolute_of_the_sum",
+        "absolute_of_the_summed",
         "with packed rows absgrad is the absolute value of the gradient, not the sum of absolute values",
         telling(_absolute_of_the_sum),
         "test_signature_cameras:packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same",
