@@ -52,14 +52,6 @@ _ORACLE: Final = (
         "test_signature_depth:the_accumulated_depth_is_the_oracles_alone_and_behind_colours",
     ),
     (
-        "ties_from_the_back",
-        "of splats of one depth the later one is blended first",
-        "tiles.py",
-        "key=lambda i: (depth_of[i], i)",
-        "key=lambda i: (depth_of[i], -i)",
-        "test_agreement:the_image_is_one_of_the_oracles_outcomes",
-    ),
-    (
         "discriminant_from_zero",
         "the square extent's discriminant is bounded by 0, not by 0.1",
         "footprint.py",
@@ -74,14 +66,6 @@ _ORACLE: Final = (
         "max(pixel.weights, default=0.0)",
         "next(iter(pixel.weights), 0.0)",
         "test_agreement:dominant_weights_are_the_oracles",
-    ),
-    (
-        "points_behind_the_camera_seen",
-        "a chord's middle behind the camera may dominate a pixel and become a point",
-        "chord.py",
-        "if depth_of[i] >= 0.0]",
-        "if depth_of[i] > -np.inf]",
-        "test_chord:a_gaussian_that_is_densest_behind_the_camera_gives_no_point",
     ),
     (
         "fisher_over_black",
@@ -131,33 +115,9 @@ _ORACLE: Final = (
         "dict(rows.v),",
         "test_density:a_reset_lowers_opacities_to_the_ceiling_and_forgets_their_moments_only",
     ),
-    (
-        "opacities_decay_too",
-        "the rate of the opacities falls with the others",
-        "optimizer.py",
-        'rate if name == "opacities" else decay * rate',
-        "decay * rate",
-        "test_optimizer:rates_rewind_and_fall_in_rounds_as_the_rules_say",
-    ),
 )
 
 _PROGRAM: Final = (
-    (
-        "steps_for_views",
-        "a step of several cameras counts as one view of the window",
-        "density/control.py",
-        'state["views"] += cameras',
-        'state["views"] += 1',
-        "test_strategies:a_training_is_the_oracles_under_every_reading",
-    ),
-    (
-        "extents_by_the_width_alone",
-        "extents on the screen are shares of the width, also where the height is larger",
-        "density/control.py",
-        'max(int(info["width"]), int(info["height"]))',
-        'int(info["width"])',
-        "test_strategies:a_training_is_the_oracles_under_every_reading",
-    ),
     (
         "blur_seen_only_while_it_is_split",
         "views of the window before the first blur step are not looked at for blurred Gaussians",
@@ -199,14 +159,6 @@ _PROGRAM: Final = (
         "        rows.clear(context.state)\n"
         "        done = DensificationStep(n_clones, n_splits, rows.prune_marked(context, prunes()))\n",
         "test_strategies:a_training_is_the_oracles_under_every_reading",
-    ),
-    (
-        "reset_raises_the_faint",
-        "a reset sets every opacity to its ceiling, those under it, too",
-        "density/rows.py",
-        "opacities.clamp_(max=math.log(ceiling / (1.0 - ceiling)))",
-        "opacities.fill_(math.log(ceiling / (1.0 - ceiling)))",
-        "test_strategies:a_training_by_gsplat_is_the_oracles_at_every_step",
     ),
     (
         "views_of_all_windows",

@@ -142,18 +142,6 @@ def _kept_intrinsics() -> Breaks:
     return breaks
 
 
-def _absolute_of_the_sum(given: Given, images: Any, alphas: Any, meta: Any) -> _Told:
-    if given["absgrad"] and given["packed"] and meta["means2d"].requires_grad:
-        means2d = meta["means2d"]
-        sums = means2d.absgrad
-
-        def change(gradient: Any) -> None:
-            sums.copy_(gradient.abs())
-
-        means2d.register_hook(change)
-    return images, alphas, meta
-
-
 _BOXES: Final = (
     (
         "rows_for_cameras",
@@ -244,12 +232,6 @@ _BOXES: Final = (
         "intrinsics are kept for each size of an image, and those of the first call stay",
         _kept_intrinsics(),
         "test_agreement:the_image_is_one_of_the_oracles_outcomes",
-    ),
-    (
-        "absolute_of_the_summed",
-        "with packed rows absgrad is the absolute value of the gradient, not the sum of absolute values",
-        telling(_absolute_of_the_sum),
-        "test_signature_cameras:packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same",
     ),
 )
 

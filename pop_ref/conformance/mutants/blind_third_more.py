@@ -61,25 +61,9 @@ _ORACLE: Final = (
         "mask & taking_part, ~mask",
         "test_polarization:restricting_the_prior_to_the_visible_is_the_prior_of_the_visible",
     ),
-    (
-        "sensitive_over_black",
-        "Speedy-Splat's score takes what is behind a pixel for black",
-        "sensitivity.py",
-        "suffix_color = sum(black_or_given)",
-        "suffix_color = 0.0",
-        "test_sensitivity:sensitivities_are_the_oracles",
-    ),
 )
 
 _PROGRAM: Final = (
-    (
-        "restarts_move",
-        "where edits replace an update, a restart of Adam does not",
-        "train/schedule.py",
-        "moved[[*edits, *restarts]] = False",
-        "moved[edits] = False",
-        "test_optimizer:adam_counts_the_updates_that_the_rules_leave_each_parameter",
-    ),
     (
         "first_share_again",
         "every round of PUP prunes the first round's share",
