@@ -75,7 +75,7 @@ class Result:
         run: twelve hex digits of the hash of configuration, data and seed.
         commit: the git commit that ran, or None outside a clone.
         config_hash: of the configuration.
-        data_hash: of the capture's files.
+        data_hash: of the capture as it was loaded: names, photographs, masks, cameras, points.
         machine: the processor, and after ", " the GPU where one was used.
         cpu: family, model, stepping and instructions of the processor, by which two machines are of one kind; None
             where nothing tells them.

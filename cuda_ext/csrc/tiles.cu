@@ -1,13 +1,14 @@
 // Lists of splats by tile, without a host synchronisation: sort splats by depth, give every (splat, tile) instance a slot,
 // sort the instances by tile. Both sorts are stable, so a list is ordered by (depth, index) (D3, D4).
 //
-// Which tiles a splat reaches is tried while they are counted, in the order of the splats, so that it need not wait for the
-// sort by depth; each tried tile leaves a bit, and listing reads the bits.
+// Which tiles a splat reaches is tried while they are counted, in the order of the splats, so that it need not wait for
+// the sort by depth; each tried tile leaves a bit, and listing reads the bits.
 //
-// Slots are numbered splat by splat, front to back; the instance sort carries them as its payload, so that the backward pass can write
-// one row a slot without atomics and sum a splat's rows, which lie together. Where there are more instances than the
-// buffers hold, nothing is listed and state->overflow says how many there are: the host makes room and repeats the step,
-// and until then nothing is updated. Their number can pass 2^32, so that it is added up with saturation.
+// Slots are numbered splat by splat, front to back; the instance sort carries them as its payload, so that the backward
+// pass can write one row a slot without atomics and sum a splat's rows, which lie together. Where there are more
+// instances than the buffers hold, nothing is listed and state->overflow says how many there are: the host makes room
+// and repeats the step, and until then nothing is updated. Their number can pass 2^32, so that it is added up with
+// saturation.
 
 #include <thrust/iterator/permutation_iterator.h>
 

@@ -6,21 +6,13 @@ import importlib
 from typing import Any, Final
 
 from pop_ref.conformance.mutants.black_box import BlackBox, Rasterization
-from pop_ref.conformance.mutants.unseen_boxes import Breaks, Given, breaking, meta_telling, telling
+from pop_ref.conformance.mutants.unseen_boxes import Breaks, Given, backwards, breaking, meta_telling, telling
 
 _Told = tuple[Any, Any, Any]
 
 
 def _torch() -> Any:
     return importlib.import_module("torch")
-
-
-def _backwards(value: Any, change: Any) -> Any:
-    """Return the value, through which a gradient goes as the change makes it."""
-    passed = value * 1.0
-    if passed.requires_grad:
-        passed.register_hook(change)
-    return passed
 
 
 def _sums_pile_up() -> Breaks:
@@ -62,7 +54,7 @@ def _unused_bands_learn(given: Given) -> Given:
         gradient[..., used:, :] = gradient[..., :1, :]
         return gradient
 
-    return {"colors": _backwards(given["colors"], change)}
+    return {"colors": backwards(given["colors"], change)}
 
 
 def _square_part(given: Given, images: Any, alphas: Any, meta: Any) -> _Told:
@@ -87,7 +79,7 @@ def _last_row_learns(given: Given) -> Given:
         gradient[..., 3, :] = gradient[..., :3, :].sum(-2)
         return gradient
 
-    return {"viewmats": _backwards(given["viewmats"], change)}
+    return {"viewmats": backwards(given["viewmats"], change)}
 
 
 def _sums_of_the_first_camera(given: Given, images: Any, alphas: Any, meta: Any) -> _Told:

@@ -7,7 +7,7 @@ import math
 from typing import Any, Final
 
 from pop_ref.conformance.mutants.black_box import BlackBox, Rasterization
-from pop_ref.conformance.mutants.unseen_boxes import Breaks, Given, breaking, telling
+from pop_ref.conformance.mutants.unseen_boxes import Breaks, Given, backwards, breaking, telling
 
 _Told = tuple[Any, Any, Any]
 _SH_C0: Final = 0.28209479177387814
@@ -15,14 +15,6 @@ _SH_C0: Final = 0.28209479177387814
 
 def _torch() -> Any:
     return importlib.import_module("torch")
-
-
-def _backwards(value: Any, change: Any) -> Any:
-    """Return the value, through which a gradient goes as the change makes it."""
-    passed = value * 1.0
-    if passed.requires_grad:
-        passed.register_hook(change)
-    return passed
 
 
 def _per_camera(given: Given) -> bool:
@@ -83,7 +75,7 @@ def _lengths_stretch(given: Given) -> Given:
 def _upper_half_learns(given: Given) -> Given:
     if given.get("covars") is None:
         return {}
-    return {"covars": _backwards(given["covars"], lambda gradient: gradient.triu())}
+    return {"covars": backwards(given["covars"], lambda gradient: gradient.triu())}
 
 
 def _counted_over_cameras(given: Given, images: Any, alphas: Any, meta: Any) -> _Told:

@@ -19,6 +19,14 @@ def _torch() -> Any:
     return importlib.import_module("torch")
 
 
+def backwards(value: Any, change: Any) -> Any:
+    """Return the value, through which a gradient goes as the change makes it."""
+    passed = value * 1.0
+    if passed.requires_grad:
+        passed.register_hook(change)
+    return passed
+
+
 def breaking(change: Callable[[Given], Given]) -> Breaks:
     return lambda sound, given: sound(**given | change(given))
 

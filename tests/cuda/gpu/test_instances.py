@@ -255,3 +255,75 @@ def test_rows_of_a_rectangle_are_exact_where_a_float_cannot_number_its_tiles(gpu
     begin, end = buffers.tensor("tile_begin"), buffers.tensor("tile_end")
     reached = (end > begin).nonzero()[:, 0]
     assert torch.equal(reached.cpu(), torch.arange(across) + (down - 1) * across)
+
+
+def long_scene(gpu, n, sizes):
+    """Return splats over an image of 65 x 65 tiles: their rows, some of them reaching across most of it."""
+    g = torch.Generator().manual_seed(11)
+    turn = 3.2 * torch.rand(n, generator=g)
+    axes = torch.stack((torch.cos(turn), torch.sin(turn), -torch.sin(turn), torch.cos(turn)), 1).view(n, 2, 2)
+    covariance = axes @ torch.diag_embed(sizes.square()) @ axes.mT
+    inverse = torch.linalg.inv(covariance)
+    rows = {
+        "means2d": torch.rand((n, 2), generator=g) * torch.tensor([1040.0, 520.0]),
+        "depths": torch.rand(n, generator=g),
+        "conics": torch.stack((inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]), 1),
+        "opacities": torch.full((n,), 0.9),
+        "radii": torch.ceil(3.3 * covariance.diagonal(dim1=1, dim2=2).sqrt()).int(),
+    }
+    return {name: value.to(gpu).contiguous() for name, value in rows.items()}
+
+
+def test_tiles_of_a_block_beyond_its_words_are_those_of_each_splat_alone(gpu):
+    from cuda_ext import load
+    from cuda_ext.arrays import N_INSTANCES, kernel_profile, new_state, stream_of
+    from cuda_ext.render.lists import TileBuffers, count_instances, splat_struct
+
+    n, profile = 20, kernel_profile(PAPER, 16)
+    rows = long_scene(gpu, n, torch.tensor([[400.0, 30.0]]).repeat(n, 1))
+    rows["radii"][::5] = 0
+
+    def listed(chosen):
+        own = {name: value[chosen].contiguous() for name, value in rows.items()}
+        state, buffers = new_state(gpu), TileBuffers(len(chosen), 1040, 520, (16, 8), True, gpu, buckets=False)
+        splats = splat_struct(**own, colors=None)
+        count_instances(buffers.struct, splats, profile, state.data_ptr(), gpu)
+        buffers.reserve(int(state[N_INSTANCES]))
+        load().make_tile_lists(buffers.struct, splats, profile, 0, state.data_ptr(), stream_of(gpu))
+        begin, end, ids = (buffers.tensor(name).tolist() for name in ("tile_begin", "tile_end", "listed"))
+        return {(chosen[ids[k]], tile) for tile in range(65 * 65) for k in range(begin[tile], end[tile])}
+
+    # more tiles are tried than a block has words for, so that splats begin and end in the middle of a round
+    assert 16 * 65 * 65 > 32 * 1024
+    assert listed(list(range(n))) == set.union(*(listed([k]) for k in range(n) if k % 5))
+
+
+def test_splats_of_many_slots_have_the_gradients_of_atomic_additions(gpu):
+    from pop_fast.cuda import rasterization
+
+    g, n, width, height = torch.Generator().manual_seed(3), 70, 272, 136
+    means = torch.rand((n, 3), generator=g) * torch.tensor([4.0, 2.0, 1.0]) + torch.tensor([-2.0, -1.0, 4.0])
+    scales = torch.full((n, 3), 0.03)
+    # two of one block of warps, and the last of all: they reach most of the 289 tiles
+    scales[[3, 35, 36, 69]] = 1.5
+    leaves = {"means": means, "quats": torch.randn((n, 4), generator=g), "scales": scales}
+    leaves |= {"opacities": 0.1 + 0.2 * torch.rand(n, generator=g), "colors": torch.rand((n, 3), generator=g)}
+    K = torch.tensor([[[200.0, 0.0, width / 2], [0.0, 200.0, height / 2], [0.0, 0.0, 1.0]]], device=gpu)
+    v = torch.rand((1, height, width, 3), generator=g).to(gpu)
+
+    def gradients(**options):
+        own = {name: value.to(gpu).detach().clone().requires_grad_() for name, value in leaves.items()}
+        image, _, meta = rasterization(*own.values(), torch.eye(4, device=gpu)[None], K, width, height, **options)
+        (image * v).sum().backward()
+        return {name: value.grad.cpu() for name, value in own.items()}, meta
+
+    by_slots, meta = gradients(packed=False)
+    again, _ = gradients(packed=False)
+    assert (
+        sorted(meta["tiles_per_gauss"].flatten().tolist())[-4] >= 80
+    )  # of 16 x 16 px: twice as many of the lists' own
+    for backward in ("pixel_parallel", "gaussian_parallel"):
+        added, _ = gradients(packed=False, deterministic=False, backward=backward)
+        for name, value in by_slots.items():
+            assert torch.equal(value, again[name]), name
+            torch.testing.assert_close(added[name], value, rtol=1e-3, atol=1e-4 * float(value.abs().max()))
