@@ -1,6 +1,6 @@
 """Ask the hardware's counters about every kernel of a POP step, by Nsight Compute.
 
-    python benchmarks/gpu_counters.py counters.json [--case 270k_1.6MP] [--lines lines.csv.gz]
+    python benchmarks/gpu_counters.py counters.json [--cases 270k_1.6MP] [--lines lines.csv.gz]
 
 One step is launched kernel by kernel; the file has for each its time, launch, registers, instructions, and what its
 warps wait for. `--lines` keeps the samples of every machine instruction of this project's kernels besides, which
@@ -53,9 +53,9 @@ STALLS: Final = "regex:smsp__average_warps_issue_stalled_.*_per_issue_active.rat
 NCU: Final = ("ncu", "--clock-control", "none", "--profile-from-start", "off")
 
 
-def one_step(name: str) -> None:
+def one_step(name: str, device: torch.device) -> None:
     """Take one POP step of a case between the profiler's start and stop; for the process that ncu watches."""
-    ((_, make),) = scenes([name], [], torch.device("cuda"), 0.0)
+    ((_, make),) = scenes([name], [], device, 0.0)
     case, scene = make()
     trainer = make_trainer(scene, photograph_of(scene, case), WARM_UP + 1, replay=False)
     trainer.run(WARM_UP, POP)
@@ -117,28 +117,30 @@ def as_json(head: dict[str, Any], kernels: list[dict[str, Any]]) -> str:
     return json.dumps(head)[:-1] + f', "kernels": [\n{lines}\n]}}\n'
 
 
-def _watched(words: list[str], case: str, limit: float) -> str:
+def _watched(words: list[str], args: argparse.Namespace) -> str:
     """Run this script under ncu and return what is printed."""
-    command = [*NCU, *words, *python_command(str(Path(__file__).resolve()), "--step", "--case", case)]
+    script = (str(Path(__file__).resolve()), "--step", "--cases", args.cases, "--device", args.device)
+    # in a rehearsal the emulator takes the GPU's place in this process too
+    through = [str(args.through)] if args.through else []
+    command = [*NCU, *words, *python_command(*through, *script)]
     # the scripts here import each other by their bare names
     path = {"PYTHONPATH": python_path(ROOT, ROOT / "benchmarks")}
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=limit, env=os.environ | path)
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, timeout=args.limit_s, env=os.environ | path
+    )
     if done.returncode != 0:
         raise ValueError(f"ncu failed:\n{(done.stdout + done.stderr)[-1500:]}")
     return done.stdout
 
 
-def _keep_lines(target: Path, case: str, limit: float) -> None:
+def _keep_lines(target: Path, args: argparse.Namespace) -> None:
     """Keep the samples of every instruction of this project's kernels."""
     report = target.with_name(target.name + ".ncu-rep")
+    ours = ["-k", "regex:pop::", "--kernel-name-base", "demangled"]
     try:
-        _watched(
-            ["--set", "full", "-k", "regex:pop::", "--kernel-name-base", "demangled", "-f", "-o", str(report)],
-            case,
-            limit,
-        )
+        _watched(["--set", "full", *ours, "-f", "-o", str(report)], args)
         words = [NCU[0], "-i", str(report), "--page", "source", "--csv"]
-        done = subprocess.run(words, capture_output=True, text=True, check=True, timeout=limit)
+        done = subprocess.run(words, capture_output=True, text=True, check=True, timeout=args.limit_s)
     finally:
         report.unlink(missing_ok=True)
     with io.TextIOWrapper(gzip.open(target, "wb"), encoding="utf-8") as file:
@@ -149,13 +151,15 @@ def main() -> int:
     """Run the script from the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("out", type=Path, nargs="?", help="the JSON file")
-    parser.add_argument("--case", choices=[case.name for case in (*CASES, TINY)], default=CASES[0].name)
+    parser.add_argument("--cases", choices=[case.name for case in (*CASES, TINY)], default=CASES[0].name)
     parser.add_argument("--lines", type=Path, help="also keep the samples of every instruction, as csv.gz")
     parser.add_argument("--limit-s", type=float, default=120.0, help="seconds for each run of ncu; default 120")
+    parser.add_argument("--device", default="cuda", help="where tensors are; the emulated kernels take cpu")
+    parser.add_argument("--through", type=Path, help="a script that runs the step, as a rehearsal's does")
     parser.add_argument("--step", action="store_true", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.step:
-        one_step(args.case)
+        one_step(args.cases, torch.device(args.device))
         return 0
     if args.out is None:
         parser.error("name the JSON file")
@@ -164,12 +168,12 @@ def main() -> int:
         return 2
     metrics = ",".join([*(metric for metric, _ in ASKED.values()), STALLS])
     try:
-        printed = _watched(["--metrics", metrics, "--csv"], args.case, args.limit_s)
-        head = {"gpu": torch.cuda.get_device_name(), "torch": torch.__version__, "case": args.case}
+        printed = _watched(["--metrics", metrics, "--csv"], args)
+        head = {"gpu": torch.cuda.get_device_name(), "torch": torch.__version__, "case": args.cases}
         head["tool"] = f"{' '.join(NCU)}, one POP step launched kernel by kernel"
         args.out.write_text(as_json(head, of_kernels(printed.splitlines())), encoding="utf-8")
         if args.lines is not None:
-            _keep_lines(args.lines, args.case, args.limit_s)
+            _keep_lines(args.lines, args)
     except (ValueError, subprocess.SubprocessError) as error:
         print(f"gpu_counters: {error}", file=sys.stderr)
         return 1

@@ -18,6 +18,8 @@ from typing import IO, Any
 from pop_fast.children import python_command
 
 ROOT = Path(__file__).resolve().parents[2]
+# what puts the emulator in the GPU's place before it runs a command
+REHEARSE = ROOT / "tests" / "cuda" / "emulated" / "rehearse.py"
 TAIL = 4000  # characters of a command's words that are kept
 GRACE = 20.0  # seconds, at most, between asking a command to stop and making it
 
@@ -223,7 +225,7 @@ class StageContext:
 
     def python(self, *words: str) -> list[str]:
         """Return the command that runs Python's `words`, with the emulator in the GPU's place in a rehearsal."""
-        rehearse = [str(ROOT / "tests" / "cuda" / "emulated" / "rehearse.py")] if self.rehearsal else []
+        rehearse = [str(REHEARSE)] if self.rehearsal else []
         return python_command(*rehearse, *words)
 
     def run(

@@ -76,6 +76,42 @@ def installed_wheel(name: str, folder: Path) -> Path:
     return target
 
 
+def stand_in_tool(path: Path, *lines: str) -> dict[str, str]:
+    """Make a script in the place of one of NVIDIA's tools, and give the environment in which it is found."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    path.chmod(0o755)
+    return {"PATH": f"{path.parent}:{bare_environment()['PATH']}"}
+
+
+def stand_in_ncu(path: Path) -> dict[str, str]:
+    """Put a script in the place of Nsight Compute, which runs the command and tells one kernel of every metric asked.
+
+    The command begins where an option would, with the name of a Python; the report that a command with `-o` leaves is
+    what one with `-i` reads.
+    """
+    return stand_in_tool(
+        path,
+        f"#!{sys.executable}",
+        "import pathlib, subprocess, sys",
+        "words = sys.argv[1:]",
+        "of = dict(zip(words, words[1:]))",
+        "if '-i' in of:",
+        "    print(pathlib.Path(of['-i']).read_text()); sys.exit()",
+        "at = next(k for k, word in enumerate(words) if k and pathlib.Path(word).name.startswith('python'))",
+        "done = subprocess.run(words[at:])",
+        "assert words[:4] == ['--clock-control', 'none', '--profile-from-start', 'off'], words",
+        "if '-o' in of:",
+        "    pathlib.Path(of['-o']).write_text('\"Source\",\"# Samples\"')",
+        "else:",
+        "    print('==PROF== Connected')",
+        '    print(\'"ID","Kernel Name","Metric Name","Metric Value"\')',
+        "    for metric in of['--metrics'].split(',regex:')[0].split(','):",
+        '        print(f\'"0","pop::begin_step_kernel(int)","{metric}","1"\')',
+        "sys.exit(done.returncode)",
+    )
+
+
 def stand_in_gsplat(folder: Path) -> Path:
     """Make a wheel whose `gsplat.rasterization` is the CPU's, and whose kernels are compiled at once."""
     target = folder / "gsplat-0.0-py3-none-any.whl"

@@ -5,6 +5,7 @@ The kernels are emulated and the cases tiny (`--rehearse`); everything else is w
 
 from __future__ import annotations
 
+import gzip
 import json
 import shutil
 import subprocess
@@ -24,6 +25,8 @@ from tests.cuda.bare_node import (
     installed_wheel,
     make_bare_node,
     stand_in_gsplat,
+    stand_in_ncu,
+    stand_in_tool,
 )
 from tests.cuda.conftest import FOLDER
 
@@ -93,7 +96,8 @@ def test_the_node_has_nothing_else(node):
 
 
 def test_job_one_builds_and_gives_numbers(node, tmp_path):
-    found = job(node, 1, tmp_path, POP_COMMIT="c0ffee")
+    tools = stand_in_ncu(tmp_path / "bin" / "ncu")
+    found = job(node, 1, tmp_path / "out", POP_COMMIT="c0ffee", **tools)
     assert found["environment"]["commit"] == "c0ffee"
     stages = found["stages"]
     assert stages["smoke"]["tests"]["failed"] == 0
@@ -109,16 +113,18 @@ def test_job_one_builds_and_gives_numbers(node, tmp_path):
     assert bench["toy_pop_enlarged"]["width"] > bench["toy_pop"]["width"] == 28
     assert all(set(case["ratios"]) == {"forward", "forward_backward", "step"} for case in beside.values())
     assert stages["gsplat"]["results"]["gsplat"] == "stand-in"
+    counters = stages["counters"]["results"]
+    assert (counters["gpu"], counters["case"]) == ("emulated", "tiny")
+    assert [kernel["kernel"] for kernel in counters["kernels"]] == ["pop::begin_step_kernel"]
+    with gzip.open(tmp_path / "out" / "lines.csv.gz", "rt") as file:
+        assert file.read().startswith('"Source"')
 
 
 def test_job_two_judges_and_trains(node, tmp_path):
-    tool = tmp_path / "bin" / "compute-sanitizer"
-    tool.parent.mkdir()
-    # in the place of NVIDIA's: it wants the options and the environment that let it see, and runs the command
-    script = '#!/bin/sh\n[ "$1 $3 $5 $PYTORCH_NO_CUDA_MEMORY_CACHING" = '
-    tool.write_text(script + '"--tool --report-api-errors --error-exitcode 1" ] || exit 9\nshift 6\nexec "$@"\n')
-    tool.chmod(0o755)
-    path = {"PATH": f"{tool.parent}:{bare_environment()['PATH']}"}
+    # it wants the options and the environment that let it see, and runs the command
+    wanted = '"--tool --report-api-errors --error-exitcode 1"'
+    script = (f'[ "$1 $3 $5 $PYTORCH_NO_CUDA_MEMORY_CACHING" = {wanted} ] || exit 9', "shift 6", 'exec "$@"')
+    path = stand_in_tool(tmp_path / "bin" / "compute-sanitizer", "#!/bin/sh", *script)
     found = job(node, 2, tmp_path / "out", "--steps-scaler", "0.001", **path)
     manifest = json.loads((node[1] / "out" / "gpu_pack" / "manifest.json").read_text())
     assert found["environment"]["commit"] == manifest["commit"] != "unknown"

@@ -43,6 +43,9 @@ def stand_in_card(patch: pytest.MonkeyPatch) -> None:
 
     patch.setattr(torch.cuda, "Event", StandInEvent)
     patch.setattr(torch.cuda, "_sleep", lambda cycles: None)
+    patch.setattr(torch.cuda, "synchronize", lambda device=None: None)
+    for name in ("start", "stop"):
+        patch.setattr(torch.cuda.profiler, name, lambda: None)
     properties = types.SimpleNamespace(multi_processor_count=2)
     patch.setattr(torch.cuda, "get_device_properties", lambda device: properties)
     patch.setattr(torch.cuda, "get_device_name", lambda device=None: "emulated")
