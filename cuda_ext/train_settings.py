@@ -14,7 +14,7 @@ from pop_ref.settings import Objective
 
 
 class Updates(Protocol):
-    """Learning rates and numbers of Adam's updates, [steps, parameters] each."""
+    """Learning rates and numbers of Adam's updates, [steps, parameters] each, and the decay of its moments."""
 
     @property
     def rates(self) -> Tensor: ...
@@ -22,6 +22,8 @@ class Updates(Protocol):
     def numbers(self) -> Tensor: ...
     @property
     def sh_rest_every(self) -> int: ...
+    @property
+    def betas(self) -> tuple[float, float]: ...
 
 
 class StepSettings(Protocol):
@@ -53,8 +55,6 @@ class StepSettings(Protocol):
     def backward(self) -> str: ...
     @property
     def deterministic(self) -> bool: ...
-    @property
-    def betas(self) -> tuple[float, float]: ...
     @property
     def eps(self) -> float: ...
     @property

@@ -176,6 +176,7 @@ class LearningRates:
         sh_rest: of the other bands.
         others_decay: what all rates but those of the centres and the opacities are multiplied by from the first step
             to the last; 1 in every published method.
+        beta2: decay of Adam's second moments from one update to the next; 0.999 in every published method.
     """
 
     means: float = 1.6e-4
@@ -186,6 +187,7 @@ class LearningRates:
     sh0: float = 2.5e-3
     sh_rest: float = 2.5e-3 / 20.0
     others_decay: float = 1.0
+    beta2: float = BETAS[1]
 
     def by_parameter(self) -> dict[str, float]:
         """List the rates under the names of the raw parameters; that of the means still in scene scales."""

@@ -50,6 +50,7 @@ from pop_ref.regularizers import (
     sparse_depth_loss_vjp,
 )
 from pop_ref.render import RenderGradients, render, render_vjp
+from pop_ref.settings import BETAS
 
 # the objective of every pixelwise loss, and its transpose
 _PHOTOMETRIC = {
@@ -207,7 +208,8 @@ def update(
     numbers = update_numbers(summed, state.step, recipe)
     rates = learning_rates(state.step, scene_scale, recipe.max_steps, recipe.lr, recipe.updates)
     due = {name: summed[name] for name in numbers}
-    moved = Rows(*adam_step(rows.params, due, rows.m, rows.v, numbers, rates))
+    betas = (BETAS[0], recipe.lr.beta2)
+    moved = Rows(*adam_step(rows.params, due, rows.m, rows.v, numbers, rates, betas))
     waits = recipe.updates.sh_rest_every > 1 and "shN" in summed and "shN" not in numbers
     return moved, {"shN": summed["shN"]} if waits else {}
 

@@ -99,7 +99,7 @@ def schedule(shared: Shared, n_views: int = 1) -> Any:
     s, views = shared.settings, shared.views
     made = fill(load().Schedule(), views=shared.order, viewmats=views.viewmats, Ks=views.Ks, n_views=n_views)
     fill(made, viewmat=shared.viewmat, K=shared.K, rates=shared.rates, numbers=shared.numbers, eps=s.eps)
-    made.beta1, made.beta2 = s.betas
+    made.beta1, made.beta2 = s.updates.betas
     return made
 
 

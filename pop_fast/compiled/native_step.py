@@ -33,11 +33,12 @@ def adam_step(
     v: Mapping[str, Tensor],
     step: int,
     lr: Mapping[str, float],
+    betas: tuple[float, float] = BETAS,
 ) -> Moved:
-    """See `pop_ref.optimizer.adam_step`; betas and eps are those of a training."""
+    """See `pop_ref.optimizer.adam_step`; eps is that of a training."""
     x, first, second = ({key: value.clone().contiguous() for key, value in group.items()} for group in (params, m, v))
     for key in grads:
-        _move(x[key], first[key], second[key], grads[key].contiguous(), step, lr[key])
+        _move(x[key], first[key], second[key], grads[key].contiguous(), step, lr[key], betas)
     return x, first, second
 
 
@@ -47,13 +48,13 @@ def adam_steps(params: Mapping[str, Tensor], grads: Sequence[Mapping[str, Tensor
     m, v = ({key: torch.zeros_like(value) for key, value in x.items()} for _ in range(2))
     for step, given in enumerate(grads, 1):
         for key, gradient in given.items():
-            _move(x[key], m[key], v[key], gradient.contiguous(), step, lr[key])
+            _move(x[key], m[key], v[key], gradient.contiguous(), step, lr[key], BETAS)
     return x, m, v
 
 
-def _move(x: Tensor, m: Tensor, v: Tensor, gradient: Tensor, step: int, lr: float) -> None:
+def _move(x: Tensor, m: Tensor, v: Tensor, gradient: Tensor, step: int, lr: float, betas: tuple[float, float]) -> None:
     arrays = (tensor.data_ptr() for tensor in (x, m, v, gradient))
-    this_library().adam(*arrays, x.numel(), step, lr, *BETAS, EPS)
+    this_library().adam(*arrays, x.numel(), step, lr, *betas, EPS)
 
 
 # steps that are taken before Python is asked again: Ctrl-C, a progress bar
@@ -355,7 +356,7 @@ class NativeTrainer:
         given.border = border_of(self._padding)
         given.pop_visible, given.pop_window = settings.pop_over == "visible", settings.pop_views == "window"
         given.blur_own_view = settings.blur_window == "own_view"
-        (given.beta1, given.beta2), given.eps = settings.betas, settings.eps
+        (given.beta1, given.beta2), given.eps = settings.updates.betas, settings.eps
         given.depth_weight = settings.depth_weight
         given.opacity_reg, given.scale_reg = settings.opacity_reg, settings.scale_reg
         given.most_entries = MOST_ENTRIES
@@ -422,7 +423,7 @@ class NativeTrainer:
             # a row of what the exposures are kept in
             given.exposure = self._exposures.exposure(self._order[step]).data_ptr()
         given.blur_pixels = settings.blur_pixels(given.n_kept)
-        rates, numbers, _ = settings.updates
+        rates, numbers = settings.updates.rates, settings.updates.numbers
         given.lr = (_REAL * len(PARAMETERS))(*rates[step].tolist())
         given.updates = (_WHOLE * len(PARAMETERS))(*numbers[step].tolist())
 

@@ -19,7 +19,7 @@ from pop_fast.train.jsonable import from_plain, to_plain
 from pop_fast.train.limits import check_values
 from pop_fast.train.presets import METHODS, MILESTONES, Given, defaults, laid_over, method_of
 from pop_ref.constants import NEAR_IN_CAPTURE_UNITS, PAPER, Profile, profile_named
-from pop_ref.settings import MAX_SH_DEGREE, AppearanceRates, LearningRates, Objective, Recipe
+from pop_ref.settings import BETAS, MAX_SH_DEGREE, AppearanceRates, LearningRates, Objective, Recipe
 
 __all__ = ["LearningRates", "TrainConfig", "first_difference"]
 
@@ -317,13 +317,14 @@ class TrainConfig:
 
     def binding(self) -> dict[str, Any]:
         """Return the settings that a resumed run must share, flat."""
-        # a batch of one, a profile's own near plane, photographs at their size, rates that stay and no regularizers are
-        # what every run had before there were others: its checkpoints say nothing of them
+        # a batch of one, a profile's own near plane, photographs at their size, rates that stay, Adam's usual decay and
+        # no regularizers are what every run had before there were others: its checkpoints say nothing of them
         usual = {
             "batch_size": self.batch_size == 1,
             "near_plane": self.near_plane is None,
             "coarse_stop_iters": not self.coarse_stop_iters,
             "lr.others_decay": self.lr.others_decay == 1.0,
+            "lr.beta2": self.lr.beta2 == BETAS[1],
             **{name: getattr(self, name) == 0.0 for name in ("depth_lambda", "opacity_reg", "scale_reg")},
         }
         free = _FREE | {name for name, is_usual in usual.items() if is_usual}

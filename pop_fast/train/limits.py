@@ -77,11 +77,9 @@ def check_values(config: Any) -> None:
         raise PopError(f"threads is {values['threads']}; it must be at most {_MOST_THREADS}; 0 takes all cores")
     if values["sh_degree"] > 3:
         raise PopError(f"sh_degree is {values['sh_degree']}; it must be 0, 1, 2 or 3")
-    if not 0.0 < values["init_opacity"] < 1.0:
-        raise PopError(f"init_opacity is {values['init_opacity']}; it must lie between 0 and 1")
-    for name in (f"{method}.{name}" for name in _BETWEEN_OF_STRATEGY):
-        if name in own and not 0.0 < own[name] < 1.0:
-            raise PopError(f"{name} is {own[name]}; it must lie between 0 and 1")
+    for name in ("init_opacity", "lr.beta2", *(f"{method}.{name}" for name in _BETWEEN_OF_STRATEGY)):
+        if name in values and not 0.0 < values[name] < 1.0:
+            raise PopError(f"{name} is {values[name]}; it must lie between 0 and 1")
     stops = values["coarse_stop_iters"]
     if any(stop < 0 for stop in stops) or list(stops) != sorted(stops) or len(stops) > _MOST_COARSE_STOPS:
         raise PopError(

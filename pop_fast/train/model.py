@@ -30,7 +30,9 @@ class _Moments(Adam):
 
 
 def make_optimizers(params: Mapping[str, Parameter]) -> dict[str, Adam]:
-    """Make one dense Adam a parameter, its moments zero, the counter of updates on the CPU; `adam_step` sets its rate.
+    """Make one dense Adam a parameter, its moments zero, the counter of updates on the CPU.
+
+    `adam_step` sets its rate and the decay of its moments.
 
     Args:
         params: raw parameters by name.
@@ -69,7 +71,7 @@ def adam_step(
         if number > 0:
             counter = optimizer.state[param]["step"]
             counter.fill_(float(number - 1))
-            optimizer.param_groups[0]["lr"] = rate
+            optimizer.param_groups[0].update(lr=rate, betas=updates.betas)
             optimizer.step()
             counter.fill_(float(number))
         optimizer.zero_grad(set_to_none=True)

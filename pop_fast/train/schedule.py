@@ -12,7 +12,7 @@ from pop_fast.density.control import DensityControl
 from pop_fast.density.foreign import ForeignStrategy
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.steps import Phase, Updates
-from pop_ref.settings import PARAMETERS, LearningRates, UpdateRules
+from pop_ref.settings import BETAS, PARAMETERS, LearningRates, UpdateRules
 
 
 def updates_of(
@@ -26,7 +26,7 @@ def updates_of(
     """List the rates and the numbers of all updates of a run; see `pop_ref.optimizer`.
 
     Args:
-        lr: the rates to begin with.
+        lr: the rates to begin with, and the decay of the second moments.
         scene_scale: the unit of the means' rate, world units.
         max_steps: length of the run, over which the means' rate decays.
         rules: which parameters Adam moves at which step; None moves all at every step.
@@ -52,7 +52,7 @@ def updates_of(
     numbers = moved.cumsum(0)
     for step in sorted(restarts):
         numbers[step + 1 :] -= numbers[step].clone()
-    return Updates(rates, (numbers * moved).to(torch.int32), rules.sh_rest_every)
+    return Updates(rates, (numbers * moved).to(torch.int32), rules.sh_rest_every, (BETAS[0], lr.beta2))
 
 
 def steady_updates(lr: Mapping[str, float], steps: int) -> Updates:

@@ -32,11 +32,13 @@ class Updates(NamedTuple):
             [steps, groups] int32
         sh_rest_every: gradients of the bands beyond the first are summed up from one update to the next if it is > 1;
             else those of a step without an update are lost, as all other parameters' are.
+        betas: decay of Adam's first and second moments.
     """
 
     rates: Tensor
     numbers: Tensor
     sh_rest_every: int = 1
+    betas: tuple[float, float] = BETAS
 
     def __len__(self) -> int:
         return len(self.rates)
@@ -62,7 +64,7 @@ class StepSettings:
         background: colour behind everything.
         profile, antialiased: of the renderer.
         backward, deterministic: of the step on a GPU, as `cuda_ext.arrays.Settings` says.
-        betas, eps: Adam's.
+        eps: Adam's.
         replay: replay steps as CUDA graphs; False launches every kernel anew, for debuggers and profilers.
         counts: also tell how many splats every pixel blends and visits, which training does not read.
     """
@@ -84,7 +86,6 @@ class StepSettings:
     antialiased: bool = False
     backward: str = "pixel_parallel"
     deterministic: bool = True
-    betas: tuple[float, float] = BETAS
     eps: float = EPS
     replay: bool = True
     counts: bool = False

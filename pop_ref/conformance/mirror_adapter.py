@@ -176,11 +176,20 @@ def pop_loss_vjp(m: Mirror, opacities: Any, mask: Any, v_loss: float) -> Any:
     return m.call("pop_loss_vjp", n, [], [(n,)], [], [mask], (0, 0, n_important, n), (v_loss,))[0]
 
 
-def adam_step(m: Mirror, params: Any, grads: Any, first: Any, second: Any, step: int, lr: Any) -> Any:
-    # betas and eps are those of the fused step
+def adam_step(
+    m: Mirror,
+    params: Any,
+    grads: Any,
+    first: Any,
+    second: Any,
+    step: int,
+    lr: Any,
+    betas: tuple[float, float] = BETAS,
+) -> Any:
+    # eps is that of the fused step
     moved: tuple[dict[str, Any], ...] = (dict(params), dict(first), dict(second))
     for name, g in grads.items():
-        numbers = [lr[name], *BETAS, EPS]
+        numbers = [lr[name], *betas, EPS]
         kept = [float(m.dtype(number)) for number in numbers]
         halves = [half for number, near in zip(numbers, kept, strict=True) for half in (near, number - near)]
         rows = [params[name], first[name], second[name], g]

@@ -357,6 +357,7 @@ def _step_by(adam: Adam, optimizer: Any) -> None:
         return
     of = optimizer.state[param]
     given = (param.detach(), param.grad, of["exp_avg"], of["exp_avg_sq"])
-    moved = adam(*({"means": value} for value in given), int(of["step"]) + 1, {"means": group["lr"]})
+    when = (int(of["step"]) + 1, {"means": group["lr"]}, group["betas"])
+    moved = adam(*({"means": value} for value in given), *when)
     for held, value in zip((param.data, of["exp_avg"], of["exp_avg_sq"]), moved, strict=True):
         held.copy_(value["means"])

@@ -73,7 +73,7 @@ def test_quick_is_a_short_schedule_with_the_papers_weights_and_its_own_rates():
     assert quick.coarse_stop_iters == (250, 500)
     rates, usual = quick.lr, LearningRates()
     assert (rates.means / usual.means, rates.sh0 / usual.sh0, rates.others_decay) == pytest.approx((12.0, 8.0, 0.1))
-    assert (rates.opacities, rates.means_decay) == (usual.opacities, usual.means_decay)
+    assert (rates.opacities, rates.means_decay, rates.beta2) == (usual.opacities, usual.means_decay, 0.99)
     control = TrainConfig.of(preset="quick", method="gsplat").strategy
     assert (control.refine_stop_iter, control.reset_every, control.prune_too_big_after) == (750, 3000, 3000)
 
@@ -87,8 +87,9 @@ def test_what_quick_has_of_its_own_reaches_no_other_preset(method):
         assert config.strategy.grow_grad2d == METHODS[method].strategy().grow_grad2d
         assert config.strategy.refine_every >= 100
     # a setting that is at its published value is not among those that decide the bits of older checkpoints
-    assert not {"coarse_stop_iters", "lr.others_decay"} & set(paper.binding())
-    assert {"coarse_stop_iters", "lr.others_decay"} <= set(TrainConfig.of(method=method, preset="quick").binding())
+    own = {"coarse_stop_iters", "lr.others_decay", "lr.beta2"}
+    assert not own & set(paper.binding())
+    assert own <= set(TrainConfig.of(method=method, preset="quick").binding())
     assert TrainConfig.of(preset="quick", steps_scaler=0.5).max_steps == 15_000
     assert TrainConfig.of(preset="quick", scale_lambda_pop=True).strategy.lambda_pop == pytest.approx(0.02)
 
@@ -336,7 +337,7 @@ def test_settings_of_another_layout_are_named_with_what_to_do(content, tmp_path)
 @pytest.mark.parametrize("name", [field.name for field in fields(LearningRates)])
 @pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
 def test_every_learning_rate_is_finite_and_not_negative(name, value):
-    with pytest.raises(PopError, match=rf"lr\.{name} is {value}; it must be"):
+    with pytest.raises(PopError, match=rf"lr\.{name} is {value}; it must"):
         TrainConfig(lr=LearningRates(**{name: value}))
 
 
@@ -365,7 +366,7 @@ def test_two_ways_to_say_the_same_schedule_are_the_same_run():
     spelled_out = TrainConfig.of(
         steps_scaler=0.05,
         coarse_stop_iters=(250, 500),
-        lr={**rates, "others_decay": 0.1},
+        lr={**rates, "others_decay": 0.1, "beta2": 0.99},
         **{"pop.blur_min_pixels": 10.0, "pop.refine_every": 50, "pop.grow_grad2d": 0.75 * POPStrategy().grow_grad2d},
     )
     assert TrainConfig.of(preset="quick").digest() == spelled_out.digest()

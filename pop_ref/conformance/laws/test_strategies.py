@@ -76,6 +76,14 @@ def test_a_training_is_the_oracles_under_every_reading(backend):
 
 
 @law("training", "scripted_steps", "method_settings")
+def test_second_moments_decay_as_they_are_told(backend):
+    for method in ("pop", "taming"):
+        script = script_of(method, steps=(1, 2, 3, 4))
+        for beta2 in (0.75, 0.99):
+            _assert_the_oracles(backend, replace(script, lr=replace(script.lr, beta2=beta2)))
+
+
+@law("training", "scripted_steps", "method_settings")
 def test_a_reset_at_step_zero_happens_where_it_is_asked_for(backend):
     for asked in (False, True):
         settings = {"reset_at_zero": asked}
