@@ -312,10 +312,10 @@ class MirrorAdapter(Adapter):
         """Make the trainer whose strategies edit the rows that the mirror moves."""
         return importlib.import_module("pop_ref.conformance.torch_training").Trainer("pop_fast", self._adam)
 
-    def _adam(self, params: Any, grads: Any, m: Any, v: Any, step: int, lr: Any) -> Any:
+    def _adam(self, params: Any, grads: Any, m: Any, v: Any, step: int, lr: Any, betas: Any) -> Any:
         torch: Any = importlib.import_module("torch")
         arrays = [{key: t.numpy().astype(np.float64) for key, t in of.items()} for of in (params, grads, m, v)]
-        moved = adam_step(self.mirror, *arrays, step=step, lr=lr)
+        moved = adam_step(self.mirror, *arrays, step=step, lr=lr, betas=betas)
         return tuple({key: torch.as_tensor(value) for key, value in of.items()} for of in moved)
 
     def _scripted_steps(self, script: Any, rows: Any) -> Any:
