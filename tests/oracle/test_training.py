@@ -23,7 +23,8 @@ from pop_ref.polarization import pop_loss, pop_loss_vjp
 from pop_ref.recipes import L1_DIVIDED, RECIPES, Recipe
 from pop_ref.records import Render
 from pop_ref.render import render, render_vjp
-from pop_ref.training import Training, control, gaussians_from_params, objective, params_vjp, start, train_step
+from pop_ref.settings import LearningRates
+from pop_ref.training import Training, control, gaussians_from_params, objective, params_vjp, start, train_step, update
 from tests.golden import ten_losses
 
 CAMERAS, PHOTOS = ten_losses.cameras(), ten_losses.photographs()
@@ -286,6 +287,14 @@ def test_a_parameter_that_never_had_a_gradient_keeps_its_bits() -> None:
 def test_a_parameter_without_a_gradient_coasts_on_its_moments() -> None:
     path = np.ravel(run(np.array([0.0]), np.array([[1.0], [0.0], [0.0]]), 0.25))
     assert path[0] > path[1] > path[2]
+
+
+def test_an_update_decays_second_moments_as_its_recipe_says() -> None:
+    before, gradient = start({"means": np.zeros((1, 3))}), {"means": np.full((1, 3), 2.0)}
+    for beta2 in (0.999, 0.75):
+        moved, _ = update(before.rows, gradient, before, 1.0, Recipe(lr=LearningRates(beta2=beta2)))
+        np.testing.assert_allclose(moved.v["means"], (1.0 - beta2) * 4.0, rtol=1e-12)
+        np.testing.assert_allclose(moved.m["means"], 0.2, rtol=1e-12)
 
 
 def test_adam_leaves_its_arguments_alone() -> None:
