@@ -30,6 +30,8 @@ _LETTERS: Final = {
     "conic": ("A", "B", "C"),
     "sh": ("red", "green", "blue"),
 }
+# what the places of a result are, where each holds the parts of many parameters
+_RESULTS: Final = {"adam_step": ("the new value", "the mean m", "the mean v")}
 # at which something of this course is held
 _LIMITS: Final = (0.0, 0.999, 1.0)
 _ALL_BUT: Final = "all but "
@@ -62,7 +64,8 @@ def diagnose(calls: Sequence[Call], folder: Path) -> Diagnosis:
     stopped = next((call for call in wrong if call.error), None)
     if stopped is not None and stopped.error is not None:
         sentence = f"{where(stopped.error, folder)}: it stops with {said(stopped.error)}."
-        return sentence, _of_shapes(stopped) or "Call it by hand with these numbers.", stopped
+        hint = _of_shapes(stopped) or _of_totals(stopped) or "Call it by hand with these numbers."
+        return sentence, hint, stopped
     plainly = _misused(name, wrong)
     if plainly:
         return plainly, "", wrong[0]
@@ -91,6 +94,13 @@ def _of_shapes(call: Call) -> str:
         and ("broadcast" in str(call.error) or "matmul" in str(call.error))
     ):
         return "`.T` of a stack of matrices turns all of its axes round; of each matrix it is `np.swapaxes(M, 1, 2)`."
+    return ""
+
+
+def _of_totals(call: Call) -> str:
+    """Say how totals are added to, where Python says that a record's field cannot be set."""
+    if isinstance(call.error, AttributeError) and "set attribute" in str(call.error) and "totals" in call.parameters:
+        return "The fields of `totals` are arrays that stay: add in place, as in `totals.v_background[:] += x`."
     return ""
 
 
@@ -125,6 +135,8 @@ def _compared(name: str, wrong: Sequence[Call], some_right: bool) -> str:
             if a.shape != b.shape and _of_lists(call.expected[0]):
                 return _lists_of_another_length(name, call)
             if a.shape != b.shape:
+                if part == "`ids`":
+                    return f"{name} blends another number of splats, {len(a)} and not {len(b)}{_where_of(call)}."
                 of = "" if len(expected) == 1 else f"{part} of "
                 return f"{of}{name} has shape {list(a.shape)} where {list(b.shape)} is asked for{_where_of(call)}."
             if not np.all(np.isfinite(a)) and np.all(np.isfinite(b)):
@@ -185,6 +197,8 @@ def parts_named(name: str, call: Call) -> list[str]:
     each = returned if type(returned) is tuple else (returned,)
     places = [k for k, result in enumerate(each) for _ in leaves(result, depth=1)]
     places += [len(each)] * (len(parts) - len(places))
+    if name in _RESULTS and len(each) == len(_RESULTS[name]):
+        return [_RESULTS[name][k] for k in places]
     named = [f"the {_ORDINALS[min(k, 5)]} result" for k in places]
     labels = [label for label, _ in parts]
     return [
