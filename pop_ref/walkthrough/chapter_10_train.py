@@ -255,10 +255,10 @@ picture(fig, caption + "averaged over seven records; the dots are the held-out v
 # **Opacities.** All began at 0.1. Without the prior few end over 0.9; with it more than twice the share does. That is
 # the polarization, and the reason for the next curve.
 #
-# **Gaussians per pixel.** How many splats a pixel blends. With the prior the curve ends lower: fewer Gaussians are
-# left, and the faint ones reach less far ([chapter 8](chapter_08_polarized_opacity.py)). It is not that rays end early:
-# in so thin a scene hardly a pixel uses its light up, with the prior or without. Less work per pixel is what POP is
-# after.
+# **Gaussians per pixel.** How many splats a pixel blends. With the prior the curve ends lower: more of the Gaussians
+# are faint, and faint ones reach less far ([chapter 8](chapter_08_polarized_opacity.py)). It is not that rays end
+# early: in so thin a scene hardly a pixel uses its light up, with the prior or without. POP aims at less work per
+# pixel.
 #
 # **PSNR.** The two end within 2.5 dB of each other, and which is ahead depends on the start: so small a training cannot
 # tell what the prior costs. It pushes twenty times harder here than in the paper, whose ablation (section 5) reports
@@ -277,6 +277,7 @@ for name in stats:
 assert histogram("prior", -1)[9:11].sum() == 1.0
 assert stats["prior"]["opacity_above_0.9"] > 2.0 * stats["none"]["opacity_above_0.9"]
 assert stats["prior"]["n_blended"] < stats["none"]["n_blended"]
+assert histogram("prior", 199)[:10].sum() > histogram("none", 199)[:10].sum()
 assert abs(stats["prior"]["psnr"] - stats["none"]["psnr"]) < 2.5
 assert curve("prior", "psnr")[1][-5:].mean() > curve("prior", "psnr")[1][:5].mean() + 3.0
 
