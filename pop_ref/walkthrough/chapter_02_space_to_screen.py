@@ -255,7 +255,7 @@ for point, over in (
     assert np.isclose(entry, -f * over)
 
 # %% [markdown]
-# A Gaussian to walk around. Its points go through the true pinhole, its ellipse through $J$.
+# Here you can walk around a Gaussian. Its points go through the true pinhole, its ellipse through $J$.
 #
 # {{widget: orbit}}
 #

@@ -97,7 +97,7 @@ for k in range(16):
 picture(fig, "The sixteen harmonics, one row a degree.")
 
 # %% [markdown]
-# Their sum, with a slider for each coefficient. The ring in the middle is what the camera in front of you sees.
+# Here is their sum, with a slider for each coefficient. The ring in the middle is what the camera in front of you sees.
 #
 # {{widget: harmonics}}
 #

@@ -3,7 +3,7 @@
 # %% [markdown]
 # # 10. Train a scene, read its report, and ask why a pixel is wrong
 #
-# Everything so far, run together. At the end of this chapter you can read the whole training step as code, start a
+# This chapter runs everything so far together. At the end of it you can read the whole training step as code, start a
 # training of your own, read its curves and tell from them what the prior has done, and ask of any pixel why it looks as
 # it does.
 #
@@ -300,9 +300,9 @@ print(*sorted(path.name for path in report.parent.iterdir() if path != report))
 # %% [markdown]
 # ## The demo capture, and one bad pixel
 #
-# Now something that was not drawn from Gaussians: the still life of chapter 0, at 96 by 72 pixels, by the commands that
-# a user types, `pop demo scene`, `pop train scene --steps-scaler 0.1`: a tenth of the schedule, of which five hundred
-# steps, with views 0 and 8 held out.
+# Now we train on something that was not drawn from Gaussians: the still life of chapter 0, at 96 by 72 pixels, by the
+# commands that a user types, `pop demo scene` and `pop train scene --steps-scaler 0.1`. The schedule is a tenth of the
+# paper's, only its first five hundred steps are taken, and views 0 and 8 are held out.
 
 # %%
 scene, out = str(home / "scene"), str(home / "demo")

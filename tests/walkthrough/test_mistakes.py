@@ -67,3 +67,28 @@ def test_who_sets_a_field_of_the_totals_is_told_to_add_in_place(tmp_path) -> Non
     calls = [tried_on(setting, truth, given, words) for words, given in probes("composite_pixel_vjp")]
     _, hint, _ = diagnose(calls, tmp_path)
     assert "totals.v_background[:] += x" in hint
+
+
+def _sentence(name: str, made, tmp_path) -> str:
+    calls = [tried_on(made, oracle()[name], given, words) for words, given in probes(name)]
+    return diagnose(calls, tmp_path)[0]
+
+
+def test_an_argument_that_is_a_factor_too_many_or_too_few_is_named(tmp_path) -> None:
+    def without_v(image, target, v_l2, *mask):
+        return oracle()["l2_vjp"](image, target, 1.0, *mask)
+
+    def blurred(covars2d, eps2d, v):
+        return eps2d * v
+
+    assert _sentence("l2_vjp", without_v, tmp_path) == "l2_vjp lacks the factor `v_l2`."
+    assert "has the factor `eps2d`, which does not belong there" in _sentence("low_pass_vjp", blurred, tmp_path)
+
+
+def test_the_translation_of_a_camera_is_named_and_no_letter(tmp_path) -> None:
+    def turned_back(viewmat, v_center):
+        back = oracle()["camera_center_vjp"](viewmat, v_center)
+        back[:3, 3] = -viewmat[:3, :3].T @ v_center
+        return back
+
+    assert "the last column, the translation's, only" in _sentence("camera_center_vjp", turned_back, tmp_path)
