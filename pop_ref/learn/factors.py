@@ -94,6 +94,8 @@ def _spread(value: Any, result: np.ndarray, length: bool) -> np.ndarray | None:
         rows = np.linalg.norm(rows, axis=1)
     elif length:
         return None
+    if rows.shape == result.shape and not length:
+        return rows.astype(np.float64)
     if rows.ndim == 0:
         return np.full(result.shape, float(rows))
     if rows.ndim != 1 or result.ndim == 0 or len(rows) != len(result):

@@ -78,6 +78,14 @@ def _pixel_by_alpha(o: Oracle, ids: Any, rows: Any, px: float, py: float, backgr
     return pixel._replace(color=color)
 
 
+def _pixel_painted(o: Oracle, ids: Any, rows: Any, px: float, py: float, background: Any, *profile: Any) -> Any:
+    """Make `composite_pixel` with the painter's rule from the front."""
+    pixel, color = o["composite_pixel"](ids, rows, px, py, background, *profile), np.zeros(len(background))
+    for i, alpha in zip(pixel.ids, pixel.alphas, strict=True):
+        color = (1.0 - alpha) * color + alpha * np.array(rows.colors[i])
+    return pixel._replace(color=(color + pixel.T_final * np.array(background)).tolist())
+
+
 def _pixel_forward(dims: str = "1 - alpha", last: bool = False, after: bool = False) -> Callable[..., Any]:
     """Make `composite_pixel` that dims otherwise, blends the splat at which it stops, or keeps T behind each splat."""
 
@@ -249,6 +257,12 @@ MISTAKES: Final = (
         _pixel_vjp(dims=False),
         "A splat hides what is behind it: the light behind must lose the share alpha before the splat's own is added.",
         "behind += alpha (color_dot_grad - behind), the same as alpha color_dot_grad + (1 - alpha) behind.",
+    ),
+    Mistake(
+        "composite_pixel",
+        _pixel_painted,
+        "You paint each splat over those before it, as from back to front; the list is in order, front first.",
+        "color += T alpha c, with T the light that the splats before it have left.",
     ),
     Mistake(
         "composite_pixel_vjp",

@@ -137,6 +137,8 @@ def _exchanged_sides(o: Oracle, means2d: Any, radii: Any, width: int, height: in
     return o["on_screen"](means2d, radii, height, width, *profile)
 
 
+_UNIT_BACK: Final = "unit_quats_from_quats_vjp"
+
 BACKWARD: Final = (
     Mistake(
         "unit_quats_from_quats_vjp",
@@ -270,5 +272,23 @@ BACKWARD: Final = (
         _exchanged_sides,
         "Width and height are exchanged: x is compared with the width, y with the height.",
         "The columns of means2d are x and y.",
+    ),
+    Mistake(
+        "unit_quats_from_quats_vjp",
+        lambda o, quats, v: 2.0 * v / np.linalg.norm(quats, axis=1, keepdims=True) - o[_UNIT_BACK](quats, v),
+        "The part along q is added where it must be taken away.",
+        "v_q = (v - u (u . v)) / |q|, with a minus.",
+    ),
+    Mistake(
+        "means_cam_from_means",
+        lambda o, means, viewmat: o["means_cam_from_means"](means, viewmat) - 2.0 * viewmat[:3, 3],
+        "You take t away; it is added.",
+        "p = R mean + t: viewmat takes the world into the camera.",
+    ),
+    Mistake(
+        "project_means_vjp",
+        lambda o, means_cam, K, *given: o["project_means_vjp"](means_cam, np.eye(3), *given),
+        "The focal lengths are missing: u changes by fx / z where x changes by 1.",
+        "v_x = fx / z v_u, and v_z has fx x / z^2 and fy y / z^2.",
     ),
 )

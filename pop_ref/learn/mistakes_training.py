@@ -8,16 +8,18 @@ from typing import Any, Final
 
 import numpy as np
 
+from pop_ref.density import POP
 from pop_ref.learn.mistakes_geometry import Mistake, Oracle
 from pop_ref.optimizer import BETAS, EPS
 
 
 def _adam(
     first: bool = True, second: bool = True, sign: float = -1.0, late: int = 0, squared: bool = True, root: bool = True,
-    turned: bool = False, share: bool = True, of_gradient: bool = False,
+    turned: bool = False, share: bool = True, of_gradient: bool = False, late_share: bool = False,
 ) -> Callable[..., Any]:  # fmt: skip
     """Make `adam_step` without the division by 1 - beta1^t or by 1 - beta2^t, uphill, with another number of the
-    update, with g for g^2, without the root, with its betas exchanged, without 1 - beta1, or with g in m's place."""
+    update, with g for g^2, without the root, with its betas exchanged, without 1 - beta1, with g in m's place,
+    or with the root taken before the correction."""
 
     def made(o: Oracle, params: Any, grads: Any, m: Any, v: Any, step: Any, lr: Any,
              betas: Any = BETAS, eps: float = EPS) -> Any:  # fmt: skip
@@ -31,6 +33,7 @@ def _adam(
             mean = g if of_gradient else mean
             size = v[name] / (1.0 - betas[1] ** t if second else 1.0)
             size = (np.sqrt(size) if root else size) + eps
+            size = np.sqrt(v[name]) / (1.0 - betas[1] ** t) + eps if late_share else size
             params[name] = params[name] + sign * lr[name] * mean / size
         return params, m, v
 
@@ -232,6 +235,26 @@ TRAINING: Final = (
         _adam(of_gradient=True),
         "The step is made of this gradient alone; it is made of the running mean m.",
         "x - lr m / (sqrt(v) + eps), both corrected.",
+    ),
+    Mistake(
+        "adam_step",
+        _adam(late_share=True),
+        "You take the root before the correction: v is divided by 1 - beta2^t first.",
+        "sqrt(v / (1 - beta2^t)) + eps.",
+    ),
+    Mistake(
+        "split_rows",
+        _split_otherwise("scales", lambda x: np.exp(x) / 1.6 + np.log(1.6), "scales"),
+        "The widths of the children are kept as they are; what is stored are their logarithms.",
+        "log s' = log(s / 1.6).",
+    ),
+    Mistake(
+        "grow_masks",
+        lambda o, window, scales, scene_scale, step, config=POP: o["grow_masks"](
+            window, scales, scene_scale / config.grow_scale3d, step, config
+        ),
+        "The share grow_scale3d is missing: small is at most that share of the scene's scale.",
+        "scales.max(axis=1) <= config.grow_scale3d * scene_scale.",
     ),
     *(
         Mistake(
