@@ -231,8 +231,8 @@ def test_the_book_prints_what_the_course_asks_for_behind_the_questions_and_a_mis
     text = book([(chapter, run_chapter(chapter))])
     questions, answers = text.split('<article id="answers">')
     right = "0.5</span> <span"
-    assert "is at the back.</a>" in questions
-    assert re.search(r"alpha\.py</code></h3><pre", answers)
+    assert "The oracle's <code>sigma_at_pixel</code> is at the back.</a>" in questions
+    assert re.search(r"<code>sigma_at_pixel</code>, <code>pop_ref/alpha\.py</code></h3><pre", answers)
     assert right in answers
     assert right not in questions
     assert "with one mistake" in questions

@@ -323,9 +323,10 @@ def _without_sources(shown: str, name: str) -> tuple[str, str]:
     def to_the_back(found: re.Match[str]) -> str:
         if "with one mistake" in found[1]:
             return found[0]
-        place = f"{name}-{len(taken)}"
-        taken.append(f'<h3 id="{place}">The oracle\'s, {found[1]}</h3>{found[2]}')
-        return f'<p class="answered"><a href="#{place}">The oracle\'s, {found[1]}, is at the back.</a></p>'
+        place, function = f"{name}-{len(taken)}", found[2].partition(">def</span>")[2]
+        called = f"<code>{_TAG.sub('', function.partition('(')[0]).strip()}</code>"
+        taken.append(f'<h3 id="{place}">The oracle\'s {called}, {found[1]}</h3>{found[2]}')
+        return f'<p class="answered"><a href="#{place}">The oracle\'s {called} is at the back.</a></p>'
 
     return _SOURCE.sub(to_the_back, shown), "".join(taken)
 
