@@ -64,7 +64,8 @@ _YOURS: Final = re.compile(
 )
 # the same once it is folded
 _SOURCE: Final = re.compile(
-    r"<details class=\"yours\"[^>]*><summary>The oracle's, (<code>.*?</code>).*?</summary>(<pre\b.*?</pre>)</details>",
+    r"<details class=\"yours\"[^>]*><summary>The oracle's (<code>\w+</code>), (<code>.*?</code>).*?</summary>"
+    r"(<pre\b.*?</pre>)</details>",
     re.DOTALL,
 )
 _TAG: Final = re.compile(r"<[^>]*>")
@@ -312,8 +313,13 @@ def _folded_source(found: re.Match[str]) -> str:
     """Fold a function that a reader may write first; a script opens it once its stage is passed."""
     first = f"Yours to write: pop learn check {found[2]}. Click again to see it."
     told = f'<span role="status" data-first="{first}"></span>'
-    summary = f"<summary>The oracle's, {found[1]} {told}</summary>"
+    summary = f"<summary>The oracle's {_called(found[3])}, {found[1]} {told}</summary>"
     return f'<details class="yours" data-stage="{found[2]}">{summary}{found[3]}</details>'
+
+
+def _called(code: str) -> str:
+    """Name the function that some highlighted code defines."""
+    return f"<code>{_TAG.sub('', code.partition('>def</span>')[2].partition('(')[0]).strip()}</code>"
 
 
 def _without_sources(shown: str, name: str) -> tuple[str, str]:
@@ -321,11 +327,11 @@ def _without_sources(shown: str, name: str) -> tuple[str, str]:
     taken: list[str] = []
 
     def to_the_back(found: re.Match[str]) -> str:
-        if "with one mistake" in found[1]:
+        called, file, code = found.groups()
+        if "with one mistake" in file:
             return found[0]
-        place, function = f"{name}-{len(taken)}", found[2].partition(">def</span>")[2]
-        called = f"<code>{_TAG.sub('', function.partition('(')[0]).strip()}</code>"
-        taken.append(f'<h3 id="{place}">The oracle\'s {called}, {found[1]}</h3>{found[2]}')
+        place = f"{name}-{len(taken)}"
+        taken.append(f'<h3 id="{place}">The oracle\'s {called}, {file}</h3>{code}')
         return f'<p class="answered"><a href="#{place}">The oracle\'s {called} is at the back.</a></p>'
 
     return _SOURCE.sub(to_the_back, shown), "".join(taken)

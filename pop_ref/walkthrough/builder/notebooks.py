@@ -94,10 +94,10 @@ _ABSENT: Final = {"cv2", "hypothesis", "matplotlib", "numpy", "pop_fast", "pop_r
 
 # a printed function that the course asks the reader to write, as `expanded` marks it
 _YOURS: Final = re.compile(
-    r"`([\w/., ]+)`, yours to write first in (`pop learn check \w+`):\n\n(```python\n.*?\n```)", re.DOTALL
+    r"`([\w/., ]+)`, yours to write first in (`pop learn check \w+`):\n\n(```python\n.*?def (\w+)\(.*?\n```)", re.DOTALL
 )
 _FOLDED: Final = (
-    r"<details><summary>The oracle's, \1: yours to write first</summary>\n\nJudge yours with \2.\n\n\3\n\n</details>"
+    r"<details><summary>The oracle's \4, \1: yours to write first</summary>\n\nJudge yours with \2.\n\n\3\n\n</details>"
 )
 
 
