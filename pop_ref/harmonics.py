@@ -163,7 +163,7 @@ def colors_from_sh_vjp(
 ) -> tuple[Float64[np.ndarray, "N n_coefficients 3"], Float64[np.ndarray, "N 3"]]:
     """Pull a cotangent of colours back to coefficients and directions.
 
-    `v_sh_k = Y_k v_c`, `v_Y_k = sh_k . v_c`, then through the basis and the normalisation. B2: a channel under 0
+    `v_sh_k = Y_k v_c`, `v_Y_k = sh_k . v_c`, then through the basis and the normalisation. A channel under 0
     passes nothing; at exactly 0 the derivative from above is used.
 
     Source: transpose of `colors_from_sh`.

@@ -54,9 +54,9 @@ def l1_vjp(
     v_l1: float,
     mask: Bool[np.ndarray, "H W"] | None = None,
 ) -> Float64[np.ndarray, "H W D"]:
-    """Pull a cotangent of `l1` back to the render: `v sign(image - target) / (3 H W)`.
+    """Pull a cotangent of `l1` back to the render: `v sign(image - target) / (H W D)`.
 
-    At equality the derivative is 0, the mean of the two one-sided ones (B4: sign(0) = 0).
+    At equality the derivative is 0, the mean of the two one-sided ones (B4), so sign(0) = 0.
 
     Source: POP paper eq. 4, left.
     Departs: nothing; torch uses sign(0) = 0 as well.
@@ -116,7 +116,7 @@ def l2_vjp(
     v_l2: float,
     mask: Bool[np.ndarray, "H W"] | None = None,
 ) -> Float64[np.ndarray, "H W D"]:
-    """Pull a cotangent of `l2` back to the render: `2 v (image - target) / (3 H W)`.
+    """Pull a cotangent of `l2` back to the render: `2 v (image - target) / (H W D)`.
 
     Source: POP paper eq. 4, right.
     Departs: nothing.

@@ -190,7 +190,7 @@ def composite_pixel_vjp(
         background: colour behind everything.
         v_color: cotangent of the pixel's colour.
         v_T_final: cotangent of the pixel's remaining transmittance.
-        totals: the sums over pixels, added to.
+        totals: the sums over pixels, added to in place.
         profile: as in the forward pass.
 
     Example:

@@ -14,15 +14,17 @@ from typing import Any, Final
 
 import numpy as np
 
+from pop_ref.learn.factors import Pair, factor_of_an_argument, one_factor, per_input
 from pop_ref.learn.mistakes import explained_by
 from pop_ref.learn.probes import oracle
 from pop_ref.learn.student import Call, numbers, said, same, where
 
-Pair = tuple[np.ndarray, np.ndarray]
 # what is wrong, the hint, the call that shows it
 Diagnosis = tuple[str, str, Call]
 _ORDINALS: Final = ("first", "second", "third", "fourth", "fifth", "sixth")
 _AXES: Final = {2: "xy", 3: "xyz", 4: "wxyz"}
+# of a camera's matrix
+_COLUMNS: Final = ("first column", "second column", "third column", "last column, the translation's,")
 _LETTERS: Final = {
     "conics_from_covars2d": ("xx", "xy", "yy"),
     "tile_rects": ("x0", "y0", "x1", "y1"),
@@ -30,21 +32,13 @@ _LETTERS: Final = {
     "conic": ("A", "B", "C"),
     "sh": ("red", "green", "blue"),
 }
+# what the places of a result are, where each holds the parts of many parameters
+_RESULTS: Final = {"adam_step": ("the new value", "the mean m", "the mean v")}
 # at which something of this course is held
 _LIMITS: Final = (0.0, 0.999, 1.0)
 _ALL_BUT: Final = "all but "
 # functions of parameters that make matrices
 _OF_STACKS: Final = ("rotmats_from_quats", "covars_from_quats_scales", "rotmats_from_quats_vjp")
-_FACTORS: Final = {
-    2.0: "a 2 is one too many, or a half is missing",
-    0.5: "a 2 is missing, or a half is one too many",
-    4.0: "a 2 is squared that should not be, or a quarter is missing",
-    0.25: "a factor of 4 is missing",
-    180.0 / np.pi: "it is in degrees, and radians are asked for",
-    np.pi / 180.0: "an angle is turned into radians that is in radians already",
-    255.0: "it counts in steps of a byte, and shares from 0 to 1 are asked for",
-    1.0 / 255.0: "it is divided by 255 once too often",
-}
 
 
 def diagnose(calls: Sequence[Call], folder: Path) -> Diagnosis:
@@ -62,7 +56,8 @@ def diagnose(calls: Sequence[Call], folder: Path) -> Diagnosis:
     stopped = next((call for call in wrong if call.error), None)
     if stopped is not None and stopped.error is not None:
         sentence = f"{where(stopped.error, folder)}: it stops with {said(stopped.error)}."
-        return sentence, _of_shapes(stopped) or "Call it by hand with these numbers.", stopped
+        hint = _of_shapes(stopped) or _of_totals(stopped) or "Call it by hand with these numbers."
+        return sentence, hint, stopped
     plainly = _misused(name, wrong)
     if plainly:
         return plainly, "", wrong[0]
@@ -91,6 +86,13 @@ def _of_shapes(call: Call) -> str:
         and ("broadcast" in str(call.error) or "matmul" in str(call.error))
     ):
         return "`.T` of a stack of matrices turns all of its axes round; of each matrix it is `np.swapaxes(M, 1, 2)`."
+    return ""
+
+
+def _of_totals(call: Call) -> str:
+    """Say how totals are added to, where Python says that a record's field cannot be set."""
+    if isinstance(call.error, AttributeError) and "set attribute" in str(call.error) and "totals" in call.parameters:
+        return "The fields of `totals` are arrays that stay: add in place, as in `totals.v_background[:] += x`."
     return ""
 
 
@@ -125,6 +127,8 @@ def _compared(name: str, wrong: Sequence[Call], some_right: bool) -> str:
             if a.shape != b.shape and _of_lists(call.expected[0]):
                 return _lists_of_another_length(name, call)
             if a.shape != b.shape:
+                if part == "`ids`":
+                    return f"{name} blends another number of splats, {len(a)} and not {len(b)}{_where_of(call)}."
                 of = "" if len(expected) == 1 else f"{part} of "
                 return f"{of}{name} has shape {list(a.shape)} where {list(b.shape)} is asked for{_where_of(call)}."
             if not np.all(np.isfinite(a)) and np.all(np.isfinite(b)):
@@ -144,7 +148,10 @@ def _compared(name: str, wrong: Sequence[Call], some_right: bool) -> str:
     sizes = [max((each.size for each in call.given if isinstance(each, np.ndarray)), default=1) for call in wrong]
     part = "" if of_all else re.sub("the cotangent of |`", "", named[0]).removeprefix("v_").rstrip("s")
     letters = _LETTERS.get(part, _LETTERS.get(name.removesuffix("_vjp"), ()) if of_all else ())
-    what = _as_a_whole(pairs, sizes, some_right, truths) or _in_places(pairs, letters) or _off_by(pairs)
+    what = _as_a_whole(pairs, sizes, some_right, truths)
+    if not what and len(bad) == 1 and len(parts[next(iter(bad))]) == len(wrong):
+        what = factor_of_an_argument(wrong, parts[next(iter(bad))])
+    what = what or _in_places(pairs, letters) or _off_by(pairs)
     if not of_all and len(named) > 1:
         what = re.sub("^(is|has|goes) ", lambda verb: {"is": "are ", "has": "have ", "goes": "go "}[verb[1]], what)
     rest = "" if of_all else "; the rest is right"
@@ -185,6 +192,8 @@ def parts_named(name: str, call: Call) -> list[str]:
     each = returned if type(returned) is tuple else (returned,)
     places = [k for k, result in enumerate(each) for _ in leaves(result, depth=1)]
     places += [len(each)] * (len(parts) - len(places))
+    if name in _RESULTS and len(each) == len(_RESULTS[name]):
+        return [_RESULTS[name][k] for k in places]
     named = [f"the {_ORDINALS[min(k, 5)]} result" for k in places]
     labels = [label for label, _ in parts]
     return [
@@ -249,7 +258,7 @@ def _as_a_whole(
         return "is always 0: it is not filled, or a term is missing"
     if always(lambda b: -b):
         return "has the wrong sign"
-    factor = _factor(found, expected)
+    factor = one_factor(found, expected)
     if factor:
         return factor
     if np.ptp(found - expected) < 1e-9 * max(1.0, np.max(np.abs(expected))) and len(found) > 1:
@@ -274,7 +283,7 @@ def _as_a_whole(
     ):
         if always(made):
             return what
-    return _of_rounding(found, expected) or _per_input(pairs, sizes)
+    return _of_rounding(found, expected) or per_input(pairs, sizes)
 
 
 def _with_turned_rotation(viewmat: np.ndarray) -> np.ndarray:
@@ -292,19 +301,6 @@ def _of_a_mask(found: np.ndarray, expected: np.ndarray, some_right: bool) -> str
     if np.all(found <= expected):
         return "says yes too rarely; is a condition too strict, or `and` written for `or`?"
     return ""
-
-
-def _factor(found: np.ndarray, expected: np.ndarray) -> str:
-    nonzero = np.abs(expected) > 1e-12
-    if np.sum(nonzero) < 2 or not np.allclose(found[~nonzero], 0.0, atol=1e-9):
-        return ""
-    ratios = found[nonzero] / expected[nonzero]
-    if np.ptp(ratios) > 1e-6 * np.max(np.abs(ratios)):
-        return ""
-    ratio = float(np.mean(ratios))
-    why = next((why for each, why in _FACTORS.items() if abs(abs(ratio) - each) < 1e-6 * each), "a factor is wrong")
-    sign = " and the sign is wrong, too" if ratio < 0 else ""
-    return f"is {abs(ratio):.4g} times what it should be, everywhere: {why}{sign}"
 
 
 def _offset(by: float) -> str:
@@ -333,23 +329,6 @@ def _of_rounding(found: np.ndarray, expected: np.ndarray) -> str:
             f"is right to {max(int(-np.log10(error / size)), 1)} digits and no further: something small, such as an "
             "epsilon, is added or missing, or a constant is rounded"
         )
-    return ""
-
-
-def _per_input(pairs: Sequence[Pair], sizes: Sequence[int]) -> str:
-    """Find a factor that is the number of entries: a sum where a mean is asked for, or the reverse."""
-    if len(pairs) != len(sizes) or len(set(sizes)) < 2:
-        return ""
-    with np.errstate(all="ignore"):
-        ratios = [np.ravel(a) / np.ravel(b) for a, b in pairs]
-    kept = [(r[np.isfinite(r)], n) for r, n in zip(ratios, sizes, strict=True) if np.any(np.isfinite(r))]
-    if len(kept) < 2 or any(np.ptp(r) > 1e-6 * np.max(np.abs(r)) for r, _ in kept):
-        return ""
-    by, entries = np.array([r[0] for r, _ in kept]), np.array([float(n) for _, n in kept])
-    if np.allclose(by, entries, rtol=1e-6):
-        return "is a sum, and a mean is asked for: divide by the number of entries"
-    if np.allclose(by * entries, 1.0, rtol=1e-6):
-        return "is divided by the number of entries once too often"
     return ""
 
 
@@ -387,6 +366,7 @@ def _places(pairs: Sequence[Pair], letters: Sequence[str]) -> Iterator[tuple[lis
     flags = all(set(np.unique(b)) <= {0.0, 1.0} for _, b in pairs)
     if all(shape[-1] == last for shape in shapes) and not (least == 1 and flags):
         names = letters if len(letters) == last else _AXES.get(last, "")
+        names = _COLUMNS if set(shapes) == {(4, 4)} else names
         for k in range(last):
             label = f"the {names[k]}" if names else f"number {k} of each row"
             yield [_at(shape, (..., k)) for shape in shapes], f"column {k} of each matrix" if least == 3 else label

@@ -24,7 +24,7 @@ from pop_ref.conformance.law import Law, missing
 from pop_ref.conformance.scenes import Scene
 from pop_ref.constants import PAPER, Profile
 from pop_ref.density import POP, DensityConfig
-from pop_ref.learn.course import DENSITY_SETTINGS, Stage
+from pop_ref.learn.course import DENSITY_SETTINGS, NOT_TAUGHT, Stage
 from pop_ref.learn.diagnosis import diagnose
 from pop_ref.learn.probes import oracle, probes
 from pop_ref.learn.stubs import formulas
@@ -216,6 +216,7 @@ def _laws(stage: Stage) -> Iterator[Law]:
             if (
                 isinstance(law, Law)
                 and law.name not in seen
+                and law.name not in NOT_TAUGHT
                 and (law.stage in stage.laws or law.name in stage.more_laws)
             ):
                 seen.add(law.name)

@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from pop_ref.learn.mistakes_backward import BACKWARD
 from pop_ref.learn.mistakes_geometry import GEOMETRY, Mistake, Oracle
 from pop_ref.learn.mistakes_training import TRAINING
 from pop_ref.learn.student import Call, same
@@ -37,10 +38,12 @@ def _shifted(right: float, down: float) -> Mistake:
 
 
 def _pixel_vjp(
-    tail: bool, background_seen: bool = False, dims: bool = True, forwards: bool = False, early: bool = False
-) -> Callable[..., Any]:
+    tail: bool = True, background_seen: bool = True, dims: bool = True, forwards: bool = False, early: bool = False,
+    lit: bool = True, share: bool = True,
+) -> Callable[..., Any]:  # fmt: skip
     """Make `composite_pixel_vjp` without what is behind a splat, without the background, with splats that do not dim
-    what is behind them, from front to back, or with what is behind a splat updated before it is read."""
+    what is behind them, from front to back, with what is behind a splat updated before it is read, without the light
+    that reaches a splat, or with splats behind that count whole and not by their alpha."""
 
     def made(o: Oracle, pixel: Any, rows: Any, px: float, py: float, background: Any, v_color: Any, v_T_final: float,
              totals: Any, *profile: Any) -> None:  # fmt: skip
@@ -52,8 +55,9 @@ def _pixel_vjp(
             color_dot_grad = float(np.dot(rows.colors[i], v_color))
             totals.v_colors[i] += T * alpha * np.array(v_color)
             before = behind
-            behind += alpha * (color_dot_grad - (behind if dims else 0.0)) if tail else 0.0
-            v_alpha = T * (color_dot_grad - (behind if early else before))
+            own = color_dot_grad * (alpha if share else 1.0)
+            behind += own - (alpha * behind if dims else 0.0) if tail else 0.0
+            v_alpha = (T if lit else 1.0) * (color_dot_grad - (behind if early else before))
             sigma = o["sigma_at_pixel"](rows.means2d[i], rows.conics[i], px, py)
             v_sigma, v_opacity = o["alpha_from_sigma_vjp"](sigma, rows.opacities[i], v_alpha, *profile)
             v_mean2d, v_conic = o["sigma_at_pixel_vjp"](rows.means2d[i], rows.conics[i], px, py, v_sigma)
@@ -74,8 +78,16 @@ def _pixel_by_alpha(o: Oracle, ids: Any, rows: Any, px: float, py: float, backgr
     return pixel._replace(color=color)
 
 
+def _pixel_painted(o: Oracle, ids: Any, rows: Any, px: float, py: float, background: Any, *profile: Any) -> Any:
+    """Make `composite_pixel` with the painter's rule from the front."""
+    pixel, color = o["composite_pixel"](ids, rows, px, py, background, *profile), np.zeros(len(background))
+    for i, alpha in zip(pixel.ids, pixel.alphas, strict=True):
+        color = (1.0 - alpha) * color + alpha * np.array(rows.colors[i])
+    return pixel._replace(color=(color + pixel.T_final * np.array(background)).tolist())
+
+
 def _pixel_forward(dims: str = "1 - alpha", last: bool = False, after: bool = False) -> Callable[..., Any]:
-    """Make `composite_pixel` that dims by alpha, blends the splat at which it stops, or keeps T behind each splat."""
+    """Make `composite_pixel` that dims otherwise, blends the splat at which it stops, or keeps T behind each splat."""
 
     def made(o: Oracle, ids: Any, rows: Any, px: float, py: float, background: Any, *profile: Any) -> Any:
         color, T, kept, n = np.zeros(len(background)), 1.0, list[tuple[int, float, float]](), 0
@@ -85,8 +97,8 @@ def _pixel_forward(dims: str = "1 - alpha", last: bool = False, after: bool = Fa
             alpha, skipped = o["alpha_from_sigma"](sigma, rows.opacities[i], *profile)
             if skipped:
                 continue
-            next_T = T * (alpha if dims == "alpha" else 1.0 - alpha)
-            ends = o["stops"](next_T, *profile)
+            next_T = {"alpha": T * alpha, "T - alpha": T - alpha}.get(dims, T * (1.0 - alpha))
+            ends = o["stops"](T * (1.0 - alpha) if dims == "T - alpha" else next_T, *profile)
             if ends and not last:
                 break
             color += T * alpha * np.array(rows.colors[i])
@@ -109,6 +121,7 @@ _HALF: Final = "The exponent of a Gaussian is half of d^T Q d: exp(-x^2 / 2) has
 
 MISTAKES: Final = (
     *GEOMETRY,
+    *BACKWARD,
     *TRAINING,
     Mistake(
         "sigma_at_pixel",
@@ -148,7 +161,7 @@ MISTAKES: Final = (
     ),
     Mistake(
         "composite_pixel_vjp",
-        _pixel_vjp(tail=False),
+        _pixel_vjp(tail=False, background_seen=False),
         "The tail is missing from dC/dalpha: more alpha shows more of a splat's own colour, and hides the colour of all"
         " that is behind it. Yours has the first part only.",
         "C = T (alpha c + (1 - alpha) behind), so dC/dalpha = T (c - behind). Walk from the back: start with behind ="
@@ -156,20 +169,20 @@ MISTAKES: Final = (
     ),
     Mistake(
         "composite_pixel_vjp",
-        _pixel_vjp(tail=True),
+        _pixel_vjp(background_seen=False),
         "The background is missing from the light behind the last splat.",
         "Before the walk from back to front, behind is background . v_color + v_T_final.",
     ),
     Mistake(
         "composite_pixel_vjp",
-        _pixel_vjp(tail=True, background_seen=True, forwards=True),
+        _pixel_vjp(forwards=True),
         "You walk from front to back; the way back begins with the last splat, since what is behind a splat must be"
         " known before the splat is reached.",
         "Go through reversed(pixel.ids), with alphas and transmittances reversed alike.",
     ),
     Mistake(
         "composite_pixel_vjp",
-        _pixel_vjp(tail=True, background_seen=True, early=True),
+        _pixel_vjp(early=True),
         "You add a splat to what is behind it before its own cotangent is taken.",
         "First v_alpha = T (color_dot_grad - behind), then behind += alpha (color_dot_grad - behind).",
     ),
@@ -217,6 +230,12 @@ MISTAKES: Final = (
     ),
     Mistake(
         "composite_pixel",
+        _pixel_forward(dims="T - alpha"),
+        "You take alpha from the light that is left; a splat takes the share alpha of what reaches it.",
+        "Behind a splat T is T (1 - alpha), which is T - T alpha.",
+    ),
+    Mistake(
+        "composite_pixel",
         _pixel_forward(last=True),
         "You blend the splat at which the pixel stops; the pixel ends before it.",
         "Ask stops(T (1 - alpha)) before the splat's colour is added.",
@@ -235,9 +254,28 @@ MISTAKES: Final = (
     ),
     Mistake(
         "composite_pixel_vjp",
-        _pixel_vjp(tail=True, background_seen=True, dims=False),
+        _pixel_vjp(dims=False),
         "A splat hides what is behind it: the light behind must lose the share alpha before the splat's own is added.",
         "behind += alpha (color_dot_grad - behind), the same as alpha color_dot_grad + (1 - alpha) behind.",
+    ),
+    Mistake(
+        "composite_pixel",
+        _pixel_painted,
+        "You paint each splat over those before it, as from back to front; the list is in order, front first.",
+        "color += T alpha c, with T the light that the splats before it have left.",
+    ),
+    Mistake(
+        "composite_pixel_vjp",
+        _pixel_vjp(share=False),
+        "A splat counts whole in what is behind the next one; it counts by the share alpha that it covers.",
+        "behind = alpha color_dot_grad + (1 - alpha) behind.",
+    ),
+    Mistake(
+        "composite_pixel_vjp",
+        _pixel_vjp(lit=False),
+        "The light that reaches the splat is missing from v_alpha: what hardly any light reaches changes the pixel"
+        " hardly.",
+        "v_alpha = T (color_dot_grad - behind), with T of pixel.transmittances.",
     ),
 )
 

@@ -8,16 +8,18 @@ from typing import Any, Final
 
 import numpy as np
 
+from pop_ref.density import POP
 from pop_ref.learn.mistakes_geometry import Mistake, Oracle
 from pop_ref.optimizer import BETAS, EPS
 
 
 def _adam(
     first: bool = True, second: bool = True, sign: float = -1.0, late: int = 0, squared: bool = True, root: bool = True,
-    turned: bool = False,
+    turned: bool = False, share: bool = True, of_gradient: bool = False, late_share: bool = False,
 ) -> Callable[..., Any]:  # fmt: skip
     """Make `adam_step` without the division by 1 - beta1^t or by 1 - beta2^t, uphill, with another number of the
-    update, with g for g^2, without the root, or with its betas exchanged."""
+    update, with g for g^2, without the root, with its betas exchanged, without 1 - beta1, with g in m's place,
+    or with the root taken before the correction."""
 
     def made(o: Oracle, params: Any, grads: Any, m: Any, v: Any, step: Any, lr: Any,
              betas: Any = BETAS, eps: float = EPS) -> Any:  # fmt: skip
@@ -25,11 +27,13 @@ def _adam(
         betas = betas[::-1] if turned else betas
         for name, g in grads.items():
             t = (step if isinstance(step, int) else step[name]) + late
-            m[name] = betas[0] * m[name] + (1.0 - betas[0]) * g
+            m[name] = betas[0] * m[name] + (1.0 - betas[0] if share else 1.0) * g
             v[name] = betas[1] * v[name] + (1.0 - betas[1]) * (g * g if squared else g)
             mean = m[name] / (1.0 - betas[0] ** t if first else 1.0)
+            mean = g if of_gradient else mean
             size = v[name] / (1.0 - betas[1] ** t if second else 1.0)
             size = (np.sqrt(size) if root else size) + eps
+            size = np.sqrt(v[name]) / (1.0 - betas[1] ** t) + eps if late_share else size
             params[name] = params[name] + sign * lr[name] * mean / size
         return params, m, v
 
@@ -48,6 +52,34 @@ def _means(of_all: bool = False, turned: bool = False) -> Callable[..., Any]:
         return total
 
     return made
+
+
+def _one_side(important: bool) -> Callable[..., Any]:
+    """Make `pop_loss` with one of its two means alone."""
+
+    def made(o: Oracle, opacities: Any, mask: Any, visible: Any = None) -> float:
+        part = np.ones(len(mask), dtype=bool) if visible is None else visible
+        side = part & (mask if important else ~mask)
+        apart = 1.0 - opacities if important else opacities
+        return float(np.sum(apart[side])) / max(int(np.sum(side)), 1)
+
+    return made
+
+
+def _reordered(rows: Any, order: Any) -> Any:
+    return type(rows)(*({name: x[order] for name, x in each.items()} for each in (rows.params, rows.m, rows.v)))
+
+
+def _split_in_pairs(o: Oracle, rows: Any, mask: Any, *given: Any) -> Any:
+    """Make `split_rows` with the two children of a parent one after the other."""
+    n, k = int(np.sum(~mask)), int(np.sum(mask))
+    pairs = n + np.arange(2 * k).reshape(2, k).T.ravel()
+    return _reordered(o["split_rows"](rows, mask, *given), np.concatenate([np.arange(n), pairs]))
+
+
+def _clones_first(o: Oracle, rows: Any, mask: Any) -> Any:
+    """Make `clone_rows` with the copies before all others."""
+    return _reordered(o["clone_rows"](rows, mask), np.roll(np.arange(len(mask) + np.sum(mask)), int(np.sum(mask))))
 
 
 def _split_beside(o: Oracle, rows: Any, mask: Any, normals: Any, *revised: Any) -> Any:
@@ -82,10 +114,22 @@ def _unturned(o: Oracle, rows: Any, mask: Any, normals: Any, *revised: Any) -> A
     return type(split)({**split.params, "quats": quats}, split.m, split.v)
 
 
-def _clone_with_moments(o: Oracle, rows: Any, mask: Any) -> Any:
-    """Make `clone_rows` whose copies have the moments of their sources."""
-    both = ({name: np.concatenate([x, x[mask]]) for name, x in each.items()} for each in (rows.m, rows.v))
-    return type(rows)(o["clone_rows"](rows, mask).params, *both)
+def _clone_with_moments(m: bool = True, v: bool = True) -> Callable[..., Any]:
+    """Make `clone_rows` whose copies have moments of their sources."""
+
+    def made(o: Oracle, rows: Any, mask: Any) -> Any:
+        cloned = o["clone_rows"](rows, mask)
+        both = ({name: np.concatenate([x, x[mask]]) for name, x in each.items()} for each in (rows.m, rows.v))
+        with_m, with_v = both
+        return type(rows)(cloned.params, with_m if m else cloned.m, with_v if v else cloned.v)
+
+    return made
+
+
+def _uncounted(o: Oracle, state: Any, *given: Any) -> Any:
+    """Make `train_step` whose new state has the old one's number."""
+    after, loss = o["train_step"](state, *given)
+    return replace(after, step=state.step), loss
 
 
 def _over_all(o: Oracle, opacities: Any, mask: Any, v_loss: float, visible: Any = None) -> Any:
@@ -181,6 +225,80 @@ TRAINING: Final = (
         "Divide for the quotient only; what is kept and returned is v itself.",
     ),
     Mistake(
+        "adam_step",
+        _adam(share=False),
+        "The factor 1 - beta1 is missing before the gradient: m would be a sum and no mean.",
+        "m = beta1 m + (1 - beta1) g.",
+    ),
+    Mistake(
+        "adam_step",
+        _adam(of_gradient=True),
+        "The step is made of this gradient alone; it is made of the running mean m.",
+        "x - lr m / (sqrt(v) + eps), both corrected.",
+    ),
+    Mistake(
+        "adam_step",
+        _adam(late_share=True),
+        "You take the root before the correction: v is divided by 1 - beta2^t first.",
+        "sqrt(v / (1 - beta2^t)) + eps.",
+    ),
+    Mistake(
+        "split_rows",
+        _split_otherwise("scales", lambda x: np.exp(x) / 1.6 + np.log(1.6), "scales"),
+        "The widths of the children are kept as they are; what is stored are their logarithms.",
+        "log s' = log(s / 1.6).",
+    ),
+    Mistake(
+        "grow_masks",
+        lambda o, window, scales, scene_scale, step, config=POP: o["grow_masks"](
+            window, scales, scene_scale / config.grow_scale3d, step, config
+        ),
+        "The share grow_scale3d is missing: small is at most that share of the scene's scale.",
+        "scales.max(axis=1) <= config.grow_scale3d * scene_scale.",
+    ),
+    *(
+        Mistake(
+            name,
+            lambda o, image, *given, name=name: o[name](image, *given) * image.shape[2],
+            "You divide by the number of pixels; the mean is over the pixels and their channels.",
+            "Divide by H W D, three times as much for a picture with three channels.",
+        )
+        for name in ("l1", "l1_vjp", "l2", "l2_vjp")
+    ),
+    Mistake(
+        "l1_vjp",
+        lambda o, *given: 0.5 * o["l2_vjp"](*given),
+        "You pass the difference on; the derivative of |x| is the sign of x, whatever its size.",
+        "v sign(image - target) over the number of entries.",
+    ),
+    *(
+        Mistake(
+            "pop_loss",
+            _one_side(important),
+            f"The mean over the {others} is missing: the prior has two, and each is over its own Gaussians.",
+            "The mean of 1 - o where the mask is true, plus the mean of o where it is not.",
+        )
+        for important, others in ((True, "unimportant"), (False, "important"))
+    ),
+    Mistake(
+        "split_rows",
+        _split_otherwise("scales", lambda x: x + np.log(1.6), "scales"),
+        "The children are as wide as their parent; each is narrower by a factor of 1.6.",
+        "log s' = log s - log 1.6.",
+    ),
+    Mistake(
+        "split_rows",
+        _split_in_pairs,
+        "The two children of a parent stand side by side; all first children come before all second ones.",
+        "Append the children of normals[0], then those of normals[1].",
+    ),
+    Mistake(
+        "clone_rows",
+        _clones_first,
+        "The copies stand before their sources; they are appended at the end.",
+        "np.concatenate([rows, copies]), in the parameters and both moments.",
+    ),
+    Mistake(
         "split_rows",
         _split_beside,
         "The parents stay; a split puts two children in the place of one parent.",
@@ -199,11 +317,30 @@ TRAINING: Final = (
         " others.",
         "Divide the first sum by N_imp and the second by N - N_imp.",
     ),
+    *(
+        Mistake(
+            "clone_rows",
+            _clone_with_moments(*which),
+            f"The copies have {of} of their sources: newcomers start with moments of 0.",
+            "Append copies to the parameters, and zeros to m and v.",
+        )
+        for which, of in (
+            ((True, True), "Adam's moments"),
+            ((True, False), "Adam's first moments, m,"),
+            ((False, True), "Adam's second moments, v,"),
+        )
+    ),
     Mistake(
-        "clone_rows",
-        _clone_with_moments,
-        "The copies have Adam's moments of their sources: newcomers start with moments of 0.",
-        "Append copies to the parameters, and zeros to m and v.",
+        "split_rows",
+        _split_otherwise("scales", lambda x: x / 1.6 + np.log(1.6), "scales"),
+        "You divide the logarithms of the widths by 1.6: to divide a width by 1.6, subtract log 1.6.",
+        "params['scales'] holds logarithms: np.log(np.exp(scales) / 1.6).",
+    ),
+    Mistake(
+        "train_step",
+        _uncounted,
+        "The step is not counted: the new state has the number of the old one.",
+        "Training(..., step=state.step + 1, ...).",
     ),
     Mistake(
         "split_rows",
@@ -244,6 +381,24 @@ TRAINING: Final = (
         ),
         "You compare the mean of the three widths: a Gaussian is small if its largest one is.",
         "scales.max(axis=1).",
+    ),
+    Mistake(
+        "params_vjp",
+        lambda o, params, gradients, v_opacities: {
+            **o["params_vjp"](params, gradients, v_opacities),
+            "scales": gradients.scales,
+        },
+        "The gradient of the widths is not pulled back to their logarithms.",
+        "scales_from_log_scales_vjp(params['scales'], gradients.scales).",
+    ),
+    Mistake(
+        "params_vjp",
+        lambda o, params, gradients, v_opacities: {
+            **o["params_vjp"](params, gradients, v_opacities),
+            "opacities": gradients.opacities + v_opacities,
+        },
+        "The gradient of the opacities is not pulled back to their logits.",
+        "opacities_from_logits_vjp(params['opacities'], gradients.opacities + v_opacities).",
     ),
     Mistake(
         "params_vjp",

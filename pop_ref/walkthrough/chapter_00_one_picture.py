@@ -202,8 +202,8 @@ picture(
 
 # %% [markdown]
 # Seventy steps leave a blur. The same toys, in photographs four times as wide, were trained for 3,000 steps before this
-# page was made, by `make demo`. Gaussians were added where they were needed, and removed
-# where they were not. The view is again one that no step has seen.
+# page was made. (`make demo` trains on those photographs for a minute.) Gaussians were added where they were needed,
+# and removed where they were not. The view is again one that no step has seen.
 
 # %%
 kept = plt.imread(str(files("pop_ref.walkthrough") / "trained.png"))[..., :3]

@@ -95,8 +95,8 @@ print(
 #
 # Rasterizers add two rules that the paper does not print. An alpha under 1/255 changes an 8-bit image by less than one
 # level and is skipped (the *floor*, decision D5). And alpha is cut at 0.999 (the *ceiling*, D6), so that no splat
-# blocks everything: what lies behind still contributes a little, and has a gradient. All of it in five lines, where
-# `falloff` is $e^{-\sigma}$:
+# blocks everything: what lies behind still contributes a little, and has a gradient. In five lines, where `falloff` is
+# $e^{-\sigma}$, this is:
 #
 # {{source: pop_ref.alpha.alpha_from_sigma}}
 
@@ -200,7 +200,7 @@ picture(
 )
 
 # %% [markdown]
-# The same splat, to be moved and shaped. What this chapter computed stands beside it.
+# Here you can move and shape the same splat. What this chapter computed is shown with it.
 #
 # {{widget: splat2d}}
 #

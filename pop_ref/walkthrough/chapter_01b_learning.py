@@ -322,11 +322,11 @@ film(
 )
 
 # %% [markdown]
-# Ninety steps, five kinds of numbers, one rule. **The picture fits, and the parameters do not.** A larger splat farther
-# away looks the same, so the depth is free to be wrong. A fainter one that is a little wider looks almost the same, so
-# the opacity comes only near. And the third width lies along the line of sight, where the camera hardly sees it. What
-# the photograph does not determine is not left alone, either: its gradient is tiny and not zero, Adam makes full steps
-# of it, and the number *drifts*. Where it ends depends on where it began. Two other starts show it:
+# In ninety steps one rule has changed five kinds of numbers. **The picture fits, and the parameters do not.** A larger
+# splat farther away looks the same, so the depth is free to be wrong. A fainter one that is a little wider looks almost
+# the same, so the opacity comes only near. And the third width lies along the line of sight, where the camera hardly
+# sees it. What the photograph does not determine is not left alone, either: its gradient is tiny and not zero, Adam
+# makes full steps of it, and the number *drifts*. Where it ends depends on where it began. Two other starts show it:
 
 # %%
 for third_width, place in ((0.05, -0.3), (0.4, -0.1)):

@@ -255,7 +255,7 @@ for point, over in (
     assert np.isclose(entry, -f * over)
 
 # %% [markdown]
-# A Gaussian to walk around. Its points go through the true pinhole, its ellipse through $J$.
+# Here you can walk around a Gaussian. Its points go through the true pinhole, its ellipse through $J$.
 #
 # {{widget: orbit}}
 #
@@ -399,7 +399,8 @@ assert np.allclose(
 
 # %% answer
 # The disc lies in the plane $y = 0$ through the camera: it is a line on the screen, a covariance of rank one that has
-# no inverse and so no conic. The blur gives it one, and the disc is drawn as a line 0.55 px wide.
+# no inverse and so no conic. The blur gives it one, and the disc is drawn as a line with a standard deviation of 0.55
+# px across.
 disc = alone([0.0, 0.0, 5.0], [0.2, 0.0, 0.2])
 chain = geometry(disc, ahead)
 assert np.linalg.det(chain.covars2d[0]) == 0.0

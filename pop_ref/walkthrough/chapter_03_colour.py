@@ -97,7 +97,7 @@ for k in range(16):
 picture(fig, "The sixteen harmonics, one row a degree.")
 
 # %% [markdown]
-# Their sum, with a slider for each coefficient. The ring in the middle is what the camera in front of you sees.
+# Here is their sum, with a slider for each coefficient. The ring in the middle is what the camera in front of you sees.
 #
 # {{widget: harmonics}}
 #
@@ -236,9 +236,9 @@ picture(fig, "One Gaussian with four coefficients a channel, seen from eight sid
 # %% [markdown]
 # ## Where the numbers go
 #
-# Degree 3 has 16 coefficients of three channels: 48 of the 59 numbers that a Gaussian stores. That is the price of
-# shine. Training does not start with all of them: it begins with degree 0 and adds a degree every 1000 steps, so that a
-# colour settles before its variation is fitted.
+# Degree 3 has 16 coefficients of three channels: 48 of the 59 numbers that a Gaussian stores. Training does not start
+# with all of them: it begins with degree 0 and adds a degree every 1000 steps, so that a colour settles before its
+# variation is fitted.
 
 # %%
 mean, quaternion, scale, opacity = 3, 4, 3, 1

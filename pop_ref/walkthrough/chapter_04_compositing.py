@@ -160,7 +160,7 @@ assert np.isclose(odd.T_final, 0.09)
 assert np.allclose(odd.color, 0.91 * np.array([0.2, 0.2, 0.2]) + 0.09 * background)
 
 # %% [markdown]
-# One pixel, to be rearranged. Its last column is the subject of chapter 5.
+# Here you can rearrange the splats of one pixel. The last column is the subject of chapter 5.
 #
 # {{widget: stack}}
 #

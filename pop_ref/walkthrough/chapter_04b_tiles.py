@@ -123,9 +123,9 @@ picture(
 # %% [markdown]
 # ## One sort for everything
 #
-# Now each tile needs its splats in the order of depth. A GPU is at its best when it does one large thing, so the lists
-# of all tiles are made by *one* sort. For every pair of a splat and a tile that it overlaps, write an *entry*: the
-# splat's index, and a *key*, a whole number of 64 bits:
+# Now each tile needs its splats in the order of depth. A GPU sorts one long list faster than many short ones, so the
+# lists of all tiles are made by *one* sort. For every pair of a splat and a tile that it overlaps, write an *entry*:
+# the splat's index, and a *key*, a whole number of 64 bits:
 #
 # $$\text{key} = \underbrace{\text{tile}}_{\text{upper 32 bits}} \;\Big|\;
 # \underbrace{\text{bits of the depth}}_{\text{lower 32 bits}}$$
@@ -213,6 +213,7 @@ elsewhere = np.sort(np.abs(np.diff(reds)))[-2]
 print(f"largest change between two angles {jump:.2f}, elsewhere at most {elsewhere:.4f}")
 assert np.abs(np.diff(reds)).argmax() == np.abs(np.diff(first)).argmax()
 assert jump > 0.2
+assert elsewhere < 0.01 * jump
 
 fig, ax = axes(1, width=5.0, height=2.3)
 before = angles < 0
@@ -228,7 +229,7 @@ picture(
 # ## Why sixteen?
 #
 # Small tiles fit the splats better: fewer are listed for nothing. But a splat is in more of them, so there are more
-# entries to sort. Large tiles are the other way round. Sixteen is also what a GPU likes: 256 pixels are a block of
+# entries to sort. Large tiles are the other way round. Sixteen also suits a GPU, in which 256 pixels are a block of
 # threads that share the list in fast memory.
 
 # %%
@@ -263,10 +264,11 @@ picture(
 
 # %% answer
 # Last of its tile: the sign is the uppermost bit of a floating-point number, so as a whole number a negative depth is
-# larger than every positive one. And among negative ones the order is reversed. The cull saves the keys.
-minus, plus = np.array([-2.0, 1e30], dtype=np.float32).view(np.uint32)
+# larger than every positive one. And among negative ones the order is reversed. Keys are in order only because what is
+# behind the camera has been culled.
+minus, farther, plus = np.array([-2.0, -3.0, 1e30], dtype=np.float32).view(np.uint32)
 print(f"{minus:032b}\n{plus:032b}")
-assert minus > plus
+assert farther > minus > plus
 
 # %% [markdown]
 # ### Exercise 2: derive
@@ -313,5 +315,5 @@ assert short_key(3, 1.0, 15) == short_key(3, 1.0000001, 15)
 
 # %% answer
 # The last tile is rounded down, so a splat whose extent ends inside a tile loses that tile: colour and gradient are cut
-# off along a straight edge. It has happened in a well-known program. The law tries splats that end just inside a tile.
+# off along a straight edge. The law tries splats that end just inside a tile.
 print(caught("edge_exact_splat_dropped"))

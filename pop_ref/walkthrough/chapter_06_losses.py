@@ -109,8 +109,8 @@ picture(
 
 # %% [markdown]
 # Read the right picture both ways. L2 is the better opponent of a *strong* prior, because large errors pull up to twice
-# as hard as under L1. Against a *weak* one L1 is better: it does not give way at all, and L2 always does a little. What
-# L2 brings is not more force but force that knows how wrong a pixel is.
+# as hard as under L1. Against a *weak* one L1 is better: it does not give way at all, and L2 always does a little.
+# Under L2 the pull depends on how wrong a pixel is, under L1 it does not.
 
 # %% [markdown]
 # ### Exercise 1: predict
@@ -236,9 +236,8 @@ picture(
 # %% [markdown]
 # L1's map is one flat tone: it says which way, never how far. L2's map is the error itself, doubled. SSIM's map is
 # something else: where it is complete, away from the border, the sizes of gradient and error correlate weakly, by less
-# than 0.7 here and for other draws of the haze (the paper says: no direct relation). That is its reason for L2: of
-# the three it alone spends its force where the artifacts are. (Here opacities are simply set, so the picture shows the
-# gradients and not the fight.)
+# than 0.7 here and for other draws of the haze (the paper says: no direct relation). That is its reason for L2,
+# which alone of the three pulls in proportion to the error. (Here opacities are simply set; no prior is at work.)
 
 # %%
 assert np.ptp(np.abs(pulls["L1"])) == 0.0
@@ -370,7 +369,7 @@ def psnr(image, target):
 black = np.zeros((10, 10, 3))
 spot = black.copy()
 spot[0, 0] = 1.0
-print(psnr(black + 0.1, black), psnr(black + 0.05, black), psnr(spot, black))
+print(*(f"{psnr(image, black):.2f} dB" for image in (black + 0.1, black + 0.05, spot)))
 assert np.isclose(psnr(black + 0.1, black), 20.0)
 assert np.isclose(psnr(black + 0.05, black) - 20.0, 6.0206, atol=1e-4)
 assert np.isclose(psnr(spot, black), 20.0)

@@ -317,9 +317,9 @@ picture(
 
 # %% [markdown]
 # At first all are too large and the number doubles; a split opens holes, which the training between two steps closes.
-# As the counts come down growth slows to about a tenth per step, at a little over $2/\theta$ Gaussians. No budget was
-# set and no gradient asked: the threshold is the budget. In the paper the rule is active from step 3,000 to 7,000 only,
-# beside the gradient rule.
+# As the counts come down growth slows to about a tenth per step, at a little over $2/\theta$ Gaussians. Neither a
+# number of Gaussians was set nor a gradient read: the threshold alone decides how many there are. In the paper the rule
+# is active from step 3,000 to 7,000 only, together with the gradient rule.
 
 # %%
 sizes = [n for n, _ in history]

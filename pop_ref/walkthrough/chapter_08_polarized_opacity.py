@@ -421,7 +421,7 @@ for camera in cameras:
 assert min(shares) > 0.95
 
 # %% [markdown]
-# And in three dimensions: the toy of chapter 0 once more, trained in this page. Train it to the end. Then change
+# The toy of chapter 0 shows it in three dimensions, trained in this page. Train it to the end. Then change
 # $\lambda_{\mathrm{POP}}$, or $\theta$ of chapter 7, and start again.
 #
 # {{widget: train}}

@@ -33,6 +33,7 @@
 
 # %%
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -133,6 +134,15 @@ assert errors[12] < errors[4] < errors[2]
 print(*files, sep="\n")
 assert {"cameras.bin", "images.bin", "points3D.bin"} <= {Path(each).name for each in files}
 at, depths = pixels_of(view, capture.points)
+# mix-ups of the first table: OpenGL's axes show what is behind, the inverse another view, a corner a shifted one
+open_gl, inverse = (
+    replace(view, viewmat=pose)
+    for pose in (flip @ view.viewmat, np.linalg.inv(view.viewmat))
+)
+by_corner = replace(view, K=view.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]))
+assert np.allclose(pixels_of(open_gl, capture.points)[1], -depths)
+assert np.median(np.abs(pixels_of(inverse, capture.points)[0] - at)) > 10.0
+assert np.allclose(pixels_of(by_corner, capture.points)[0], at - 0.5)
 inside = (depths > 0) & np.all((at > 0) & (at < [view.width, view.height]), axis=1)
 print(f"{len(capture.points)} points, {inside.sum()} of them in photograph 0,", end=" ")
 print(f"at depths {depths[inside].min():.1f} to {depths[inside].max():.1f}")

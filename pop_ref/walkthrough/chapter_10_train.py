@@ -3,7 +3,7 @@
 # %% [markdown]
 # # 10. Train a scene, read its report, and ask why a pixel is wrong
 #
-# Everything so far, run together. At the end of this chapter you can read the whole training step as code, start a
+# This chapter runs everything so far together. At the end of it you can read the whole training step as code, start a
 # training of your own, read its curves and tell from them what the prior has done, and ask of any pixel why it looks as
 # it does.
 #
@@ -255,10 +255,10 @@ picture(fig, caption + "averaged over seven records; the dots are the held-out v
 # **Opacities.** All began at 0.1. Without the prior few end over 0.9; with it more than twice the share does. That is
 # the polarization, and the reason for the next curve.
 #
-# **Gaussians per pixel.** How many splats a pixel blends. With the prior the curve ends lower: fewer Gaussians are
-# left, and the faint ones reach less far ([chapter 8](chapter_08_polarized_opacity.py)). It is not that rays end early:
-# in so thin a scene hardly a pixel uses its light up, with the prior or without. Less work per pixel is what POP is
-# after.
+# **Gaussians per pixel.** How many splats a pixel blends. With the prior the curve ends lower: more of the Gaussians
+# are faint, and faint ones reach less far ([chapter 8](chapter_08_polarized_opacity.py)). It is not that rays end
+# early: in so thin a scene hardly a pixel uses its light up, with the prior or without. POP aims at less work per
+# pixel.
 #
 # **PSNR.** The two end within 2.5 dB of each other, and which is ahead depends on the start: so small a training cannot
 # tell what the prior costs. It pushes twenty times harder here than in the paper, whose ablation (section 5) reports
@@ -277,6 +277,7 @@ for name in stats:
 assert histogram("prior", -1)[9:11].sum() == 1.0
 assert stats["prior"]["opacity_above_0.9"] > 2.0 * stats["none"]["opacity_above_0.9"]
 assert stats["prior"]["n_blended"] < stats["none"]["n_blended"]
+assert histogram("prior", 199)[:10].sum() > histogram("none", 199)[:10].sum()
 assert abs(stats["prior"]["psnr"] - stats["none"]["psnr"]) < 2.5
 assert curve("prior", "psnr")[1][-5:].mean() > curve("prior", "psnr")[1][:5].mean() + 3.0
 
@@ -299,9 +300,9 @@ print(*sorted(path.name for path in report.parent.iterdir() if path != report))
 # %% [markdown]
 # ## The demo capture, and one bad pixel
 #
-# Now something that was not drawn from Gaussians: the still life of chapter 0, at 96 by 72 pixels, by the commands that
-# a user types, `pop demo scene`, `pop train scene --steps-scaler 0.1`: a tenth of the schedule, of which five hundred
-# steps, with views 0 and 8 held out.
+# Now we train on something that was not drawn from Gaussians: the still life of chapter 0, at 96 by 72 pixels, by the
+# commands that a user types, `pop demo scene` and `pop train scene --steps-scaler 0.1`. The schedule is a tenth of the
+# paper's, only its first five hundred steps are taken, and views 0 and 8 are held out.
 
 # %%
 scene, out = str(home / "scene"), str(home / "demo")

@@ -3,9 +3,9 @@
 # %% [markdown]
 # # 12. Break it: each mutant, and the law that catches it
 #
-# A test that no bug fails is worth nothing. So the kit that judges rasterizers is judged itself: by broken copies of
-# the oracle, each wrong in one line, many of them as some program once was. At the end of this chapter you have
-# seen what such bugs do to a picture, that most of them do nothing to it, and which law catches which.
+# A test must fail where the program is wrong, and this can be tried. The kit that judges rasterizers is judged itself
+# by broken copies of the oracle, each wrong in one line. At the end of this chapter you have seen what such bugs do to
+# a picture, that most of them do nothing to it, and which law catches which.
 #
 # ## A law and a mutant
 #

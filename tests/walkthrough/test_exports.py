@@ -225,6 +225,20 @@ def test_the_book_holds_every_chapter_and_no_id_twice(small: tuple[Chapter, list
     assert not re.search(r'href="(?!#)', text)
 
 
+def test_the_book_prints_what_the_course_asks_for_behind_the_questions_and_a_mistake_where_it_is_looked_for() -> None:
+    asked = "# {{source: pop_ref.alpha.sigma_at_pixel}}\n#\n# {{bug: no_half_in_the_exponent}}\n"
+    chapter = read_chapter(Path("chapter_01_small.py"), TEXT.replace("# It has a widget", f"{asked}# It has a widget"))
+    text = book([(chapter, run_chapter(chapter))])
+    questions, answers = text.split('<article id="answers">')
+    right = "0.5</span> <span"
+    assert "The oracle's <code>sigma_at_pixel</code> is at the back.</a>" in questions
+    assert re.search(r"<code>sigma_at_pixel</code>, <code>pop_ref/alpha\.py</code></h3><pre", answers)
+    assert right in answers
+    assert right not in questions
+    assert "with one mistake" in questions
+    assert "with one mistake" not in answers
+
+
 @in_browser
 def test_a_training_in_a_book_is_drawn_before_the_page_is_loaded(page: Page, tmp_path: Path) -> None:
     # what is printed is the page as it is when it has loaded, and a worker answers later

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy
 import pytest
 
 import pop_ref
+from pop_ref.learn.course import COURSE
 from pop_ref.walkthrough.builder.chapter import Chapter, chapter_number, read_chapter
 from pop_ref.walkthrough.builder.notebooks import notebook
 from tests.walkthrough.ran import CHAPTERS, MISSING, executed, run_of
@@ -57,6 +59,17 @@ def _small(text: str = GOOD) -> Chapter:
 
 def _pictures(outputs: list[dict[str, Any]]) -> int:
     return sum("image/png" in output.get("data", {}) for output in outputs)
+
+
+def test_a_notebook_folds_the_functions_that_the_course_asks_for() -> None:
+    for path in CHAPTERS:
+        chapter = read_chapter(path)
+        told = ["".join(c["source"]) for c in json.loads(notebook(chapter))["cells"] if c["cell_type"] == "markdown"]
+        # what is left once the folded parts are taken out
+        left = re.sub(r"<details>.*?</details>", "", "\n".join(told), flags=re.DOTALL)
+        assert "yours to write first" not in left
+        for name in (name for stage in COURSE for name in stage.names):
+            assert f"def {name}(" not in left, (path.name, name)
 
 
 def test_a_notebook_holds_the_chapter_and_folds_what_a_page_folds() -> None:

@@ -62,6 +62,12 @@ _YOURS: Final = re.compile(
     r"<p>(<code>[\w/., ]+</code>), yours to write first in <code>pop learn check (\w+)</code>:</p>\s*(<pre\b.*?</pre>)",
     re.DOTALL,
 )
+# the same once it is folded
+_SOURCE: Final = re.compile(
+    r"<details class=\"yours\"[^>]*><summary>The oracle's (<code>\w+</code>), (<code>.*?</code>).*?</summary>"
+    r"(<pre\b.*?</pre>)</details>",
+    re.DOTALL,
+)
 _TAG: Final = re.compile(r"<[^>]*>")
 # as many characters of code have room in the narrowest box of a page or a book; so few lines stay on one page of a book
 _LONG, _SHORT = 80, 12
@@ -169,6 +175,8 @@ def notebook_index(chapters: Sequence[Chapter], names: Sequence[str]) -> str:
 def book(told: Sequence[tuple[Chapter, Sequence[Outcome]]]) -> str:
     """Lay out chapters one after the other for the printer, with a contents at the front and the answers at the back.
 
+    A function that the course asks the reader to write is an answer, too.
+
     Args:
         told: chapters in order, with what their cells did.
 
@@ -196,7 +204,8 @@ def book(told: Sequence[tuple[Chapter, Sequence[Outcome]]]) -> str:
                 body += f'<p class="answered"><a href="#{answer}">The answer is at the back.</a></p>'
                 answers += f'<h3 id="{answer}">Exercise {asked}</h3>{shown}'
             else:
-                body += shown
+                left, sources = _without_sources(shown, f"{name}-source-{i}")
+                body, answers = body + left, answers + sources
         articles += f'<article id="{name}">{body}</article>'
     lines += '<li><a href="#answers">Answers</a></li>'
     body = (
@@ -304,8 +313,28 @@ def _folded_source(found: re.Match[str]) -> str:
     """Fold a function that a reader may write first; a script opens it once its stage is passed."""
     first = f"Yours to write: pop learn check {found[2]}. Click again to see it."
     told = f'<span role="status" data-first="{first}"></span>'
-    summary = f"<summary>The oracle's, {found[1]} {told}</summary>"
+    summary = f"<summary>The oracle's {_called(found[3])}, {found[1]} {told}</summary>"
     return f'<details class="yours" data-stage="{found[2]}">{summary}{found[3]}</details>'
+
+
+def _called(code: str) -> str:
+    """Name the function that some highlighted code defines."""
+    return f"<code>{_TAG.sub('', code.partition('>def</span>')[2].partition('(')[0]).strip()}</code>"
+
+
+def _without_sources(shown: str, name: str) -> tuple[str, str]:
+    """Take the functions that a reader may write out of a cell; what has a mistake to be found stays."""
+    taken: list[str] = []
+
+    def to_the_back(found: re.Match[str]) -> str:
+        called, file, code = found.groups()
+        if "with one mistake" in file:
+            return found[0]
+        place = f"{name}-{len(taken)}"
+        taken.append(f'<h3 id="{place}">The oracle\'s {called}, {file}</h3>{code}')
+        return f'<p class="answered"><a href="#{place}">The oracle\'s {called} is at the back.</a></p>'
+
+    return _SOURCE.sub(to_the_back, shown), "".join(taken)
 
 
 def _code(text: str) -> str:

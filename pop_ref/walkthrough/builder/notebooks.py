@@ -92,8 +92,18 @@ def _needed(chapter: Chapter) -> tuple[str, ...]:
 _ABSENT: Final = {"cv2", "hypothesis", "matplotlib", "numpy", "pop_fast", "pop_ref", "torch"}
 
 
+# a printed function that the course asks the reader to write, as `expanded` marks it
+_YOURS: Final = re.compile(
+    r"`([\w/., ]+)`, yours to write first in (`pop learn check \w+`):\n\n(```python\n.*?def (\w+)\(.*?\n```)", re.DOTALL
+)
+_FOLDED: Final = (
+    r"<details><summary>The oracle's \4, \1: yours to write first</summary>\n\nJudge yours with \2.\n\n\3\n\n</details>"
+)
+
+
 def _told(cell: Cell) -> list[dict[str, Any]]:
-    text = re.sub(r"\]\((chapter_\w+)\.py\)", r"](\1.ipynb)", expanded(cell.text))
+    text = re.sub(r"\]\((chapter_\w+)\.py\)", r"](\1.ipynb)", expanded(cell.text, marked=True))
+    text = _YOURS.sub(_FOLDED, text)
     cells: list[dict[str, Any]] = []
     # every second piece is the name of a widget
     for i, piece in enumerate(_WIDGET.split(text)):
