@@ -88,8 +88,8 @@ _ORACLE: Final = (
         "whole_dissimilarity",
         "D-SSIM that is asked to be halved is not",
         "training.py",
-        "options = (goal.lambda_ssim, goal.padding, None, goal.d_ssim_halved, goal.pixel_scale)",
-        "options = (goal.lambda_ssim, goal.padding, None, False, goal.pixel_scale)",
+        "options = (goal.lambda_ssim, goal.padding, mask, goal.d_ssim_halved, goal.pixel_scale)",
+        "options = (goal.lambda_ssim, goal.padding, mask, False, goal.pixel_scale)",
         SETTINGS,
     ),
     (
