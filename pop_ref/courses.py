@@ -82,7 +82,8 @@ class Trained:
 
     def __init__(self, course: Course) -> None:
         self.course, self.step = course, 0
-        self.driven: Any = methods.Driven(_Shown(course, self), rows_from_params(dict(course.params)))
+        shown: Any = _Shown(course, self)
+        self.driven: Any = methods.Driven(shown, rows_from_params(dict(course.params)))
         # no update has been made
         self.driven.counters = dict.fromkeys(methods.KEYS, 0.0)
         self.driven.recipe = _with_options(self.driven.recipe, course)

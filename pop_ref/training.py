@@ -392,10 +392,10 @@ def objective(
     if not recipe.pop_start_iter <= state.step < recipe.pop_stop_iter:
         return loss, v_image, np.zeros(len(gaussians))
     counts = view.dominant_counts
-    mask = importance_mask(counts + state.statistics.dominant_sum if recipe.pop_views == "window" else counts)
+    important = importance_mask(counts + state.statistics.dominant_sum if recipe.pop_views == "window" else counts)
     visible = view.splats.visible if recipe.pop_over == "visible" else None
-    loss += recipe.lambda_pop * pop_loss(gaussians.opacities, mask, visible)
-    return loss, v_image, pop_loss_vjp(gaussians.opacities, mask, recipe.lambda_pop, visible)
+    loss += recipe.lambda_pop * pop_loss(gaussians.opacities, important, visible)
+    return loss, v_image, pop_loss_vjp(gaussians.opacities, important, recipe.lambda_pop, visible)
 
 
 def control(

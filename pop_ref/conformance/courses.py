@@ -92,7 +92,12 @@ class Course:
     @functools.cached_property
     def _every_camera(self) -> list[Camera]:
         every = cameras(self.views + self.held_out, self.centred, self.size)
-        return [Camera(_single(c.viewmat), _single(c.K), c.width, c.height) for c in every]
+        # held-out ones see a corner of what the others see, four times as large
+        near = [np.diag([1.0, 1.0, 1.0]) if k < self.views else np.diag([4.0, 4.0, 1.0]) for k in range(len(every))]
+        return [
+            Camera(_single(c.viewmat), _single(larger @ c.K), c.width, c.height)
+            for c, larger in zip(every, near, strict=True)
+        ]
 
     def photo(self, index: int) -> np.ndarray:
         """Return the photograph of a view, held-out ones counted on. uint8 [H, W, 3]"""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -71,7 +71,7 @@ class Trainee:
 
     def whole_run(self, course: Course, folder: str) -> list[np.ndarray]:
         """Run to the end, with all that a run writes, and return the parameters."""
-        run = self._run(course, folder, max_steps=course.steps)
+        run = self._run(course, folder)
         run.run()
         return [_array(run.params[key]) for key in KEYS]
 

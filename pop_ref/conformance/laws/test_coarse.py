@@ -1,4 +1,4 @@
-"""Laws of coarse-to-fine trainings: how a photograph, its mask and its camera are shrunk, and which step sees which size.
+"""Laws of coarse-to-fine trainings: how photographs, masks and cameras are shrunk, and which step sees which size.
 
 A coarse pixel is the mean of the area that it covers, also where sizes do not divide.
 """

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import replace
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -51,7 +52,9 @@ def _assert_steps(backend, course):
 
 @law("training", "taken_steps")
 def test_every_step_is_the_oracles_under_every_setting(backend):
-    for course in (PRIOR, ENTROPY, MASKED):
+    # another Gaussian is important in either view
+    window = replace(PRIOR, order=(0, 1), seed=1216, count=9)
+    for course in (PRIOR, window, ENTROPY, MASKED):
         _assert_steps(backend, course)
 
 
@@ -71,13 +74,14 @@ def test_every_step_is_the_oracles_under_every_rule_of_updates(backend):
     assert "cloned" in _assert_steps(backend, rewound)
 
 
+LATER = ("3dgs", "taming", "speedy-splat")
+
+
 @law("training", "taken_steps")
 def test_every_step_of_every_method_is_the_oracles(backend):
-    for method, recipe in RECIPE_OF.items():
-        centred = recipe.profile.principal_point == "centred"
-        seed = 14 if method in ("3dgs", "taming", "speedy-splat") else 11
-        course = Course(method, order=(0, 1), seed=seed, centred=centred)
-        _assert_steps(backend, course)
+    # principal points lie off the centre, where Inria's code takes them to be
+    for method in RECIPE_OF:
+        _assert_steps(backend, Course(method, order=(0, 1), seed=14 if method in LATER else 11))
 
 
 # large and faint are told apart by far, so that rounding decides nothing
@@ -86,21 +90,21 @@ CHANGES = {
     "refine_stop_iter": 4,
     "refine_every": 2,
     "grow_grad2d": 1e-6,
-    "grow_scale3d": 0.25,
+    "grow_scale3d": 0.45,
     "prune_opa": 0.3,
     "prune_scale3d": 2.0,
     "prune_too_big_after": 0,
-    "reset_every": 3,
+    "reset_every": 2,
     "reset_opa": 0.2,
 }
 
 
 @law("training", "taken_steps")
 def test_every_step_is_the_oracles_while_the_gaussians_change(backend):
-    course = Course("gsplat", CHANGES, SHORT, ORDER, seed=173, scene_scale=2.0)
+    course = Course("gsplat", CHANGES, SHORT, ORDER[:4], seed=173, scene_scale=2.0)
     happened = _assert_steps(backend, course)
     blur = {**CHANGES, "reset_every": 0, "theta_blur": 0.05, "blur_start_iter": 0, "blur_stop_iter": 3}
-    blur |= {"prune_opa": 0.05, "final_prune_iter": 2, "final_prune_opa": 0.4}
+    blur |= {"prune_opa": 0.05, "final_prune_iter": 2, "final_prune_opa": 0.6}
     happened |= _assert_steps(backend, replace(course, method="pop", settings=blur, seed=34, order=ORDER[:3]))
     assert happened == {"cloned", "split", "pruned", "reset"}, f"{happened} only"
 
@@ -113,17 +117,18 @@ def test_every_step_is_the_oracles_with_terms_for_few_photographs(backend):
         _assert_steps(backend, course)
 
 
-# shares that are removed lie between scores that are far apart
+# scores of who goes and who stays are apart, and others would go by those of other photographs, bands or renders
 @law("training", "taken_steps")
 def test_what_a_method_prunes_by_is_of_all_photographs(backend):
-    common = {"centred": True, "views": 3, "held_out": 1}
-    growing = {"max_steps": 8, "sh_interval": 1}
-    speedy = {**STILL, "hard_prune_iters": (0, 1), "hard_prune_share": 0.34, "soft_prune_iters": ()}
+    speedy = {**STILL, "hard_prune_iters": (0, 1), "hard_prune_share": 0.4, "soft_prune_iters": ()}
     mini = {**STILL, "reinit_iters": (), "sample_iter": 90, "prune_iter": 1, "prune_mass": 0.25, "sh_start_iter": 0}
-    pup = {**STILL, "rounds_start_iter": 1, "round_steps": 3, "prune_shares": (0.34,), "score_divisor": 2}
-    for method, seed, settings in (("speedy-splat", 51, speedy), ("mini-splatting", 6, mini), ("pup", 10, pup)):
-        course = Course(method, settings, growing, (0, 1, 2), seed, **common)
-        assert "pruned" in _assert_steps(backend, course), method
+    pup = {**STILL, "rounds_start_iter": 1, "round_steps": 3, "prune_shares": (0.5,), "score_divisor": 2}
+    for method, seeds, settings in (("speedy-splat", (8, 34), speedy), ("mini-splatting", (6,), mini),
+                                    ("pup", (3, 24), pup)):  # fmt: skip
+        for seed in seeds:
+            course = Course(method, settings, SHORT, (0, 1), seed, count=9, views=3, held_out=1)
+            found = backend.stage("taken_steps")(course)
+            assert "pruned" in assert_steps(backend, course, found, least=0.0), method
 
 
 @law("training", "taken_steps")
@@ -218,8 +223,7 @@ def test_small_steps_on_one_photograph_bring_the_loss_down(backend):
 @law("training", "taken_steps")
 def test_the_scale_of_the_scene_is_the_unit_of_the_centres_rate_and_of_nothing_else(backend):
     one, four = (
-        backend.stage("taken_steps")(replace(PRIOR, scene_scale=scale, order=(0,)))[0]["params"]
-        for scale in (1.0, 4.0)
+        backend.stage("taken_steps")(replace(PRIOR, scene_scale=scale, order=(0,)))[0]["params"] for scale in (1.0, 4.0)
     )
     start = PRIOR.params["means"]
     for key in KEYS:
@@ -239,3 +243,14 @@ def test_bands_of_the_harmonics_move_from_their_own_step_on(backend):
         moved = [bool(np.any(after[:, a:b] != before[:, a:b])) for a, b in ((0, 3), (3, 8))]
         assert moved == [step >= 2, step >= 4], f"step {step} moves bands {moved}"
         before = after
+
+
+@law("training", "whole_run")
+def test_a_run_to_its_end_takes_the_steps_that_can_be_asked_for_one_by_one(backend):
+    settings = {**CHANGES, "reset_every": 0}
+    course = Course("pop", settings, {**SHORT, "max_steps": 4}, (0, 1, 0, 1), seed=34, held_out=1)
+    last = backend.stage("taken_steps")(course)[-1]["params"]
+    with TemporaryDirectory() as folder:
+        whole = backend.stage("whole_run")(course, folder)
+    for key, found in zip(KEYS, whole, strict=True):
+        assert_same_bits(key, found, last[key])
