@@ -8,9 +8,8 @@ scripts: no course of it may grow.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -20,56 +19,10 @@ from pop_ref.contributions import Contributions, contributions
 from pop_ref.density import Rows, rows_from_params
 from pop_ref.recipes import Recipe
 from pop_ref.records import Camera
-from pop_ref.scripted import Draws
+from pop_ref.scripted import Course
 from pop_ref.settings import LearningRates
 from pop_ref.splatting import project
 from pop_ref.tiles import tile_lists
-
-
-class Course(Protocol):
-    """A training on photographs.
-
-    Attributes:
-        method: one of `methods.RECIPE_OF`.
-        settings: of its strategy, by name; others are those of its recipe.
-        options: of the rest of its recipe, by the names of `Recipe`; others are its own.
-        order: the view of every step.
-        scene_scale: world units.
-        params: raw parameters to start from.
-        cameras: of the views that are trained on.
-        background: colour behind everything. [3]
-        antialiased: whether opacities make up for the low-pass.
-    """
-
-    method: str
-    settings: Mapping[str, Any]
-    options: Mapping[str, Any]
-    order: tuple[int, ...]
-    scene_scale: float
-    background: tuple[float, float, float]
-    antialiased: bool
-
-    @property
-    def params(self) -> Mapping[str, np.ndarray]: ...
-
-    @property
-    def cameras(self) -> list[Camera]: ...
-
-    def photo(self, index: int) -> np.ndarray:
-        """Return the photograph of a view. uint8 [H, W, 3]"""
-        ...
-
-    def mask(self, index: int) -> np.ndarray | None:
-        """Return which pixels of a view count, None for all. [H, W]"""
-        ...
-
-    def points(self, index: int) -> np.ndarray | None:
-        """Return the sparse points that a photograph sees, None where none are known. [P, 3]"""
-        ...
-
-    def draws(self) -> Draws:
-        """Return the random numbers of the training."""
-        ...
 
 
 class Trained:
