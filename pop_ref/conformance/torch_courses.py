@@ -49,7 +49,7 @@ class Trainee:
         run = self._run(course, exposure=True, appearance_lr=rates)
         found: list[np.ndarray] = []
         for step in range(course.steps):
-            run.take_steps(step + 1)
+            self._step(run, step)
             found.append(_array(run.appearance.params["exposures"]))
         return found
 
@@ -75,8 +75,14 @@ class Trainee:
         run.run()
         return [_array(run.params[key]) for key in KEYS]
 
+    def _step(self, run: Any, step: int) -> Any:
+        # with the threads that a run has, on whose number the order of sums may depend
+        environment = importlib.import_module(f"{self._package}.train.environment")
+        with environment.reproducible(run.config.threads):
+            return run.take_steps(step + 1)
+
     def _taken(self, run: Any, step: int) -> dict[str, Any]:
-        segment = run.take_steps(step + 1)
+        segment = self._step(run, step)
         (stats,), (names,) = segment.stats, segment.views
         views = [int(name.removesuffix(".png")) for name in names.split(", ")]
         moments = {key: run.optimizers[key].state[run.params[key]] for key in KEYS}
