@@ -124,7 +124,7 @@ def scripted_steps(script: Script, rows: Rows) -> list[dict[str, Any]]:
         >>> [step["done"] for step in scripted_steps(script, script.rows())]
         [{}, {'reset': 1}]
     """
-    return _Driven(script, rows).steps()
+    return Driven(script, rows).steps()
 
 
 def method_settings(method: str) -> dict[str, Any]:
@@ -152,7 +152,15 @@ def method_settings(method: str) -> dict[str, Any]:
     return {**kept, **{f.name: getattr(recipe, f.name) for f in fields(PopTerm)}, **screen, "absgrad": False}
 
 
-class _Driven:
+class Driven:
+    """A method on its way through a script.
+
+    Attributes:
+        rows: the Gaussians.
+        recipe: what is minimised.
+        window, waiting, counters: see `training.Training`, and how many updates each parameter has had.
+    """
+
     def __init__(self, script: Script, rows: Rows) -> None:
         self.script, self.rows = script, rows
         given = {name: value for name, value in script.settings.items() if name in {f.name for f in fields(Extras)}}
@@ -172,12 +180,13 @@ class _Driven:
         return len(self.rows)
 
     def steps(self) -> list[dict[str, Any]]:
+        """Take every step of the script; see `scripted_steps`."""
         found: list[dict[str, Any]] = []
         for step in self.script.steps:
             view = self.script.view(step, self.n)
             term = self._update(step, view)
             self._collect(step, view)
-            done = self._change(step)
+            done = self.change(step)
             found.append(
                 {
                     "params": dict(self.rows.params),
@@ -229,8 +238,8 @@ class _Driven:
         extents = np.where(view.visible, np.max(view.radii, axis=2), 0) / max(script.width, script.height)
         self.extents = np.maximum(self.extents, np.max(extents, axis=0, initial=0.0))
 
-    def _change(self, step: int) -> dict[str, int]:
-        """Do what is due, and return what was done by its kind."""
+    def change(self, step: int) -> dict[str, int]:
+        """Do what is due after a step, and return what was done by its kind."""
         method, config = self.script.method, self.recipe.density
         if step in self.recipe.adam_restarts:
             return self._round(step) if method == "pup" else self._mini_splatting(step)

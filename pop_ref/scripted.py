@@ -1,6 +1,7 @@
 """What a training is shown by whoever writes it down: renders, passes over views, random numbers.
 
 `methods.scripted_steps` takes a method through such a script; `pop_ref.conformance.strategy_script` writes some.
+`courses.taken_steps` takes one through a course, where photographs are what it is shown.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from pop_ref.contributions import Contributions
+from pop_ref.records import Camera
 from pop_ref.settings import LearningRates
 
 
@@ -127,4 +129,52 @@ class Script(Protocol):
 
     def sh_degree(self, step: int) -> int:
         """Return the bands that are drawn at a step."""
+        ...
+
+
+class Course(Protocol):
+    """A training on photographs.
+
+    Attributes:
+        method: one of RECIPE_OF.
+        settings: of its strategy, by name; others are those of its recipe.
+        options: of the rest of its recipe, by the names of `Recipe`; others are its own.
+        order: the view of every step.
+        scene_scale: world units.
+        background: colour behind everything. [3]
+        antialiased: whether opacities make up for the low-pass.
+    """
+
+    method: str
+    settings: Mapping[str, Any]
+    options: Mapping[str, Any]
+    order: tuple[int, ...]
+    scene_scale: float
+    background: tuple[float, float, float]
+    antialiased: bool
+
+    @property
+    def params(self) -> Mapping[str, np.ndarray]:
+        """Return raw parameters to start from."""
+        ...
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """Return the cameras of the views that are trained on."""
+        ...
+
+    def photo(self, index: int) -> np.ndarray:
+        """Return the photograph of a view. uint8 [H, W, 3]"""
+        ...
+
+    def mask(self, index: int) -> np.ndarray | None:
+        """Return which pixels of a view count, None for all. [H, W]"""
+        ...
+
+    def points(self, index: int) -> np.ndarray | None:
+        """Return the sparse points that a photograph sees, None where none are known. [P, 3]"""
+        ...
+
+    def draws(self) -> Draws:
+        """Return the random numbers of the training."""
         ...

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from pop_ref import losses
-from pop_ref._shapes import Float64
+from pop_ref._shapes import Bool, Float64
 from pop_ref.activations import (
     opacities_from_logits,
     opacities_from_logits_vjp,
@@ -97,6 +97,96 @@ def start(params: Mapping[str, np.ndarray]) -> Training:
     return Training(rows, zero_statistics(len(rows)))
 
 
+@dataclass(frozen=True)
+class Look:
+    """What a step learns of one view before it moves anything.
+
+    Attributes:
+        loss: with all its terms.
+        grads: of the raw parameters, shapes as these.
+        v_image: cotangent of the render; with the depth of sparse points its last channel is depth. [H, W, D]
+        v_means2d: gradient by the screen centres, per px. [N, 2]
+        visible: whom the view shows. [N]
+        dominant_counts: pixels that each dominates, of those that count. [N]
+    """
+
+    loss: float
+    grads: dict[str, np.ndarray]
+    v_image: np.ndarray
+    v_means2d: np.ndarray
+    visible: np.ndarray
+    dominant_counts: np.ndarray
+
+
+def look(
+    state: Training,
+    camera: Camera,
+    target: Float64[np.ndarray, "H W 3"],
+    scene_scale: float,
+    recipe: Recipe = RECIPES["POP"],
+    points: Float64[np.ndarray, "P 3"] | None = None,
+    mask: Bool[np.ndarray, "H W"] | None = None,
+    background: Float64[np.ndarray, " 3"] | None = None,
+    antialiased: bool = False,
+) -> Look:
+    """Render a view, compare it with its photograph, and go back to the gradients of the raw parameters.
+
+    Source: POP paper, section 3; Kerbl et al. 2023, algorithm 1.
+    Departs: nothing.
+
+    Args:
+        state: before the step.
+        camera: of the view.
+        target: the photograph.
+        scene_scale: world units.
+        recipe: what is minimised.
+        points: sparse points that the photograph sees, world, for `Recipe.depth_lambda`; None where none are known.
+        mask: True for the pixels that count, or None.
+        background: colour behind everything; None is black.
+        antialiased: whether opacities make up for the low-pass.
+
+    Returns:
+        The loss, its gradients, and what density control collects.
+
+    Example:
+        >>> params = {"means": np.array([[0.0, 0.0, 4.0]]), "quats": np.array([[1.0, 0.0, 0.0, 0.0]]),
+        ...           "scales": np.zeros((1, 3)), "opacities": np.zeros(1), "sh0": np.zeros((1, 1, 3))}
+        >>> camera = Camera(np.eye(4), np.array([[16.0, 0.0, 8.0], [0.0, 16.0, 8.0], [0.0, 0.0, 1.0]]), 16, 16)
+        >>> seen = look(start(params), camera, np.ones((16, 16, 3)), 1.0)
+        >>> seen.visible.tolist(), bool(seen.grads["opacities"][0] < 0.0)
+        ([True], True)
+    """
+    rows, step = state.rows, state.step
+    gaussians = gaussians_from_params(rows.params)
+    degree = sh_degree_at(step, recipe.sh_interval, isqrt(gaussians.sh.shape[1]) - 1, recipe.updates.sh_start_iter)
+    deep = points is not None and recipe.depth_lambda != 0.0
+    mode = "RGB+ED" if deep else "RGB"
+    options: dict[str, Any] = {"sh_degree": degree, "profile": recipe.profile, "render_mode": mode}
+    options |= {"background": background, "antialiased": antialiased}
+    view = render(gaussians, camera, **options)
+    # the dominant counts of this very forward pass say what is important (A27)
+    counts = view.dominant_counts if mask is None else _counts_inside(view, mask)
+    colored = replace(view, image=view.image[..., :3], dominant_counts=counts)
+    loss, v_image, v_opacities = objective(colored, gaussians, target, state, recipe, mask)
+    if points is not None and deep:
+        samples, weight = depth_samples(points, camera, mask), recipe.depth_lambda * scene_scale
+        loss += weight * sparse_depth_loss(view.image[..., 3], *samples)
+        v_depth = sparse_depth_loss_vjp(view.image[..., 3], *samples, weight)
+        v_image = np.concatenate((v_image, v_depth[..., None]), axis=2)
+    gradients = render_vjp(gaussians, camera, v_image, **options)
+    grads = params_vjp(rows.params, gradients, v_opacities)
+    loss += _add_regularizers(grads, gaussians, rows.params, recipe)
+    if recipe.lambda_entropy != 0.0 and recipe.pop_start_iter <= step < recipe.pop_stop_iter:
+        loss += recipe.lambda_entropy * opacity_entropy(rows.params["opacities"])
+        grads["opacities"] += opacity_entropy_vjp(rows.params["opacities"], recipe.lambda_entropy)
+    return Look(loss, grads, v_image, gradients.means2d, view.splats.visible, counts)
+
+
+def _counts_inside(view: Render, mask: np.ndarray) -> np.ndarray:
+    ids = view.dominant_ids[mask]
+    return np.bincount(ids[ids >= 0], minlength=len(view.dominant_counts)).astype(np.int64)
+
+
 def train_step(
     state: Training,
     camera: Camera,
@@ -105,6 +195,9 @@ def train_step(
     normals: Callable[[int], np.ndarray],
     recipe: Recipe = RECIPES["POP"],
     points: Float64[np.ndarray, "P 3"] | None = None,
+    mask: Bool[np.ndarray, "H W"] | None = None,
+    background: Float64[np.ndarray, " 3"] | None = None,
+    antialiased: bool = False,
 ) -> tuple[Training, float]:
     """Take one step with one view.
 
@@ -120,6 +213,9 @@ def train_step(
         normals: given n, standard normal draws [2, n, 3], for instance `lambda n: rng.standard_normal((2, n, 3))`.
         recipe: what is minimised.
         points: sparse points that the photograph sees, world, for `Recipe.depth_lambda`; None where none are known.
+        mask: True for the pixels that count, or None.
+        background: colour behind everything; None is black.
+        antialiased: whether opacities make up for the low-pass.
 
     Returns:
         The state after the step; the loss before it.
@@ -133,34 +229,16 @@ def train_step(
         >>> state.step, after < before
         (2, True)
     """
-    rows, step = state.rows, state.step
-    gaussians = gaussians_from_params(rows.params)
-    degree = sh_degree_at(step, recipe.sh_interval, isqrt(gaussians.sh.shape[1]) - 1, recipe.updates.sh_start_iter)
-    deep = points is not None and recipe.depth_lambda != 0.0
-    mode = "RGB+ED" if deep else "RGB"
-    options: dict[str, Any] = {"sh_degree": degree, "profile": recipe.profile, "render_mode": mode}
-    view = render(gaussians, camera, **options)
-    # the dominant counts of this very forward pass say what is important (A27)
-    colored = replace(view, image=view.image[..., :3])
-    loss, v_image, v_opacities = objective(colored, gaussians, target, state, recipe)
-    if points is not None and deep:
-        samples, weight = depth_samples(points, camera), recipe.depth_lambda * scene_scale
-        loss += weight * sparse_depth_loss(view.image[..., 3], *samples)
-        v_depth = sparse_depth_loss_vjp(view.image[..., 3], *samples, weight)
-        v_image = np.concatenate((v_image, v_depth[..., None]), axis=2)
-    gradients = render_vjp(gaussians, camera, v_image, **options)
-    grads = params_vjp(rows.params, gradients, v_opacities)
-    loss += _add_regularizers(grads, gaussians, rows.params, recipe)
-    if recipe.lambda_entropy != 0.0 and recipe.pop_start_iter <= step < recipe.pop_stop_iter:
-        loss += recipe.lambda_entropy * opacity_entropy(rows.params["opacities"])
-        grads["opacities"] += opacity_entropy_vjp(rows.params["opacities"], recipe.lambda_entropy)
-    rows, waiting = update(rows, grads, state, scene_scale, recipe)
-    seen = (gradients.means2d, view.splats.visible, view.dominant_counts, camera.width, camera.height)
-    statistics = accumulate(state.statistics, *seen, recipe.density)
+    step = state.step
+    found = look(state, camera, target, scene_scale, recipe, points, mask, background, antialiased)
+    rows, waiting = update(state.rows, found.grads, state, scene_scale, recipe)
+    seen = (found.v_means2d, found.visible, found.dominant_counts, camera.width, camera.height)
+    kept = None if mask is None else int(np.sum(mask))
+    statistics = accumulate(state.statistics, *seen, recipe.density, kept)
     rows, statistics = control(rows, statistics, scene_scale, step, normals, recipe.density)
     # rows that wait are not those of Gaussians that have been edited
     waiting = {} if densifies_at(step, recipe.density) else waiting
-    return Training(rows, statistics, step + 1, waiting), loss
+    return Training(rows, statistics, step + 1, waiting), found.loss
 
 
 def _add_regularizers(
@@ -278,7 +356,12 @@ def params_vjp(
 
 
 def objective(
-    view: Render, gaussians: Gaussians, target: Float64[np.ndarray, "H W 3"], state: Training, recipe: Recipe
+    view: Render,
+    gaussians: Gaussians,
+    target: Float64[np.ndarray, "H W 3"],
+    state: Training,
+    recipe: Recipe,
+    mask: Bool[np.ndarray, "H W"] | None = None,
 ) -> tuple[float, Float64[np.ndarray, "H W 3"], Float64[np.ndarray, " N"]]:
     """Compare a render with its photograph and opacities with their poles: eq. 9, or eq. 2.
 
@@ -291,6 +374,7 @@ def objective(
         target: the photograph.
         state: tells the step, and the window's dominant counts.
         recipe: the terms and their weights.
+        mask: True for the pixels that count, or None; the render's dominant counts are of these.
 
     Returns:
         The loss; its cotangents of the image and, through the POP term alone, of the opacities.
@@ -304,16 +388,16 @@ def objective(
         (0.0005, [-0.001])
     """
     goal = recipe.at(state.step, recipe.l2_stop_iter)
-    options = (goal.lambda_ssim, goal.padding, None, goal.d_ssim_halved, goal.pixel_scale)
+    options = (goal.lambda_ssim, goal.padding, mask, goal.d_ssim_halved, goal.pixel_scale)
     value, value_vjp = _PHOTOMETRIC[goal.pixelwise]
     loss, v_image = value(view.image, target, *options), value_vjp(view.image, target, 1.0, *options)
     if not recipe.pop_start_iter <= state.step < recipe.pop_stop_iter:
         return loss, v_image, np.zeros(len(gaussians))
     counts = view.dominant_counts
-    mask = importance_mask(counts + state.statistics.dominant_sum if recipe.pop_views == "window" else counts)
+    important = importance_mask(counts + state.statistics.dominant_sum if recipe.pop_views == "window" else counts)
     visible = view.splats.visible if recipe.pop_over == "visible" else None
-    loss += recipe.lambda_pop * pop_loss(gaussians.opacities, mask, visible)
-    return loss, v_image, pop_loss_vjp(gaussians.opacities, mask, recipe.lambda_pop, visible)
+    loss += recipe.lambda_pop * pop_loss(gaussians.opacities, important, visible)
+    return loss, v_image, pop_loss_vjp(gaussians.opacities, important, recipe.lambda_pop, visible)
 
 
 def control(

@@ -65,6 +65,7 @@ STAGE_MODULES = (
     "optimizer",
     "training",
     "methods",
+    "courses",
     "contributions",
     "sensitivity",
     "fisher",

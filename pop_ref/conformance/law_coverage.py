@@ -30,7 +30,6 @@ PACKAGE: Final = Path(__file__).parents[1]
 MODULES: Final = tuple(sorted({*STAGE_MODULES, "render", "splatting", "depth", "margins"}))
 # by function: why no law reaches lines of it; a statement that refuses arguments needs none
 REASONS: Final[dict[str, str]] = {
-    "training.py": "the oracle's own trainer: laws drive strategies by `scripted_steps`, tests hold trainers to this",
     "taming.py: taming_scores": "sums what laws of single views judge",
     "margins.py: nearest": "read by reports of failures",
     "margins.py: near_threshold": "read by reports of failures",

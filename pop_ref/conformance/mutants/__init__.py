@@ -26,12 +26,13 @@ from pop_ref.conformance.mutants.trainers import TRAINERS, TRAINERS_BOXES
 from pop_ref.conformance.mutants.training import TRAINING
 from pop_ref.conformance.mutants.unseen import UNSEEN
 from pop_ref.conformance.mutants.unseen_boxes import UNSEEN_BOXES
+from pop_ref.conformance.mutants.whole_steps import WHOLE_STEPS, WHOLE_STEPS_PROGRAM
 
 # of the oracle, and of the program that trains
 _BLIND = (*BLIND, *BLIND_SECOND, *BLIND_THIRD, *BLIND_THIRD_MORE)
-MUTANTS = (*GEOMETRY, *PIXELS, *TRAINING, *BASELINES, *METHOD_MUTANTS, *_BLIND)
+MUTANTS = (*GEOMETRY, *PIXELS, *TRAINING, *BASELINES, *METHOD_MUTANTS, *_BLIND, *WHOLE_STEPS)
 _BLIND_PROGRAM = (*BLIND_PROGRAM, *BLIND_SECOND_PROGRAM, *BLIND_THIRD_PROGRAM, *BLIND_THIRD_MORE_PROGRAM)
-PROGRAM = (*LINES, *TRAINERS, *COLLECTED, *STRANGERS, *UNSEEN, *_BLIND_PROGRAM)
+PROGRAM = (*LINES, *TRAINERS, *COLLECTED, *STRANGERS, *UNSEEN, *_BLIND_PROGRAM, *WHOLE_STEPS_PROGRAM)
 # behind gsplat's signature: one argument broken, several together; autograd, memory, size
 BLACK_BOXES = (
     *(*SINGLE, *COMBINED, *SEAMS, *TRAINERS_BOXES, *STRANGERS_BOXES, *UNSEEN_BOXES),

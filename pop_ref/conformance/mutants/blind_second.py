@@ -120,8 +120,8 @@ _ORACLE: Final = (
         "depth_weighed_without_the_scene",
         "the weight of sparse depth is not multiplied by the scene's scale",
         "training.py",
-        "depth_samples(points, camera), recipe.depth_lambda * scene_scale",
-        "depth_samples(points, camera), recipe.depth_lambda",
+        "depth_samples(points, camera, mask), recipe.depth_lambda * scene_scale",
+        "depth_samples(points, camera, mask), recipe.depth_lambda",
         "test_few_photographs:the_depth_of_sparse_points_weighs_in_units_of_the_scene",
     ),
     (

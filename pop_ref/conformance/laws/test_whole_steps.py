@@ -1,0 +1,256 @@
+"""Laws of whole steps, as a user's run takes them on photographs: every step is the oracle's from the same Gaussians.
+
+The first laws compare parameters, moments and losses with the oracle's after every step, under each setting, rule and
+method. The others say what any training does, and need no oracle.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from pop_ref.conformance.assertions import assert_close, assert_same_bits
+from pop_ref.conformance.courses import Course
+from pop_ref.conformance.judged_steps import assert_steps
+from pop_ref.conformance.law import law
+from pop_ref.courses import Trained
+from pop_ref.methods import KEYS, RECIPE_OF
+from pop_ref.settings import LearningRates
+
+# of band 0
+SH_C0 = 0.28209479177387814
+# no step of these changes the Gaussians
+STILL = {"refine_start_iter": 100, "reset_every": 0}
+SHORT = {"max_steps": 8, "sh_interval": 2}
+# so slow that what rounding does not decide at the first step it decides at no later one
+SLOW = LearningRates(means=2e-5, scales=5e-4, quats=1e-4, opacities=5e-3, sh0=2.5e-4, sh_rest=1.25e-5)
+FIRST = {"pop_stop_iter": 3, "lambda_pop": 0.5, "pop_views": "window"}
+SECOND = {"pop_start_iter": 1, "pop_stop_iter": 3, "lambda_pop": 0.0, "lambda_entropy": 0.5}
+HALVED = {"lambda_ssim": 0.25, "d_ssim_halved": True, "padding": "same", "l2_stop_iter": 3}
+BEHIND = (0.25, 0.5, 0.75)
+ORDER = (0, 1, 0, 1, 0)
+
+PRIOR = Course("pop", {**STILL, **FIRST}, {**SHORT, **HALVED, "lr": SLOW}, ORDER, seed=125, scene_scale=4.0)
+ENTROPY = Course("pop", {**STILL, **SECOND}, {**SHORT, "pixel_scale": 0.25, "lr": SLOW}, ORDER, 16, antialiased=True)
+MASKED = Course(
+    "pop",
+    {**STILL, "lambda_pop": 0.5, "pop_over": "visible"},
+    {**SHORT, "pixelwise": "l1", "lambda_ssim": 0.25},
+    ORDER[:3],
+    seed=195,
+    masked=True,
+    background=BEHIND,
+)
+
+
+def _assert_steps(backend, course):
+    return assert_steps(backend, course, backend.stage("taken_steps")(course))
+
+
+@law("training", "taken_steps")
+def test_every_step_is_the_oracles_under_every_setting(backend):
+    # another Gaussian is important in either view
+    window = replace(PRIOR, order=(0, 1), seed=1216, count=9)
+    for course in (PRIOR, window, ENTROPY, MASKED):
+        _assert_steps(backend, course)
+
+
+# every parameter waits, rests, or goes back at a step of its own
+WAITING = {"sh_start_iter": 1, "sh_rest_every": 3, "opacities_stop_iter": 3}
+REWOUND = {"means_rewind_iter": 3, "means_rewind_to": 1, "edits_replace_update": True}
+FALLING = replace(SLOW, others_decay=0.125)
+
+
+@law("training", "taken_steps")
+def test_every_step_is_the_oracles_under_every_rule_of_updates(backend):
+    grows = {"refine_start_iter": 1, "refine_every": 2, "grow_grad2d": 1e-6, "grow_scale3d": 100.0, "prune_opa": 0.0}
+    rates = {"max_steps": 8, "sh_interval": 1, "lr": SLOW}
+    waiting = Course("pop", {**STILL, **WAITING}, rates, (*ORDER, 1), seed=126)
+    rewound = Course("pop", {**grows, **REWOUND}, {**SHORT, "lr": FALLING}, ORDER[:4], seed=40)
+    _assert_steps(backend, waiting)
+    assert "cloned" in _assert_steps(backend, rewound)
+
+
+LATER = ("3dgs", "taming", "speedy-splat")
+
+
+@law("training", "taken_steps")
+def test_every_step_of_every_method_is_the_oracles(backend):
+    # principal points lie off the centre, where Inria's code takes them to be
+    for method in RECIPE_OF:
+        _assert_steps(backend, Course(method, order=(0, 1), seed=14 if method in LATER else 11))
+
+
+# large and faint are told apart by far, so that rounding decides nothing
+CHANGES = {
+    "refine_start_iter": 0,
+    "refine_stop_iter": 4,
+    "refine_every": 2,
+    "grow_grad2d": 1e-6,
+    "grow_scale3d": 0.45,
+    "prune_opa": 0.3,
+    "prune_scale3d": 2.0,
+    "prune_too_big_after": 0,
+    "reset_every": 2,
+    "reset_opa": 0.2,
+}
+
+
+@law("training", "taken_steps")
+def test_every_step_is_the_oracles_while_the_gaussians_change(backend):
+    course = Course("gsplat", CHANGES, SHORT, ORDER[:4], seed=173, scene_scale=2.0)
+    happened = _assert_steps(backend, course)
+    blur = {**CHANGES, "reset_every": 0, "theta_blur": 0.05, "blur_start_iter": 0, "blur_stop_iter": 3}
+    blur |= {"prune_opa": 0.05, "final_prune_iter": 2, "final_prune_opa": 0.6}
+    happened |= _assert_steps(backend, replace(course, method="pop", settings=blur, seed=34, order=ORDER[:3]))
+    assert happened == {"cloned", "split", "pruned", "reset"}, f"{happened} only"
+
+
+@law("training", "taken_steps")
+def test_every_step_is_the_oracles_with_terms_for_few_photographs(backend):
+    weights = {"depth_lambda": 0.5, "opacity_reg": 0.25, "scale_reg": 0.125}
+    for masked, scale in ((False, 4.0), (True, 0.5)):
+        course = Course("pop", STILL, {**SHORT, **weights}, ORDER[:2], 34, sparse=18, masked=masked, scene_scale=scale)
+        _assert_steps(backend, course)
+
+
+# scores of who goes and who stays are apart, and others would go by those of other photographs, bands or renders
+@law("training", "taken_steps")
+def test_what_a_method_prunes_by_is_of_all_photographs(backend):
+    speedy = {**STILL, "hard_prune_iters": (0, 1), "hard_prune_share": 0.4, "soft_prune_iters": ()}
+    mini = {**STILL, "reinit_iters": (), "sample_iter": 90, "prune_iter": 1, "prune_mass": 0.25, "sh_start_iter": 0}
+    pup = {**STILL, "rounds_start_iter": 1, "round_steps": 3, "prune_shares": (0.5,), "score_divisor": 2}
+    for method, seeds, settings in (("speedy-splat", (8, 34), speedy), ("mini-splatting", (6,), mini),
+                                    ("pup", (3, 24), pup)):  # fmt: skip
+        for seed in seeds:
+            course = Course(method, settings, SHORT, (0, 1), seed, count=9, views=3, held_out=1)
+            found = backend.stage("taken_steps")(course)
+            assert "pruned" in assert_steps(backend, course, found, least=0.0), method
+
+
+@law("training", "taken_steps")
+def test_gaussians_begin_anew_on_the_photographs_and_inside_their_masks(backend):
+    settings = {**STILL, "reinit_iters": (1,), "reinit_points": 60, "sample_iter": 90, "prune_iter": 91}
+    course = Course("mini-splatting", settings, SHORT, (0, 1), seed=6, centred=True, masked=True)
+    params = backend.stage("taken_steps")(course)[-1]["params"]
+    assert len(params["means"]) > course.count
+    colors = 255.0 * (0.5 + SH_C0 * params["sh0"][:, 0])
+    shown = np.zeros(len(colors), dtype=bool)
+    for view, camera in enumerate(course.cameras):
+        seen = params["means"] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+        at = (seen[:, :2] / seen[:, 2:]) @ camera.K[:2, :2].T + camera.K[:2, 2] - 0.5
+        pixel = np.clip(np.round(at).astype(int), 0, np.array(course.size) - 1)
+        rows, columns = pixel[:, 1], pixel[:, 0]
+        close = np.all(np.abs(at - pixel) < 0.01, axis=1) & course.mask(view)[rows, columns]
+        shown |= close & np.all(np.abs(colors - course.photo(view)[rows, columns]) < 0.01, axis=1)
+    assert np.all(shown), f"Gaussian {np.argmin(shown)} lies on no pixel that counts, or has not that pixel's colour"
+
+
+@law("training", "batched_steps")
+def test_a_step_of_several_views_has_their_mean_loss_and_gradient(backend):
+    course = replace(PRIOR, batch=2, order=(0, 1))
+    (found,) = backend.stage("batched_steps")(course)
+    assert sorted(found["view"]) == [0, 1]
+    looks = [Trained(course).look(view) for view in (0, 1)]
+    loss = 0.5 * (looks[0].loss + looks[1].loss)
+    assert_close("steps.batch", found["loss"], loss, loss, backend.dtype, against_oracle=True)
+    for key in KEYS:
+        grads = [look.grads[key] for look in looks]
+        size = 0.05 * (np.max(np.abs(grads[0]), initial=0.0) + np.max(np.abs(grads[1]), initial=0.0))
+        expected = 0.05 * (grads[0] + grads[1])
+        assert_close("steps.batch", found["m"][key], expected, size, backend.dtype, against_oracle=True)
+
+
+@law("training", "learned_exposures")
+def test_an_exposure_learns_to_be_that_of_its_photograph(backend):
+    # of bright noise behind a dark render every entry wants to grow, and of two exposures none is the first
+    course = _Bright("pop", STILL, SHORT, (0,), seed=22, background=(0.05, 0.05, 0.05))
+    rate = 2.0**-6
+    (exposures,) = backend.stage("learned_exposures")(course, rate)
+    seen = int(exposures[1, 0, 3] > exposures[0, 0, 3])
+    assert_close("steps.still", exposures[seen] - exposures[1 - seen], np.full((3, 4), rate), 1.0, backend.dtype)
+
+
+class _Bright(Course):
+    """A course of white photographs."""
+
+    def photo(self, index):
+        return np.full_like(super().photo(index), 255)
+
+
+NONE = LearningRates(means=0.0, scales=0.0, quats=0.0, opacities=0.0, sh0=0.0, sh_rest=0.0)
+
+
+@functools.cache
+def _alike(rate):
+    """Return a course of two photographs that are one and the same."""
+    rates = LearningRates(means=rate, scales=rate, quats=rate, opacities=rate, sh0=rate, sh_rest=rate)
+    return _Alike("pop", {**STILL, "lambda_pop": 0.0}, {"max_steps": 8, "lr": rates}, (0, 1, 0, 1), seed=22)
+
+
+class _Alike(Course):
+    """A course of one photograph that is there twice."""
+
+    @property
+    def cameras(self):
+        return super()._every_camera[:1] * 2
+
+    def photo(self, index):
+        return super().photo(0)
+
+
+@law("training", "taken_steps")
+def test_at_rates_of_zero_every_look_at_a_photograph_costs_the_same(backend):
+    course = replace(PRIOR, settings={**STILL, "lambda_pop": 0.0}, options={"max_steps": 8, "lr": NONE}, order=ORDER)
+    costs = {}
+    for record in backend.stage("taken_steps")(course):
+        loss = costs.setdefault(record["view"], record["loss"])
+        # a step that is recorded counts what its pixels blend, and may sum in another order
+        assert_close("steps.still", record["loss"], loss, loss, backend.dtype)
+        for key, value in course.params.items():
+            assert_same_bits(key, record["params"][key], value)
+
+
+@law("training", "taken_steps")
+def test_small_steps_on_one_photograph_bring_the_loss_down(backend):
+    losses = [record["loss"] for record in backend.stage("taken_steps")(_alike(1e-3))]
+    assert losses[0] > losses[1] > losses[2] > losses[3], f"the losses are {losses}"
+
+
+@law("training", "taken_steps")
+def test_the_scale_of_the_scene_is_the_unit_of_the_centres_rate_and_of_nothing_else(backend):
+    one, four = (
+        backend.stage("taken_steps")(replace(PRIOR, scene_scale=scale, order=(0,)))[0]["params"] for scale in (1.0, 4.0)
+    )
+    start = PRIOR.params["means"]
+    for key in KEYS:
+        if key != "means":
+            assert_same_bits(key, four[key], one[key])
+    assert np.any(one["means"] != start)
+    size = np.abs(start) + 1.0
+    assert_close("steps.still", four["means"] - start, 4.0 * (one["means"] - start), size, backend.dtype)
+
+
+@law("training", "taken_steps")
+def test_bands_of_the_harmonics_move_from_their_own_step_on(backend):
+    course = replace(PRIOR, options={"max_steps": 8, "sh_interval": 2}, order=(0, 1, 0, 1, 0))
+    before = course.params["shN"]
+    for step, record in enumerate(backend.stage("taken_steps")(course)):
+        after = record["params"]["shN"]
+        moved = [bool(np.any(after[:, a:b] != before[:, a:b])) for a, b in ((0, 3), (3, 8))]
+        assert moved == [step >= 2, step >= 4], f"step {step} moves bands {moved}"
+        before = after
+
+
+@law("training", "whole_run")
+def test_a_run_to_its_end_takes_the_steps_that_can_be_asked_for_one_by_one(backend):
+    settings = {**CHANGES, "reset_every": 0}
+    course = Course("pop", settings, {**SHORT, "max_steps": 4}, (0, 1, 0, 1), seed=34, held_out=1)
+    last = backend.stage("taken_steps")(course)[-1]["params"]
+    with TemporaryDirectory() as folder:
+        whole = backend.stage("whole_run")(course, folder)
+    for key, found in zip(KEYS, whole, strict=True):
+        assert_same_bits(key, found, last[key])
