@@ -94,7 +94,8 @@ PRESETS: Final = {"paper": 1.0, "quick": QUICK_SCALER, AUTOMATIC: 1.0}
 # longer, never below the published ones, and they fall by less
 QUICK_RATES: Final = {"means": 12.0, "scales": 6.0, "quats": 6.0, "sh0": 8.0, "sh_rest": 12.0}
 QUICK_DECAY: Final = 0.1
-# of so few steps the usual 0.999 remembers nearly all, also what gradients were when photographs were coarse
+# Adam's second moments: the usual 0.999 remembers most of so few steps, also those of coarse photographs. In a longer
+# schedule of "auto" the memory is longer by as much, up to the usual one
 QUICK_BETA2: Final = 0.99
 # steps of the full schedule until which "quick" sees the photographs at a quarter, and at a half, of their size
 QUICK_COARSE: Final = (5_000, 10_000)

@@ -39,11 +39,12 @@ def _shifted(right: float, down: float) -> Mistake:
 
 def _pixel_vjp(
     tail: bool = True, background_seen: bool = True, dims: bool = True, forwards: bool = False, early: bool = False,
-    lit: bool = True, share: bool = True,
+    lit: bool = True, share: bool = True, color_lit: bool = True, absolute: bool = True,
 ) -> Callable[..., Any]:  # fmt: skip
     """Make `composite_pixel_vjp` without what is behind a splat, without the background, with splats that do not dim
     what is behind them, from front to back, with what is behind a splat updated before it is read, without the light
-    that reaches a splat, or with splats behind that count whole and not by their alpha."""
+    that reaches a splat, with splats behind that count whole and not by their alpha, without that light in the colours'
+    cotangent, or with signs in the sum of absolute values."""
 
     def made(o: Oracle, pixel: Any, rows: Any, px: float, py: float, background: Any, v_color: Any, v_T_final: float,
              totals: Any, *profile: Any) -> None:  # fmt: skip
@@ -53,7 +54,7 @@ def _pixel_vjp(
         blended = list(zip(pixel.ids, pixel.alphas, pixel.transmittances, strict=True))
         for i, alpha, T in blended if forwards else reversed(blended):
             color_dot_grad = float(np.dot(rows.colors[i], v_color))
-            totals.v_colors[i] += T * alpha * np.array(v_color)
+            totals.v_colors[i] += (T if color_lit else 1.0) * alpha * np.array(v_color)
             before = behind
             own = color_dot_grad * (alpha if share else 1.0)
             behind += own - (alpha * behind if dims else 0.0) if tail else 0.0
@@ -63,7 +64,7 @@ def _pixel_vjp(
             v_mean2d, v_conic = o["sigma_at_pixel_vjp"](rows.means2d[i], rows.conics[i], px, py, v_sigma)
             totals.v_opacities[i] += v_opacity
             totals.v_means2d[i] += v_mean2d
-            totals.v_means2d_abs[i] += np.abs(v_mean2d)
+            totals.v_means2d_abs[i] += np.abs(v_mean2d) if absolute else v_mean2d
             totals.v_conics[i] += v_conic
 
     return made
@@ -118,6 +119,20 @@ def _pixel(o: Oracle, ids: Any, rows: Any, px: float, py: float, background: Any
 
 
 _HALF: Final = "The exponent of a Gaussian is half of d^T Q d: exp(-x^2 / 2) has a 2 under its square."
+
+
+def _dominant(better: Callable[[float, float], bool], by_place: bool = False) -> Callable[..., Any]:
+    """Make `dominant_id` by another comparison, or with the winner's place in the list for its id."""
+
+    def made(o: Oracle, ids: Any, weights: Any) -> int:
+        best, best_weight = -1, 0.0
+        for place, (i, weight) in enumerate(zip(ids, weights, strict=True)):
+            if better(weight, best_weight):
+                best, best_weight = place if by_place else i, weight
+        return best
+
+    return made
+
 
 MISTAKES: Final = (
     *GEOMETRY,
@@ -269,6 +284,36 @@ MISTAKES: Final = (
         _pixel_vjp(share=False),
         "A splat counts whole in what is behind the next one; it counts by the share alpha that it covers.",
         "behind = alpha color_dot_grad + (1 - alpha) behind.",
+    ),
+    Mistake(
+        "falloff",
+        lambda o, sigma: 1.0 - sigma,
+        "You take the first two terms of the exponential for the whole of it.",
+        "exp(-sigma), which never falls below 0.",
+    ),
+    Mistake(
+        "dominant_id",
+        _dominant(lambda weight, best: weight < best),
+        "The comparison is the wrong way round: the largest weight wins.",
+        "A later splat wins where weight > best_weight.",
+    ),
+    Mistake(
+        "dominant_id",
+        _dominant(lambda weight, best: weight > best, by_place=True),
+        "You return the winner's place in the list; its id is asked for.",
+        "ids[place] is the id.",
+    ),
+    Mistake(
+        "composite_pixel_vjp",
+        _pixel_vjp(color_lit=False),
+        "The light that reaches the splat is missing from the cotangent of its colour.",
+        "v_colors += T alpha v_color, as C has T alpha c.",
+    ),
+    Mistake(
+        "composite_pixel_vjp",
+        _pixel_vjp(absolute=False),
+        "The absolute value is missing in v_means2d_abs: pixels on two sides of a splat cancel.",
+        "Add |v_mean2d| of every pixel, entry by entry.",
     ),
     Mistake(
         "composite_pixel_vjp",

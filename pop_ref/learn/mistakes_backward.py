@@ -291,4 +291,107 @@ BACKWARD: Final = (
         "The focal lengths are missing: u changes by fx / z where x changes by 1.",
         "v_x = fx / z v_u, and v_z has fx x / z^2 and fy y / z^2.",
     ),
+    Mistake(
+        "view_dirs",
+        lambda o, means, viewmat: means - viewmat[:3, 3],
+        "You take t for the camera's centre; t is the world's origin as the camera sees it.",
+        "camera_center(viewmat) has the centre, -R^T t.",
+    ),
+    Mistake(
+        "view_dirs",
+        lambda o, means, viewmat: means.copy(),
+        "The camera's centre is missing: a direction leads from the camera to the Gaussian.",
+        "means - camera_center(viewmat).",
+    ),
+    Mistake(
+        "project_means",
+        lambda o, means_cam, K, *given: means_cam[:, :2] * np.diag(K)[:2] + K[:2, 2],
+        "You do not divide by the depth: what is twice as far is half as large.",
+        "u = fx x / z + cx and v = fy y / z + cy.",
+    ),
+    Mistake(
+        "project_means_vjp",
+        lambda o, means_cam, *given: (
+            o["project_means_vjp"](means_cam, *given) * np.where(np.arange(3) < 2, means_cam[:, 2:], 1.0)
+        ),
+        "The depth is missing under fx and fy: u changes by fx / z where x changes by 1.",
+        "v_x = fx / z v_u and v_y = fy / z v_v.",
+    ),
+    Mistake(
+        "projection_jacobians",
+        lambda o, means_cam, *given: (
+            o["projection_jacobians"](means_cam, *given) * np.where(np.arange(3) < 2, 1.0, means_cam[:, None, 2:])
+        ),
+        "The column of z lacks one division by the depth: the slope of 1 / z is -1 / z^2.",
+        "The entries of z are -fx tx / z^2 and -fy ty / z^2.",
+    ),
+    Mistake(
+        "project_covars",
+        lambda o, covars_cam, jacobians: jacobians @ np.swapaxes(jacobians, 1, 2),
+        "The covariance is missing between the two Jacobians.",
+        "J S J^T, with the Gaussian's S in the middle.",
+    ),
+    Mistake(
+        "covars_cam_from_covars",
+        lambda o, covars, viewmat: viewmat[:3, :3] @ covars @ viewmat[:3, :3],
+        "The second rotation is not transposed.",
+        "A linear map A turns a covariance S into A S A^T; here A is R = viewmat[:3, :3].",
+    ),
+    Mistake(
+        "rotmats_from_quats_vjp",
+        lambda o, quats, v_rotmats: o["rotmats_from_quats_vjp"](quats, np.swapaxes(v_rotmats, 1, 2)),
+        "The cotangent is read with its rows and columns exchanged.",
+        "v_rotmats[i, j, k] belongs to row j and column k of the i-th matrix.",
+    ),
+    Mistake(
+        "sh_basis",
+        lambda o, dirs, *given: o["sh_basis"](dirs[:, [0, 2, 1]], *given),
+        "y and z are exchanged in the basis.",
+        "The three functions of degree 1 are those of -y, z and -x, in this order.",
+    ),
+    Mistake(
+        "sh_basis_vjp",
+        lambda o, dirs, *given: o["sh_basis_vjp"](dirs[:, ::-1], *given),
+        "x and z are exchanged in the slopes of the basis.",
+        "The columns of a direction are x, y and z.",
+    ),
+    Mistake(
+        "scales_from_log_scales",
+        lambda o, log_scales: log_scales,
+        "The exponential is missing: what is kept is the logarithm of the width.",
+        "exp(log_scales), entry by entry.",
+    ),
+    Mistake(
+        "opacities_from_logits",
+        lambda o, logits: 1.0 / (1.0 + np.exp(-np.abs(logits))),
+        "The logit's sign is lost: no opacity of yours is below a half.",
+        "Where the logit is negative the opacity is exp(logit) / (1 + exp(logit)).",
+    ),
+    Mistake(
+        "opacities_from_logits_vjp",
+        lambda o, logits, v: o["opacities_from_logits"](logits) ** 2 * v,
+        "You multiply o by itself: the slope of the sigmoid is o (1 - o).",
+        "1 - o is the sigmoid of -logit.",
+    ),
+    Mistake(
+        "unit_quats_from_quats",
+        lambda o, quats: quats / np.max(np.abs(quats), axis=1, keepdims=True),
+        "You divide by the largest entry; a unit quaternion has the length 1.",
+        "|q| is the root of the sum of the squares.",
+    ),
+    Mistake(
+        "low_pass",
+        lambda o, covars2d, eps2d, *given: covars2d - eps2d * np.eye(2),
+        "eps2d is taken away from the diagonal; it is added, as blur makes a splat wider.",
+        "covars2d + eps2d times the unit matrix.",
+    ),
+    Mistake(
+        "radii_from_covars2d",
+        lambda o, covars2d, opacities, *given: (
+            o["radii_from_covars2d"](covars2d, np.ones_like(opacities), *given)
+            * (o["radii_from_covars2d"](covars2d, opacities, *given) > 0)
+        ),
+        "Your reach is that of opacity 1 for every splat; a faint one ends sooner.",
+        "The reach is min(3.33, sqrt(2 ln(255 o))) standard deviations, with o the splat's own.",
+    ),
 )

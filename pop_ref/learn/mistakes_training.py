@@ -66,6 +66,12 @@ def _one_side(important: bool) -> Callable[..., Any]:
     return made
 
 
+def _signed_mean(o: Oracle, image: Any, target: Any, mask: Any = None) -> float:
+    """Make `l1` without its absolute value."""
+    difference = image - target if mask is None else (image - target)[mask]
+    return float(np.sum(difference)) / max(difference.size, 1)
+
+
 def _reordered(rows: Any, order: Any) -> Any:
     return type(rows)(*({name: x[order] for name, x in each.items()} for each in (rows.params, rows.m, rows.v)))
 
@@ -405,5 +411,33 @@ TRAINING: Final = (
         lambda o, params, gradients, v_opacities: o["params_vjp"](params, gradients, np.zeros_like(v_opacities)),
         "The prior's pull is missing: v_opacities is added to the gradient of the render's opacities.",
         "gradients.opacities + v_opacities, then back through the sigmoid.",
+    ),
+    Mistake(
+        "dominant_counts",
+        lambda o, ids, n: np.minimum(o["dominant_counts"](ids, n), 1),
+        "Each Gaussian is counted once, however many pixels it dominates.",
+        "Add 1 to a Gaussian's count at every pixel that is its own.",
+    ),
+    Mistake(
+        "l1",
+        lambda o, *given: o["l2"](*given),
+        "You square the difference: that is L2; L1 takes its absolute value.",
+        "The mean of |image - target|.",
+    ),
+    Mistake(
+        "l1",
+        _signed_mean,
+        "The absolute value is missing: differences of either sign cancel.",
+        "The mean of |image - target|.",
+    ),
+    Mistake(
+        "pop_loss_vjp",
+        lambda o, opacities, mask, v_loss, *visible: np.where(
+            mask & o["pop_loss_vjp"](opacities, mask, v_loss, *visible).astype(bool),
+            -v_loss / max(len(opacities), 1),
+            o["pop_loss_vjp"](opacities, mask, v_loss, *visible),
+        ),
+        "The important are divided by the number of all Gaussians; their mean is over themselves.",
+        "-v_loss / N_imp where the mask is true.",
     ),
 )

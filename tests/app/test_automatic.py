@@ -119,6 +119,9 @@ def test_rates_go_from_those_of_quick_to_the_published_ones_and_no_length_jumps(
         least = min(getattr(quick, name) * quick.others_decay, getattr(published, name))
         assert (rates * [lr.others_decay for lr in found] >= 0.999 * least).all()
     assert {lr.opacities for lr in found} == {published.opacities}
+    # the steps that second moments remember are as many of each schedule, up to the usual number
+    memory = 1.0 / (1.0 - np.array([lr.beta2 for lr in found]))
+    np.testing.assert_allclose(memory, np.minimum(memory[0] * scalers / scalers[0], 1000.0), rtol=1e-6)
 
 
 def test_no_minute_more_makes_a_schedule_shorter() -> None:

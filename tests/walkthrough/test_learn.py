@@ -153,8 +153,9 @@ def test_every_wrong_solution_is_refused_and_told_what_is_wrong(mine: Path, name
 def test_there_are_wrong_solutions_of_every_function_and_right_ones_of_every_stage() -> None:
     assert set(WRONG) == {name for stage in COURSE for name in stage.names}
     assert sum(map(len, WRONG.values())) >= 150
-    # nine in ten of those that students make most are named
-    assert sum(len(each) == 3 for wrong in WRONG.values() for each in wrong) >= 150
+    # nine in ten are named: the sentence holds the pattern that tells the cause
+    mistakes = [each for wrong in WRONG.values() for each in wrong]
+    assert sum(len(each) == 3 for each in mistakes) >= 0.9 * len(mistakes)
     assert len(RIGHT) >= 30
     assert {each["stage"] for each in RIGHT.values()} == set(BY_NAME)
 
