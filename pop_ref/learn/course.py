@@ -178,7 +178,7 @@ COURSE: Final = (
         "loop",
         "render, compare, go back, step: what is repeated until the picture is right",
         "10",
-        {"training": ("gaussians_from_params", "params_vjp", "train_step")},
+        {"training": ("gaussians_from_params", "params_vjp", "look", "train_step")},
         elsewhere={"gaussians_from_params": "1b", "params_vjp": "1b"},
     ),
 )

@@ -316,6 +316,11 @@ def _steps(rng: np.random.Generator) -> Iterator[Probe]:
     yield "the prior is over", (later, camera, target, 1.0, _zeros, over)
 
 
+def _looks(rng: np.random.Generator) -> Iterator[Probe]:
+    for where, (state, camera, target, scale, _, recipe) in _steps(rng):
+        yield where, (state, camera, target, scale, recipe)
+
+
 _PROBES: Final[dict[str, Callable[[np.random.Generator], Iterator[Probe]]]] = {
     **GEOMETRY,
     "sigma_at_pixel": _at_pixel,
@@ -342,5 +347,6 @@ _PROBES: Final[dict[str, Callable[[np.random.Generator], Iterator[Probe]]]] = {
     "prune_mask": _pruning,
     "gaussians_from_params": _raw,
     "params_vjp": _raw_back,
+    "look": _looks,
     "train_step": _steps,
 }

@@ -28,6 +28,7 @@ _WIDTH: Final = 114
 _MOST_FIELDS: Final = 12
 _LABELS: Final = {label: f"the {words.partition(':')[0]}" for label, words in (DECISIONS | KINKS).items()}
 # what the functions of the course read of their settings
+_NOT_HERE: Final = dict.fromkeys(("points", "mask", "background", "antialiased"), "not in this course; leave it out.")
 _SETTINGS: Final = {
     "grow_masks": {
         "config": "of its fields you need four: `grow_grad2d` (2e-4), the average gradient over which a Gaussian is"
@@ -39,11 +40,12 @@ _SETTINGS: Final = {
         "totals": "the sums over pixels, added to. `v_means2d_abs` sums the absolute values of what each pixel adds to"
         " `v_means2d`."
     },
+    "look": {"recipe": "what is minimised, for `objective`. The course draws harmonics of degree 0.", **_NOT_HERE},
     "train_step": {
-        "recipe": "what is minimised: `objective` and `update` read it, `accumulate` and `control` take its `density`."
-        " `state.step` counts from 0. The course draws harmonics of degree 0. `waiting` is what `update` gives beside"
-        " the rows; it goes into the new `Training`.",
-        "points": "not in this course; leave it out.",
+        "recipe": "what is minimised: `look` and `update` read it, `accumulate` and `control` take its `density`."
+        " `state.step` counts from 0. `waiting` is what `update` gives beside the rows; it goes into the new"
+        " `Training`.",
+        **_NOT_HERE,
     },
 }
 # where a docstring's formulas are of other programs, too, or stand in its module's text

@@ -9,7 +9,10 @@
 #
 # ## One step, in full
 #
-# This is the oracle's training step, complete. Every name in it is one of the earlier chapters:
+# This is the oracle's training step, complete, in two functions: `look` finds the loss and its gradients and moves
+# nothing, `train_step` moves. Every name in them is one of the earlier chapters:
+#
+# {{source: pop_ref.training.look}}
 #
 # {{source: pop_ref.training.train_step}}
 #
@@ -18,8 +21,8 @@
 # **objective** (6, 8) gives the loss, its gradient with respect to the image, and what the prior adds to the opacities;
 # who is important is read off this very render (7). The gradient goes **back** (5, 5b) to the raw parameters (1b).
 # `update` is **Adam** (1b). Then **density control** (9): `accumulate` counts what this view shows, and `control`
-# clones, splits and prunes when it is time. Points, entropy, regularizers and "waiting" serve other methods and are
-# off.
+# clones, splits and prunes when it is time. Points, masks, entropy, regularizers and "waiting" serve other methods and
+# photographs and are off.
 #
 # What is minimised, eq. 9:
 #
