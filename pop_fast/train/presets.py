@@ -94,9 +94,10 @@ PRESETS: Final = {"paper": 1.0, "quick": QUICK_SCALER, AUTOMATIC: 1.0}
 # longer, never below the published ones, and they fall by less
 QUICK_RATES: Final = {"means": 12.0, "scales": 6.0, "quats": 6.0, "sh0": 8.0, "sh_rest": 12.0}
 QUICK_DECAY: Final = 0.1
-# Adam's second moments: the usual 0.999 remembers most of so few steps, also those of coarse photographs. In a longer
-# schedule of "auto" the memory is longer by as much, up to the usual one
+# Adam's second moments: the usual 0.999 remembers most of so few steps, also those of coarse photographs. Longer
+# schedules of "auto" come near it, and have it from a quarter on, where less memory gained nothing
 QUICK_BETA2: Final = 0.99
+QUICK_BETA2_UNTIL: Final = 0.25
 # steps of the full schedule until which "quick" sees the photographs at a quarter, and at a half, of their size
 QUICK_COARSE: Final = (5_000, 10_000)
 # "quick" looks for what should grow twice as often, and asks for less of a gradient, as coarse photographs show less
@@ -239,7 +240,8 @@ def defaults(given: Given) -> dict[str, Any]:
 def _quicker(lr: LearningRates, share: float) -> LearningRates:
     """Return rates that begin at this share of what "quick" has more than the published ones, and fall as far."""
     rates = {name: max(factor * share, 1.0) * getattr(lr, name) for name, factor in QUICK_RATES.items()}
-    beta2 = 1.0 - max((1.0 - QUICK_BETA2) * share, 1.0 - lr.beta2)
+    usual = QUICK_SCALER / QUICK_BETA2_UNTIL
+    beta2 = lr.beta2 + (QUICK_BETA2 - lr.beta2) * max(share - usual, 0.0) / (1.0 - usual)
     return replace(lr, **rates, others_decay=min(QUICK_DECAY / share, lr.others_decay), beta2=beta2)
 
 
