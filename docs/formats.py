@@ -125,7 +125,8 @@ def _measured(sizes: dict[str, Any]) -> str:
         }
         formats = dict.fromkeys(row["format"] for row in found["rows"])
         rows += [[name, f"`{format}`", *(cells[format, share] for share in shares)] for format in formats]
-    return f"""Bytes, their share of the whole splat's PLY, and the change of the held-out PSNR. POP, `--preset quick`:
+    return f"""Bytes, their share of the whole splat's PLY, and the change of the held-out PSNR. POP,
+`--preset quick --lr.beta2 0.999`, as `quick` was when this was measured:
 {"; ".join(sources)}. Every file is written by `pop export` and measured by `pop eval`
 (`benchmarks/sizes.py`).
 
@@ -150,7 +151,8 @@ def _budgets(record: dict[str, Any]) -> str:
             size = f"{row['bytes'] / 1e6:.2f} MB, 1/{row['share']}"
             rows.append([name, f"`{row['format']}`", size, *cells])
     return f"""Change of the held-out PSNR in a tenth and a twentieth of the bytes of the whole splat's PLY. POP,
-`--preset quick`, which ends before the splat is as good as it gets: what is tuned can be better than the whole.
+`--preset quick` as above, which ends before the splat is as good as it gets: what is tuned can be better than the
+whole.
 "Fewer Gaussians alone" is what `--target-mb` did before, "harmonics and digits too" is `--fine-tune-steps 0`, the last
 column the default of {record["steps"]} steps (`benchmarks/budgets.py`).
 
