@@ -46,7 +46,8 @@ def capture_folder(path: Path, progress: Progress | None = None) -> tuple[Path, 
             return target, f"{path}: its photographs are in {target} already"
         taken = take_frames(path, target, progress=progress)
         return target, f"{path}: {len(taken.frames)} of {taken.of:,} frames are taken as photographs, in {target}"
-    if zipfile.is_zipfile(path):
+    # one that was cut short is not known by its end, but by its name
+    if zipfile.is_zipfile(path) or path.suffix.lower() == ".zip":
         target = path.with_name(f"{path.stem}_unpacked")
         if not _made_before(path, target):
             unpack(path, target)

@@ -13,11 +13,13 @@ import numpy as np
 import pycolmap
 import pytest
 
+from benchmarks import estimates
 from benchmarks.few_photographs import left_of, table_of
 from pop_fast.cli.train_checks import chooses_for_itself
 from pop_fast.data.capture import Capture
 from pop_fast.data.unpack import capture_folder, unpack
 from pop_fast.errors import CaptureError
+from pop_fast.io.heartbeat import duration
 from pop_fast.train import TrainConfig, automatic
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.automatic import (
@@ -26,6 +28,7 @@ from pop_fast.train.automatic import (
     LOOKS,
     MINUTES,
     SHORTEST,
+    Choice,
     Speed,
     Terms,
     choose_length,
@@ -376,6 +379,11 @@ def test_an_archive_that_would_fill_the_disk_or_is_damaged_is_refused(tmp_path: 
         unpack(tmp_path / "c.zip", tmp_path / "c")
     assert not (tmp_path / "a").exists()
     assert not (tmp_path / "c").exists()
+    # a copy that was cut short has lost its end, by which archives are known
+    (tmp_path / "d.zip").write_bytes(damaged[:50])
+    with pytest.raises(CaptureError, match=r"d\.zip: cannot be unpacked"):
+        capture_folder(tmp_path / "d.zip")
+    assert not (tmp_path / "d_unpacked").exists()
 
 
 def test_a_video_is_a_folder_of_its_frames_the_second_time_too(tmp_path: Path) -> None:
@@ -398,3 +406,20 @@ def test_a_video_is_a_folder_of_its_frames_the_second_time_too(tmp_path: Path) -
     os.utime(film, (folder.stat().st_mtime + 60.0,) * 2)
     with pytest.raises(CaptureError, match="is older than"):
         capture_folder(film)
+
+
+def test_the_line_before_the_first_step_is_read_back_for_the_table_of_estimates() -> None:
+    choice = Choice(scaler=0.01, gaussians=34_900.0, seconds=3_725.0, memory_bytes=1.27e9)
+    config = TrainConfig.of(preset="auto", steps_scaler=0.01, factor=2, backend="fast")
+    row = estimates.foretold(f"before\n{automatic.line_of(choice, config, (256, 512))}\n")
+    assert row == {
+        "size": "256x512",
+        "steps": 300,
+        "foretold": {"gaussians": 35_000, "seconds": 3_720.0, "memory": 1.3},
+    }
+    assert estimates.seconds_of(duration(62.0)) == 62.0
+    came = {"gaussians": 40_000, "seconds": 1_860.0, "memory": 1.21}
+    table = estimates.table_of({"machine": {}, "toy, 60": {**row, "minutes": 60.0, "came": came}})
+    assert table.splitlines()[2:] == ["| toy, 60 | 256x512, 300 | 3720 s, 1860 s | 0.50 | 35,000, 40,000 | 1.3, 1.2 |"]
+    with pytest.raises(ValueError, match="no line says"):
+        estimates.foretold("trained")

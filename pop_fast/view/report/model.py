@@ -35,6 +35,8 @@ _FITS_BADLY: Final = 19.0
 _PARTS: Final = 0.006  # of a training view, on average: what does not fit where the rest does
 _EPOCHS: Final = 30  # how often each photograph is to be seen
 
+_MORE_STEPS: Final = ("train", "DATA", "--minutes", "240")
+
 Kind = Literal["good", "look", "bad"]
 
 
@@ -55,10 +57,11 @@ class Finding:
     next: tuple[str, ...] = ()
 
 
+_CLOSE: Final = 25.0
 # held-out PSNR from which a render is called so, dB
 _GRADES: Final[tuple[tuple[float, Kind, str], ...]] = (
     (30.0, "good", "very close to the photographs"),
-    (25.0, "good", "close to the photographs"),
+    (_CLOSE, "good", "close to the photographs"),
     (20.0, "look", "recognisable, with much of the detail lost"),
     (-1e9, "bad", "far from the photographs"),
 )
@@ -107,8 +110,13 @@ def _quality(psnr: float | None, checks: Checks | None) -> Iterator[Finding]:
         if rest - psnr >= _ONE_VIEW:
             notes += f" {worst} is the worst, {by_view[worst]:.2f} dB; the mean without it is {rest:.2f} dB."
     _, kind, words = next(grade for grade in _GRADES if psnr >= grade[0])
+    next_: tuple[str, ...] = () if kind == "good" else ("data", "check", "DATA")
+    # where the training views are hardly better, photographs are not what is missing
+    if kind != "good" and checks is not None and _too_short(checks) and _gap(checks) < _SOME_OVERFITTING:
+        notes += f" The run had few steps, {(checks.steps or 0) / checks.photographs:.0f} a photograph."
+        next_ = _MORE_STEPS
     text = f"Views that training never saw are {words}: {psnr:.2f} dB on average.{notes}"
-    yield Finding(kind, "Quality", text, () if kind == "good" else ("data", "check", "DATA"))
+    yield Finding(kind, "Quality", text, next_)
 
 
 def _fewer_steps(held_out: tuple[Sequence[float], Sequence[float]] | None) -> float | None:
@@ -140,7 +148,7 @@ def _unfitting(checks: Checks) -> Iterator[Finding]:
         yield _parts(checks, text)
         return
     short = " The run had few steps for it." if _too_short(checks) else ""
-    more = ("train", "DATA", "--minutes", "240") if short else ("data", "check", "DATA")
+    more = _MORE_STEPS if short else ("data", "check", "DATA")
     why = (
         f"{text}.{short} A subject or a light that moved, or cameras that are wrong, leave photographs that contradict "
     )
@@ -171,6 +179,11 @@ def _gap(checks: Checks) -> float:
     return 0.0 if checks.judged_psnr is None else checks.train_psnr - checks.judged_psnr
 
 
+def _is_close(checks: Checks) -> bool:
+    """Tell whether held-out views are called close to the photographs: no other finding calls them missed then."""
+    return checks.judged_psnr is not None and checks.judged_psnr >= _CLOSE
+
+
 def _overfitting(checks: Checks, fewer: float | None) -> Iterator[Finding]:
     if checks.held_out_psnr is None:
         text = "No view was held out, so that nothing says how views between the photographs look."
@@ -182,13 +195,15 @@ def _overfitting(checks: Checks, fewer: float | None) -> Iterator[Finding]:
         if checks.train_psnr < _FITS:
             # little of it says nothing good where the training views are missed as well
             text = f"Not the trouble here: {numbers}, {gap:.1f} dB apart, both low."
-            yield Finding("look", "Overfitting", text, ("data", "check", "DATA"))
+            yield Finding("look", "Overfitting", text, _MORE_STEPS if _too_short(checks) else ("data", "check", "DATA"))
             return
         yield Finding("good", "Overfitting", f"Little: {numbers}, {gap:.1f} dB apart.")
         return
-    some = gap < _OVERFITTED
-    text = f"{'Some' if some else 'Much'}: {numbers}, {gap:.1f} dB apart."
-    text += "" if some else " The splat knows its photographs by heart and little in between."
+    some = gap < _OVERFITTED or _is_close(checks)
+    text = f"{'Some' if gap < _OVERFITTED else 'Much'}: {numbers}, {gap:.1f} dB apart."
+    if gap >= _OVERFITTED:
+        less = "less well, though close" if _is_close(checks) else "little"
+        text += f" The splat knows its photographs by heart and what lies in between {less}."
     # no two findings send to schedules of two lengths
     steps = checks.steps or Recipe.max_steps
     if fewer is None and steps <= LOOKS * checks.photographs:
@@ -208,9 +223,11 @@ def _photographs(checks: Checks) -> Iterator[Finding]:
     if not few and not far and not missing:
         yield Finding("good", "Photographs", f"{n} trained on{spacing}: enough.")
         return
-    why = "few" if few else "far apart" if far else f"not enough for this subject, as the {gap:.1f} dB show"
+    close = _is_close(checks)
+    why = "few" if few else "far apart" if far else ""
+    why = why or f"{'not all that' if close else 'not enough for what'} this subject takes, as the {gap:.1f} dB show"
     kind: Kind = "look"
-    if gap >= _SOME_OVERFITTING:
+    if gap >= _SOME_OVERFITTING and not close:
         kind, why = "bad", f"too {why}" if few or far else why
     text = f"{n} trained on{spacing}: {why}. Photographs between these would help most."
     yield Finding(kind, "Photographs", text, ("data", "check", "DATA"))
