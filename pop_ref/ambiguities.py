@@ -219,7 +219,7 @@ AMBIGUITIES: Final = (
         "L",
         "Are dominant counts taken before or after the update?",
         "in the forward pass of the loss",
-        "pop_ref.training:train_step",
+        "pop_ref.training:look",
     ),
     Ambiguity(
         "A28",
