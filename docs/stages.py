@@ -83,8 +83,8 @@ STAGES = (
 # modules of pop_ref that are data or types, not stages
 NOT_STAGES = frozenset(
     {"__init__", "_shapes", "ambiguities", "constants", "notation", "records", "registry", "settings"}
-    # whole trainings of the methods, which the kit's laws of strategies and steps are held to, scripts and courses
-    | {"methods", "scripted", "courses"}
+    # whole trainings of the methods, which the laws of strategies and of steps are held to, and what they train
+    | {"methods", "scripted", "short_training"}
 )
 # stages whose laws stand in a file of another name: whole views, and what is tested elsewhere
 LAWS_ELSEWHERE = {

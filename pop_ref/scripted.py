@@ -1,7 +1,7 @@
 """What a training is shown by whoever writes it down: renders, passes over views, random numbers.
 
 `methods.scripted_steps` takes a method through such a script; `pop_ref.conformance.strategy_script` writes some.
-`courses.taken_steps` takes one through a course, where photographs are what it is shown.
+`short_training.taken_steps` takes one through a short training, where photographs are what it is shown.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ class Script(Protocol):
         ...
 
 
-class Course(Protocol):
+class ShortTraining(Protocol):
     """A training on photographs.
 
     Attributes:

@@ -65,7 +65,7 @@ STAGE_MODULES = (
     "optimizer",
     "training",
     "methods",
-    "courses",
+    "short_training",
     "contributions",
     "sensitivity",
     "fisher",

@@ -171,7 +171,7 @@ def program(name: str, package: str, backend: str, dtype: str) -> Any:
         dtype: "float64" or "float32".
     """
     from pop_ref.conformance.torch_adapter import TorchAdapter
-    from pop_ref.conformance.torch_courses import course_stages
+    from pop_ref.conformance.torch_short_training import short_training_stages
     from pop_ref.conformance.torch_training import training_stages
     from pop_ref.conformance.torch_watched import watching_stages
 
@@ -183,7 +183,7 @@ def program(name: str, package: str, backend: str, dtype: str) -> Any:
         native = importlib.import_module(f"{package}.compiled.native_step")
         own_adam = {name: getattr(native, name) for name in ("adam_step", "adam_steps")}
     trains = training_stages(package, own_adam.get("adam_step")) | own_adam | watching_stages(package, backend, dtype)
-    trains |= course_stages(package, backend, dtype)
+    trains |= short_training_stages(package, backend, dtype)
     if backend == "compiled":
         # one module of its own holds the passes over views
         scores = importlib.import_module(f"{package}.compiled.scores")

@@ -17,37 +17,37 @@ import numpy as np
 from pop_ref.conformance import tolerances
 from pop_ref.conformance.assertions import assert_close
 from pop_ref.conformance.calls import Call, Frame
-from pop_ref.conformance.courses import Course
 from pop_ref.conformance.error_bounds import PixelErrorBounds
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.reference import error_bounds_of
 from pop_ref.conformance.scenes import Scene
+from pop_ref.conformance.short_training import ShortTraining
 from pop_ref.conformance.signature import Expected
 from pop_ref.conformance.views import clear_of_extents
-from pop_ref.courses import Trained
 from pop_ref.density import Rows
 from pop_ref.methods import KEYS
 from pop_ref.optimizer import learning_rates, sh_degree_at
 from pop_ref.settings import BETAS, EPS
+from pop_ref.short_training import Trained
 from pop_ref.training import Look, gaussians_from_params
 
 # under it moments of single precision may be flushed to zero
 _SMALLEST: Final = float(np.finfo(np.float32).tiny)
 # world units that no step moves a Gaussian by, and that no two are within
 _PLACE: Final = 0.01
-# of the steps of a course so many must be clear of rounding
+# of the steps of a short training so many must be clear of rounding
 _LEAST_JUDGED: Final = 0.6
 
 
 def assert_steps(
-    backend: Any, course: Course, found: Sequence[Mapping[str, Any]], least: float = _LEAST_JUDGED
+    backend: Any, short: ShortTraining, found: Sequence[Mapping[str, Any]], least: float = _LEAST_JUDGED
 ) -> set[str]:
     """Assert that every step that was taken is the oracle's.
 
     Args:
         backend: that took them.
-        course: what was trained.
-        found: of every step what `pop_ref.courses.taken_steps` returns; its "view" is the one that was seen.
+        short: what was trained.
+        found: of every step what `pop_ref.short_training.taken_steps` returns; its "view" is the one that was seen.
         least: the share of the steps that must be clear of rounding; of the others nothing is compared but whose the
             rows are.
 
@@ -55,7 +55,7 @@ def assert_steps(
         What was done to the Gaussians.
     """
     # frozen, which a protocol of attributes does not allow
-    given: Any = course
+    given: Any = short
     trained, happened, judged = Trained(given), set[str](), 0
     waiting = np.zeros(0)
     for step, record in enumerate(found):
@@ -69,11 +69,11 @@ def assert_steps(
         happened |= set(trained.change())
         if step_bounds.clear:
             judged += 1
-            at = f"step {step} of {course.method}"
+            at = f"step {step} of {short.method}"
             size = abs(seen.loss) + step_bounds.loss_size
             assert_close("steps.loss", record["loss"], seen.loss, size, backend.dtype, True, place=_at(f"{at}: loss"))
             _assert_rows(record, trained.driven.rows, backend.dtype, at)
-        _assert_whose(record["params"]["means"], trained.driven.rows.params["means"], f"step {step} of {course.method}")
+        _assert_whose(record["params"]["means"], trained.driven.rows.params["means"], f"step {step} of {short.method}")
         trained.driven.rows = Rows(*({key: record[kind][key] for key in KEYS} for kind in ("params", "m", "v")))
     assert judged >= least * len(found), "rounding decides a pixel of most steps"
     return happened
@@ -114,21 +114,21 @@ class _Bounds:
     dtype: Any
 
     def __post_init__(self) -> None:
-        course, recipe = self.trained.course, self.trained.recipe
+        short, recipe = self.trained.short, self.trained.recipe
         params = self.trained.driven.rows.params
         self.gaussians = gaussians_from_params(params)
         degree = sh_degree_at(
             self.trained.step, recipe.sh_interval, _degree_of(params), recipe.updates.sh_start_iter
         )  # fmt: skip
-        camera, behind = course.cameras[self.view], np.array(course.background)
-        self.scene = Scene(self.gaussians, camera, behind, recipe.profile, None, degree, course.antialiased)
+        camera, behind = short.cameras[self.view], np.array(short.background)
+        self.scene = Scene(self.gaussians, camera, behind, recipe.profile, None, degree, short.antialiased)
         self.pixels: PixelErrorBounds = error_bounds_of(self.scene, self.dtype)
 
     @property
     def clear(self) -> bool:
         """Tell whether rounding decides nothing of the render."""
         recipe, pixels = self.trained.recipe, self.pixels
-        dominates = recipe.lambda_pop != 0.0 or recipe.density.blur_start_iter < len(self.trained.course.order)
+        dominates = recipe.lambda_pop != 0.0 or recipe.density.blur_start_iter < len(self.trained.short.order)
         decided = bool(np.all(pixels.smooth & (pixels.decided | (not dominates))))
         return decided and not np.any(pixels.screen.kinked) and bool(np.all(clear_of_extents(self.scene, self.dtype)))
 
@@ -188,8 +188,8 @@ def _degree_of(params: Mapping[str, np.ndarray]) -> int:
 
 def _with_errors(trained: Trained, before: Rows, errors: Mapping[str, np.ndarray], dtype: Any) -> Rows:
     """Return the rows after Adam, with the size of a unit of each entry under more keys, which go with their rows."""
-    moved, step, course, recipe = trained.driven.rows, trained.step, trained.course, trained.recipe
-    rates = learning_rates(step, course.scene_scale, recipe.max_steps, recipe.lr, recipe.updates)
+    moved, step, short, recipe = trained.driven.rows, trained.step, trained.short, trained.recipe
+    rates = learning_rates(step, short.scene_scale, recipe.max_steps, recipe.lr, recipe.updates)
     limit = tolerances.agreement("steps.params", dtype)
     more: dict[str, np.ndarray] = {}
     for key in KEYS:

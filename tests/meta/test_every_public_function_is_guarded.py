@@ -307,7 +307,7 @@ DOCTESTS = (
     "depth.expected_depth_vjp",
     "depth.with_depth_channel",
     *("constants.profile_named", "notation.symbol_named", "magnitudes.distance", "magnitudes.colors_magnitudes"),
-    *("methods.scripted_steps", "methods.method_settings", "courses.taken_steps"),
+    *("methods.scripted_steps", "methods.method_settings", "short_training.taken_steps"),
     *("loss_magnitudes.d_ssim_magnitudes", "loss_magnitudes.pixelwise_magnitudes"),
 )
 

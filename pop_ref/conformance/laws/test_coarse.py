@@ -9,8 +9,8 @@ import numpy as np
 from hypothesis import strategies as st
 
 from pop_ref.conformance.assertions import assert_close
-from pop_ref.conformance.courses import Course
 from pop_ref.conformance.law import law
+from pop_ref.conformance.short_training import ShortTraining
 
 sizes = st.tuples(st.integers(64, 150), st.integers(64, 150))
 factors = st.sampled_from([2, 4])
@@ -88,8 +88,8 @@ def test_a_pixel_of_a_coarse_mask_counts_where_half_of_its_area_does(backend, si
         assert np.array_equal(found, share >= 0.5)
 
 
-class _Stripes(Course):
-    """A course whose photographs are stripes of 1, 2 and 4 px, told apart by how strong they are."""
+class _Stripes(ShortTraining):
+    """A short training whose photographs are stripes of 1, 2 and 4 px, told apart by how strong they are."""
 
     def photo(self, index):
         width, height = self.size
@@ -116,7 +116,7 @@ def test_every_step_sees_its_photograph_at_the_size_of_its_turn(backend):
         (48, 1, (whole,)),
     ):
         order = (0, 1, 2) * (len(expected) * batch // 3 + 1)
-        course = _Stripes("pop", settings, options, order[: len(expected) * batch], 3, 2, 3, background=grey,
+        short = _Stripes("pop", settings, options, order[: len(expected) * batch], 3, 2, 3, background=grey,
                           batch=batch, size=(side, side))  # fmt: skip
-        found = backend.stage("coarse_losses")(course, (2, 5))
+        found = backend.stage("coarse_losses")(short, (2, 5))
         assert_close("steps.coarse", found, expected, 1.0, backend.dtype)

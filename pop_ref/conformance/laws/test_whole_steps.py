@@ -13,12 +13,12 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
-from pop_ref.conformance.courses import Course
 from pop_ref.conformance.judged_steps import assert_steps
 from pop_ref.conformance.law import law
-from pop_ref.courses import Trained
+from pop_ref.conformance.short_training import ShortTraining
 from pop_ref.methods import KEYS, RECIPE_OF
 from pop_ref.settings import LearningRates
+from pop_ref.short_training import Trained
 
 # of band 0
 SH_C0 = 0.28209479177387814
@@ -33,9 +33,11 @@ HALVED = {"lambda_ssim": 0.25, "d_ssim_halved": True, "padding": "same", "l2_sto
 BEHIND = (0.25, 0.5, 0.75)
 ORDER = (0, 1, 0, 1, 0)
 
-PRIOR = Course("pop", {**STILL, **FIRST}, {**SHORT, **HALVED, "lr": SLOW}, ORDER, seed=125, scene_scale=4.0)
-ENTROPY = Course("pop", {**STILL, **SECOND}, {**SHORT, "pixel_scale": 0.25, "lr": SLOW}, ORDER, 16, antialiased=True)
-MASKED = Course(
+PRIOR = ShortTraining("pop", {**STILL, **FIRST}, {**SHORT, **HALVED, "lr": SLOW}, ORDER, seed=125, scene_scale=4.0)
+ENTROPY = ShortTraining(
+    "pop", {**STILL, **SECOND}, {**SHORT, "pixel_scale": 0.25, "lr": SLOW}, ORDER, 16, antialiased=True
+)
+MASKED = ShortTraining(
     "pop",
     {**STILL, "lambda_pop": 0.5, "pop_over": "visible"},
     {**SHORT, "pixelwise": "l1", "lambda_ssim": 0.25},
@@ -46,16 +48,16 @@ MASKED = Course(
 )
 
 
-def _assert_steps(backend, course):
-    return assert_steps(backend, course, backend.stage("taken_steps")(course))
+def _assert_steps(backend, short):
+    return assert_steps(backend, short, backend.stage("taken_steps")(short))
 
 
 @law("training", "taken_steps")
 def test_every_step_is_the_oracles_under_every_setting(backend):
     # another Gaussian is important in either view
     window = replace(PRIOR, order=(0, 1), seed=1216, count=9)
-    for course in (PRIOR, window, ENTROPY, MASKED):
-        _assert_steps(backend, course)
+    for short in (PRIOR, window, ENTROPY, MASKED):
+        _assert_steps(backend, short)
 
 
 # every parameter waits, rests, or goes back at a step of its own
@@ -68,8 +70,8 @@ FALLING = replace(SLOW, others_decay=0.125)
 def test_every_step_is_the_oracles_under_every_rule_of_updates(backend):
     grows = {"refine_start_iter": 1, "refine_every": 2, "grow_grad2d": 1e-6, "grow_scale3d": 100.0, "prune_opa": 0.0}
     rates = {"max_steps": 8, "sh_interval": 1, "lr": SLOW}
-    waiting = Course("pop", {**STILL, **WAITING}, rates, (*ORDER, 1), seed=126)
-    rewound = Course("pop", {**grows, **REWOUND}, {**SHORT, "lr": FALLING}, ORDER[:4], seed=40)
+    waiting = ShortTraining("pop", {**STILL, **WAITING}, rates, (*ORDER, 1), seed=126)
+    rewound = ShortTraining("pop", {**grows, **REWOUND}, {**SHORT, "lr": FALLING}, ORDER[:4], seed=40)
     _assert_steps(backend, waiting)
     assert "cloned" in _assert_steps(backend, rewound)
 
@@ -81,7 +83,7 @@ LATER = ("3dgs", "taming", "speedy-splat")
 def test_every_step_of_every_method_is_the_oracles(backend):
     # principal points lie off the centre, where Inria's code takes them to be
     for method in RECIPE_OF:
-        _assert_steps(backend, Course(method, order=(0, 1), seed=14 if method in LATER else 11))
+        _assert_steps(backend, ShortTraining(method, order=(0, 1), seed=14 if method in LATER else 11))
 
 
 # large and faint are told apart by far, so that rounding decides nothing
@@ -101,11 +103,11 @@ CHANGES = {
 
 @law("training", "taken_steps")
 def test_every_step_is_the_oracles_while_the_gaussians_change(backend):
-    course = Course("gsplat", CHANGES, SHORT, ORDER[:4], seed=173, scene_scale=2.0)
-    happened = _assert_steps(backend, course)
+    short = ShortTraining("gsplat", CHANGES, SHORT, ORDER[:4], seed=173, scene_scale=2.0)
+    happened = _assert_steps(backend, short)
     blur = {**CHANGES, "reset_every": 0, "theta_blur": 0.05, "blur_start_iter": 0, "blur_stop_iter": 3}
     blur |= {"prune_opa": 0.05, "final_prune_iter": 2, "final_prune_opa": 0.6}
-    happened |= _assert_steps(backend, replace(course, method="pop", settings=blur, seed=34, order=ORDER[:3]))
+    happened |= _assert_steps(backend, replace(short, method="pop", settings=blur, seed=34, order=ORDER[:3]))
     assert happened == {"cloned", "split", "pruned", "reset"}, f"{happened} only"
 
 
@@ -113,8 +115,10 @@ def test_every_step_is_the_oracles_while_the_gaussians_change(backend):
 def test_every_step_is_the_oracles_with_terms_for_few_photographs(backend):
     weights = {"depth_lambda": 0.5, "opacity_reg": 0.25, "scale_reg": 0.125}
     for masked, scale in ((False, 4.0), (True, 0.5)):
-        course = Course("pop", STILL, {**SHORT, **weights}, ORDER[:2], 34, sparse=18, masked=masked, scene_scale=scale)
-        _assert_steps(backend, course)
+        short = ShortTraining(
+            "pop", STILL, {**SHORT, **weights}, ORDER[:2], 34, sparse=18, masked=masked, scene_scale=scale
+        )
+        _assert_steps(backend, short)
 
 
 # scores of who goes and who stays are apart, and others would go by those of other photographs, bands or renders
@@ -126,35 +130,35 @@ def test_what_a_method_prunes_by_is_of_all_photographs(backend):
     for method, seeds, settings in (("speedy-splat", (8, 34), speedy), ("mini-splatting", (6,), mini),
                                     ("pup", (3, 24), pup)):  # fmt: skip
         for seed in seeds:
-            course = Course(method, settings, SHORT, (0, 1), seed, count=9, views=3, held_out=1)
-            found = backend.stage("taken_steps")(course)
-            assert "pruned" in assert_steps(backend, course, found, least=0.0), method
+            short = ShortTraining(method, settings, SHORT, (0, 1), seed, count=9, views=3, held_out=1)
+            found = backend.stage("taken_steps")(short)
+            assert "pruned" in assert_steps(backend, short, found, least=0.0), method
 
 
 @law("training", "taken_steps")
 def test_gaussians_begin_anew_on_the_photographs_and_inside_their_masks(backend):
     settings = {**STILL, "reinit_iters": (1,), "reinit_points": 60, "sample_iter": 90, "prune_iter": 91}
-    course = Course("mini-splatting", settings, SHORT, (0, 1), seed=6, centred=True, masked=True)
-    params = backend.stage("taken_steps")(course)[-1]["params"]
-    assert len(params["means"]) > course.count
+    short = ShortTraining("mini-splatting", settings, SHORT, (0, 1), seed=6, centred=True, masked=True)
+    params = backend.stage("taken_steps")(short)[-1]["params"]
+    assert len(params["means"]) > short.count
     colors = 255.0 * (0.5 + SH_C0 * params["sh0"][:, 0])
     shown = np.zeros(len(colors), dtype=bool)
-    for view, camera in enumerate(course.cameras):
+    for view, camera in enumerate(short.cameras):
         seen = params["means"] @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
         at = (seen[:, :2] / seen[:, 2:]) @ camera.K[:2, :2].T + camera.K[:2, 2] - 0.5
-        pixel = np.clip(np.round(at).astype(int), 0, np.array(course.size) - 1)
+        pixel = np.clip(np.round(at).astype(int), 0, np.array(short.size) - 1)
         rows, columns = pixel[:, 1], pixel[:, 0]
-        close = np.all(np.abs(at - pixel) < 0.01, axis=1) & course.mask(view)[rows, columns]
-        shown |= close & np.all(np.abs(colors - course.photo(view)[rows, columns]) < 0.01, axis=1)
+        close = np.all(np.abs(at - pixel) < 0.01, axis=1) & short.mask(view)[rows, columns]
+        shown |= close & np.all(np.abs(colors - short.photo(view)[rows, columns]) < 0.01, axis=1)
     assert np.all(shown), f"Gaussian {np.argmin(shown)} lies on no pixel that counts, or has not that pixel's colour"
 
 
 @law("training", "batched_steps")
 def test_a_step_of_several_views_has_their_mean_loss_and_gradient(backend):
-    course = replace(PRIOR, batch=2, order=(0, 1))
-    (found,) = backend.stage("batched_steps")(course)
+    short = replace(PRIOR, batch=2, order=(0, 1))
+    (found,) = backend.stage("batched_steps")(short)
     assert sorted(found["view"]) == [0, 1]
-    looks = [Trained(course).look(view) for view in (0, 1)]
+    looks = [Trained(short).look(view) for view in (0, 1)]
     loss = 0.5 * (looks[0].loss + looks[1].loss)
     assert_close("steps.batch", found["loss"], loss, loss, backend.dtype, against_oracle=True)
     for key in KEYS:
@@ -167,15 +171,15 @@ def test_a_step_of_several_views_has_their_mean_loss_and_gradient(backend):
 @law("training", "learned_exposures")
 def test_an_exposure_learns_to_be_that_of_its_photograph(backend):
     # of bright noise behind a dark render every entry wants to grow, and of two exposures none is the first
-    course = _Bright("pop", STILL, SHORT, (0,), seed=22, background=(0.05, 0.05, 0.05))
+    short = _Bright("pop", STILL, SHORT, (0,), seed=22, background=(0.05, 0.05, 0.05))
     rate = 2.0**-6
-    (exposures,) = backend.stage("learned_exposures")(course, rate)
+    (exposures,) = backend.stage("learned_exposures")(short, rate)
     seen = int(exposures[1, 0, 3] > exposures[0, 0, 3])
     assert_close("steps.still", exposures[seen] - exposures[1 - seen], np.full((3, 4), rate), 1.0, backend.dtype)
 
 
-class _Bright(Course):
-    """A course of white photographs."""
+class _Bright(ShortTraining):
+    """A short training of white photographs."""
 
     def photo(self, index):
         return np.full_like(super().photo(index), 255)
@@ -186,13 +190,13 @@ NONE = LearningRates(means=0.0, scales=0.0, quats=0.0, opacities=0.0, sh0=0.0, s
 
 @functools.cache
 def _alike(rate):
-    """Return a course of two photographs that are one and the same."""
+    """Return a short training of two photographs that are one and the same."""
     rates = LearningRates(means=rate, scales=rate, quats=rate, opacities=rate, sh0=rate, sh_rest=rate)
     return _Alike("pop", {**STILL, "lambda_pop": 0.0}, {"max_steps": 8, "lr": rates}, (0, 1, 0, 1), seed=22)
 
 
-class _Alike(Course):
-    """A course of one photograph that is there twice."""
+class _Alike(ShortTraining):
+    """A short training of one photograph that is there twice."""
 
     @property
     def cameras(self):
@@ -204,13 +208,13 @@ class _Alike(Course):
 
 @law("training", "taken_steps")
 def test_at_rates_of_zero_every_look_at_a_photograph_costs_the_same(backend):
-    course = replace(PRIOR, settings={**STILL, "lambda_pop": 0.0}, options={"max_steps": 8, "lr": NONE}, order=ORDER)
+    short = replace(PRIOR, settings={**STILL, "lambda_pop": 0.0}, options={"max_steps": 8, "lr": NONE}, order=ORDER)
     costs = {}
-    for record in backend.stage("taken_steps")(course):
+    for record in backend.stage("taken_steps")(short):
         loss = costs.setdefault(record["view"], record["loss"])
         # a step that is recorded counts what its pixels blend, and may sum in another order
         assert_close("steps.still", record["loss"], loss, loss, backend.dtype)
-        for key, value in course.params.items():
+        for key, value in short.params.items():
             assert_same_bits(key, record["params"][key], value)
 
 
@@ -236,9 +240,9 @@ def test_the_scale_of_the_scene_is_the_unit_of_the_centres_rate_and_of_nothing_e
 
 @law("training", "taken_steps")
 def test_bands_of_the_harmonics_move_from_their_own_step_on(backend):
-    course = replace(PRIOR, options={"max_steps": 8, "sh_interval": 2}, order=(0, 1, 0, 1, 0))
-    before = course.params["shN"]
-    for step, record in enumerate(backend.stage("taken_steps")(course)):
+    short = replace(PRIOR, options={"max_steps": 8, "sh_interval": 2}, order=(0, 1, 0, 1, 0))
+    before = short.params["shN"]
+    for step, record in enumerate(backend.stage("taken_steps")(short)):
         after = record["params"]["shN"]
         moved = [bool(np.any(after[:, a:b] != before[:, a:b])) for a, b in ((0, 3), (3, 8))]
         assert moved == [step >= 2, step >= 4], f"step {step} moves bands {moved}"
@@ -248,9 +252,9 @@ def test_bands_of_the_harmonics_move_from_their_own_step_on(backend):
 @law("training", "whole_run")
 def test_a_run_to_its_end_takes_the_steps_that_can_be_asked_for_one_by_one(backend):
     settings = {**CHANGES, "reset_every": 0}
-    course = Course("pop", settings, {**SHORT, "max_steps": 4}, (0, 1, 0, 1), seed=34, held_out=1)
-    last = backend.stage("taken_steps")(course)[-1]["params"]
+    short = ShortTraining("pop", settings, {**SHORT, "max_steps": 4}, (0, 1, 0, 1), seed=34, held_out=1)
+    last = backend.stage("taken_steps")(short)[-1]["params"]
     with TemporaryDirectory() as folder:
-        whole = backend.stage("whole_run")(course, folder)
+        whole = backend.stage("whole_run")(short, folder)
     for key, found in zip(KEYS, whole, strict=True):
         assert_same_bits(key, found, last[key])

@@ -21,7 +21,7 @@ SIZE: Final = 13, 11
 
 
 @dataclass(frozen=True)
-class Course:
+class ShortTraining:
     """A method, its settings, and the photographs that it is trained on.
 
     Attributes:

@@ -2,7 +2,7 @@
 
 `training.train_step` is what a step of 3DGS and of POP is; methods that pass over all photographs change the Gaussians
 between two steps by `methods`, with renders where a script would say what they show. Taming-3DGS's scores are left to
-scripts: no course of it may grow.
+scripts: no short training of it may grow.
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from pop_ref.contributions import Contributions, contributions
 from pop_ref.density import Rows, rows_from_params
 from pop_ref.recipes import Recipe
 from pop_ref.records import Camera
-from pop_ref.scripted import Course
+from pop_ref.scripted import ShortTraining
 from pop_ref.settings import LearningRates
 from pop_ref.splatting import project
 from pop_ref.tiles import tile_lists
 
 
 class Trained:
-    """A course on its way.
+    """A short training on its way.
 
     Attributes:
         driven: the method, with its Gaussians.
         step: number of the next step, from 0.
     """
 
-    def __init__(self, course: Course) -> None:
-        self.course, self.step = course, 0
-        shown: Any = _Shown(course, self)
-        self.driven: Any = methods.Driven(shown, rows_from_params(dict(course.params)))
+    def __init__(self, short: ShortTraining) -> None:
+        self.short, self.step = short, 0
+        shown: Any = _Shown(short, self)
+        self.driven: Any = methods.Driven(shown, rows_from_params(dict(short.params)))
         # no update has been made
         self.driven.counters = dict.fromkeys(methods.KEYS, 0.0)
-        self.driven.recipe = _with_options(self.driven.recipe, course)
+        self.driven.recipe = _with_options(self.driven.recipe, short)
 
     @property
     def recipe(self) -> Recipe:
@@ -51,16 +51,16 @@ class Trained:
         """Render a view and compare it with its photograph; see `training.look`."""
         driven = self.driven
         state = training.Training(driven.rows, driven.window, self.step, driven.waiting)
-        return training.look(state, *_seen(self.course, view, self.recipe))
+        return training.look(state, *_seen(self.short, view, self.recipe))
 
     def move(self, view: int, found: training.Look) -> None:
         """Let Adam move what is due, and let the view join the window."""
-        driven, course, recipe = self.driven, self.course, self.recipe
+        driven, short, recipe = self.driven, self.short, self.recipe
         state = training.Training(driven.rows, driven.window, self.step, driven.waiting)
         numbers = methods.optimizer.update_numbers(methods.KEYS, self.step, recipe)
         driven.counters |= {name: float(number) for name, number in numbers.items()}
-        driven.rows, driven.waiting = training.update(driven.rows, found.grads, state, course.scene_scale, recipe)
-        camera, mask = course.cameras[view], course.mask(view)
+        driven.rows, driven.waiting = training.update(driven.rows, found.grads, state, short.scene_scale, recipe)
+        camera, mask = short.cameras[view], short.mask(view)
         seen = (found.v_means2d, found.visible, found.dominant_counts, camera.width, camera.height)
         kept = None if mask is None else int(np.sum(mask))
         if self.step < recipe.density.refine_stop_iter:
@@ -73,41 +73,41 @@ class Trained:
         return {name: count for name, count in done.items() if count}
 
 
-def taken_steps(course: Course) -> list[dict[str, Any]]:
-    """Take the steps of a course.
+def taken_steps(short: ShortTraining) -> list[dict[str, Any]]:
+    """Take the steps of a short training.
 
     Source: POP paper, section 3, and the papers and code of the methods (`recipes`, `methods.Extras`).
     Departs: nothing.
 
     Args:
-        course: what is trained, and on what.
+        short: what is trained, and on what.
 
     Returns:
         Of every step: its "view", its "loss", which is that of the parameters before it, and "params", "m" and "v"
         after it.
 
     Example:
-        >>> from pop_ref.conformance.courses import Course
-        >>> first, second = taken_steps(Course("gsplat", order=(0, 1)))
+        >>> from pop_ref.conformance.short_training import ShortTraining
+        >>> first, second = taken_steps(ShortTraining("gsplat", order=(0, 1)))
         >>> first["view"], second["view"], first["params"]["means"].shape
         (0, 1, (6, 3))
     """
-    if course.method in ("pup", "mini-splatting", "speedy-splat"):
-        return _taken_with_passes(course)
-    recipe = Trained(course).recipe
-    state, draws = training.start(course.params), course.draws()
+    if short.method in ("pup", "mini-splatting", "speedy-splat"):
+        return _taken_with_passes(short)
+    recipe = Trained(short).recipe
+    state, draws = training.start(short.params), short.draws()
     found: list[dict[str, Any]] = []
-    for view in course.order:
-        camera, target, scale, _, *more = _seen(course, view, recipe)
+    for view in short.order:
+        camera, target, scale, _, *more = _seen(short, view, recipe)
         state, loss = training.train_step(state, camera, target, scale, draws.normals, recipe, *more)
         found.append(_record(view, loss, state.rows))
     return found
 
 
-def _taken_with_passes(course: Course) -> list[dict[str, Any]]:
-    trained = Trained(course)
+def _taken_with_passes(short: ShortTraining) -> list[dict[str, Any]]:
+    trained = Trained(short)
     found: list[dict[str, Any]] = []
-    for view in course.order:
+    for view in short.order:
         seen = trained.look(view)
         trained.move(view, seen)
         trained.change()
@@ -119,70 +119,70 @@ def _record(view: int, loss: float, rows: Rows) -> dict[str, Any]:
     return {"view": view, "loss": loss, "params": dict(rows.params), "m": dict(rows.m), "v": dict(rows.v)}
 
 
-def _seen(course: Course, view: int, recipe: Recipe) -> tuple[Any, ...]:
+def _seen(short: ShortTraining, view: int, recipe: Recipe) -> tuple[Any, ...]:
     """Return what `training.look` takes of a view."""
-    target, points, mask = course.photo(view) / 255.0, course.points(view), course.mask(view)
-    background = np.array(course.background)
-    return course.cameras[view], target, course.scene_scale, recipe, points, mask, background, course.antialiased
+    target, points, mask = short.photo(view) / 255.0, short.points(view), short.mask(view)
+    background = np.array(short.background)
+    return short.cameras[view], target, short.scene_scale, recipe, points, mask, background, short.antialiased
 
 
-def _with_options(recipe: Recipe, course: Course) -> Recipe:
-    return replace(recipe, **{name: value for name, value in course.options.items() if name not in ("lr", "max_steps")})
+def _with_options(recipe: Recipe, short: ShortTraining) -> Recipe:
+    return replace(recipe, **{name: value for name, value in short.options.items() if name not in ("lr", "max_steps")})
 
 
 @dataclass(frozen=True)
 class _Shown:
-    """A course as `methods` is shown a script: what passes say is rendered of the Gaussians as they are."""
+    """A short training as `methods` is shown a script: what passes say is rendered of the Gaussians as they are."""
 
-    course: Course
+    short: ShortTraining
     trained: Trained
     cameras: int = 1
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self.course, name)
+        return getattr(self.short, name)
 
     @property
     def lr(self) -> LearningRates:
-        own = methods.RECIPE_OF[self.course.method].lr
-        found: LearningRates = self.course.options.get("lr", own)
+        own = methods.RECIPE_OF[self.short.method].lr
+        found: LearningRates = self.short.options.get("lr", own)
         return found
 
     @property
     def max_steps(self) -> int:
-        return int(self.course.options.get("max_steps", methods.RECIPE_OF[self.course.method].max_steps))
+        return int(self.short.options.get("max_steps", methods.RECIPE_OF[self.short.method].max_steps))
 
     @property
     def n_views(self) -> int:
-        return len(self.course.cameras)
+        return len(self.short.cameras)
 
     @property
     def width(self) -> int:
-        return self.course.cameras[0].width
+        return self.short.cameras[0].width
 
     @property
     def height(self) -> int:
-        return self.course.cameras[0].height
+        return self.short.cameras[0].height
 
     def sh_degree(self, step: int) -> int:
-        recipe, bands = self.trained.recipe, self.course.params["shN"].shape[1] + 1
+        recipe, bands = self.trained.recipe, self.short.params["shN"].shape[1] + 1
         degree = round(np.sqrt(bands)) - 1
         return methods.optimizer.sh_degree_at(step, recipe.sh_interval, degree, recipe.updates.sh_start_iter)
 
     def over(self, index: int, n: int, sh_degree: int = 0, divisor: int = 1) -> _Rendered:
-        return _Rendered(self.course, self.trained, index, sh_degree, divisor)
+        return _Rendered(self.short, self.trained, index, sh_degree, divisor)
 
 
 class _Rendered:
     """What `scripted.Pass` says, of a view of the Gaussians as they are, each part when it is asked for."""
 
-    def __init__(self, course: Course, trained: Trained, index: int, sh_degree: int, divisor: int) -> None:
-        own, self._degree, self._profile = course.cameras[index], sh_degree, trained.recipe.profile
+    def __init__(self, short: ShortTraining, trained: Trained, index: int, sh_degree: int, divisor: int) -> None:
+        own, self._degree, self._profile = short.cameras[index], sh_degree, trained.recipe.profile
         self._gaussians = training.gaussians_from_params(trained.driven.rows.params)
         width, height = -(-own.width // divisor), -(-own.height // divisor)
         K = np.diag([width / own.width, height / own.height, 1.0]) @ own.K
-        self._camera, self._mask = Camera(own.viewmat, K, width, height), course.mask(index)
-        self._behind, size = np.array(course.background), self._profile.tile_size
-        self._splats = project(self._gaussians, self._camera, sh_degree, self._profile, course.antialiased)
+        self._camera, self._mask = Camera(own.viewmat, K, width, height), short.mask(index)
+        self._behind, size = np.array(short.background), self._profile.tile_size
+        self._splats = project(self._gaussians, self._camera, sh_degree, self._profile, short.antialiased)
         given = (self._splats.means2d, self._splats.radii, self._splats.depths, width, height, size, self._profile)
         self._view = (self._splats, tile_lists(*given), width, height, size)
 
