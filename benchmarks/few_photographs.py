@@ -35,7 +35,6 @@ from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.evaluate import evaluate
 from pop_fast.train.views import ViewTensors
-from pop_ref.settings import BETAS
 
 # options of `pop train`
 SETTINGS: Final = (
@@ -106,8 +105,7 @@ def config_of(setting: str, steps: int, seed: int, data: Path, folder: str) -> T
         method = words[at + 1]
         del words[at : at + 2]
     said = TrainConfig.from_options(words, method=method, preset="quick").given
-    # the runs that are kept were taken when quick had Adam's usual decay
-    settings = {"lr.beta2": BETAS[1], **({} if said is None else said.settings)}
+    settings = {} if said is None else said.settings
     plan = {"method": method, "preset": "quick", "steps_scaler": steps / 30_000}
     given = TrainConfig.of(**plan, **settings, seed=seed, data=str(data), result_dir=f"{folder}/run", progress=False)
     return choose_backend(replace(given, checkpoint_every=0))[0]
