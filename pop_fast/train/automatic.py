@@ -43,9 +43,10 @@ SHORTEST: Final = 0.01
 # fewer of a step's kind do not tell how long it takes
 _TIMED_STEPS: Final = 40
 _TIMED_SECONDS: Final = 4.0
-# steps with trained Gaussians, which are opaque, take this share of what those with the first ones take, nearly
-# transparent all; processor time of whole runs on fox and bear_512 against what was timed before: 0.72 and 0.85
-_TRAINED: Final = 0.8
+# steps of a run take this share of what they took when they were timed, before any training: while Gaussians still grow
+# as much, and 0.8 at the end of the paper's schedule, when most are opaque or gone. Short runs took 1.03 (fox), 0.97
+# (bear_512), 0.91 (bonsai) and 1.16 (garden) of it by processor time, whole ones 0.72 (fox) and 0.85 (bear_512)
+_TRAINED: Final = ((0.1, 1.0), (1.0, 0.8))
 # and those of a run with few steps, whose first photographs are coarse, this share of that: whole runs of preset
 # "quick" took 0.76 to 0.88 of what they would have if all their steps had taken what the last ones did
 _COARSE: Final = 0.8
@@ -53,12 +54,14 @@ _COARSE: Final = 0.8
 _RENDER: Final = 0.4
 # renders that end a run: the turn about the subject, training views of the report, views of the table of sizes
 _RENDERS: Final = 100
-_FILES: Final = 5.0  # s, for exports and the page
+# s, for the page and the turn's film, and for a Gaussian in the formats of the table of sizes and in every render
+_FILES: Final = 4.0
+_WRITTEN: Final = 1.7e-4
 # bytes of a Gaussian while it is trained: 59 numbers, their gradients, two moments of Adam, and what edits copy
 _GAUSSIAN_BYTES: Final = 59 * 4 * 6
 _PROGRAM_BYTES: Final = 450e6
-# of a photograph's pixel: it, its tensor and what SSIM needs of it
-_PIXEL_BYTES: Final = 30
+# of a photograph's pixel: it, its tensor and what SSIM needs of it; fitted to fox, bear_512, bonsai and garden
+_PIXEL_BYTES: Final = 42
 
 
 @dataclass(frozen=True)
@@ -167,8 +170,9 @@ def choose_length(
     def seconds(scaler: float) -> float:
         last, mean = expected(scaler)
         renders = _RENDER * speed.seconds_a_step(last) * (3 * held_out + _RENDERS)
-        share = _TRAINED * (_COARSE if scaler <= QUICK_SCALER else 1.0)
-        return speed.took + share * steps * scaler * speed.seconds_a_step(mean) + renders + _FILES
+        share = _trained_share(scaler) * (_COARSE if scaler <= QUICK_SCALER else 1.0)
+        written = _FILES + _WRITTEN * last
+        return speed.took + share * steps * scaler * speed.seconds_a_step(mean) + renders + written
 
     trained = photographs - held_out
     longest = min(1.0, LOOKS * trained / (steps * config.batch_size)) if trained <= FEW else 1.0
@@ -186,6 +190,13 @@ def choose_length(
         why = f"each of {trained} photographs is seen {LOOKS} times: what more steps learn fits few photographs alone "
         why += "(--steps-scaler S takes more)"
     return Choice(scaler, gaussians, seconds(scaler), memory, why)
+
+
+def _trained_share(scaler: float) -> float:
+    """Give the share of a timed step that a step takes on average, between that of short and of whole schedules."""
+    (short, of_short), (whole, of_whole) = _TRAINED
+    part = math.log(max(scaler, short) / short) / math.log(whole / short)
+    return of_short + part * (of_whole - of_short)
 
 
 # how often each of few photographs is seen. Of 9 of a castle and 15 from the air, held-out views, scaled to their

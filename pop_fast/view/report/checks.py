@@ -193,14 +193,15 @@ def near_limit(view: View, points: np.ndarray) -> float | None:
     Returns:
         The limit, world units; None where too few points are in the picture to tell.
     """
-    seen = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
-    seen = seen[seen[:, 2] > 1e-6]
-    pixels = seen @ view.K.T
-    pixels = pixels[:, :2] / pixels[:, 2:]
-    inside = ((pixels >= 0.0) & (pixels < [view.width, view.height])).all(axis=1)
+    # a row of numbers for each axis: of hundreds of views and as many thousand points, that takes a tenth of the time
+    seen = view.viewmat[:3, :3] @ points.T + view.viewmat[:3, 3:]
+    columns, rows, depths = view.K @ seen
+    before = seen[2] > 1e-6
+    inside = before & (columns >= 0.0) & (columns < view.width * depths)
+    inside &= (rows >= 0.0) & (rows < view.height * depths)
     if inside.sum() < _FEWEST_POINTS:
         return None
-    return _NEAR * float(np.quantile(seen[inside, 2], _NEAREST_POINTS))
+    return _NEAR * float(np.quantile(seen[2][inside], _NEAREST_POINTS))
 
 
 def nearer_than(params: Mapping[str, Tensor], view: View, limit: float) -> dict[str, Tensor]:
