@@ -22,8 +22,8 @@ R = TypeVar("R")
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Look a capture over before training: lenses, sizes, EXIF, pairing, masks, points, reprojection, memory; and its
-    photographs: blur, exposure, copies. A folder of photographs alone can be looked over too.
+    """Look a capture over before training: lenses, spacing, sizes, EXIF, pairing, masks, points, reprojection, memory;
+    and its photographs: blur, exposure, copies. A folder of photographs alone can be looked over too.
 
     Exit status 0 when nothing stands against training, 1 when something does.
     """
@@ -86,6 +86,7 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
     findings = [CaptureFinding("ok" if len(shots) > 1 else "bad", "poses", what)]
     findings += [CaptureFinding("warn", "poses", note) for note in listing.notes]
     findings += check_dataset.about_cameras(shots)
+    findings += check_dataset.about_spacing(shots)
     paths = {id(shot): check_dataset.file_of(root, shot) for shot in shots}
     photos, damage = _each(
         shots, lambda shot: check_dataset.read_photo(shot, paths[id(shot)], cloud), lambda shot: paths[id(shot)]

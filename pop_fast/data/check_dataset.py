@@ -14,6 +14,7 @@ from pop_fast.data.capture import Listing, PosedImage, SparsePoints
 from pop_fast.data.colmap import find_model
 from pop_fast.data.exposure_drift import UNEVEN, exposures, levels_at
 from pop_fast.data.load import find_listing
+from pop_fast.data.normalize import FAR_APART, nearest_cameras
 from pop_fast.data.photo_quality import (
     CaptureFinding,
     Shown,
@@ -30,6 +31,8 @@ from pop_fast.io.images import find_image, list_images, read_image, read_mask, u
 
 # bytes of a Gaussian in training: 59 float32 numbers, each with its gradient and two moments of Adam
 BYTES_IN_TRAINING = 59 * 4 * 4
+# gaps between cameras that are named
+_GAPS = 3
 
 
 @dataclass(frozen=True)
@@ -106,6 +109,24 @@ def about_cameras(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:
         yield CaptureFinding("ok", "cameras", f"{count} x {kind}")
     if len(kinds) > 8:
         yield CaptureFinding("ok", "cameras", f"and {len(kinds) - 8} more kinds")
+
+
+def about_spacing(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:
+    """Tell how far apart neighbouring cameras are, and where the widest gaps are that photographs would fill."""
+    found = nearest_cameras(np.stack([shot.viewmat for shot in shots])) if shots else None
+    if found is None:
+        return
+    nearest, degrees = found
+    median, gaps = float(np.median(degrees)), {}
+    for k in np.argsort(-degrees, kind="stable"):
+        pair = tuple(sorted((shots[k].name, shots[nearest[k]].name)))
+        gaps.setdefault(pair, f"{degrees[k]:.0f} degrees between {pair[0]} and {pair[1]}")
+    apart = f"neighbours {median:.1f} degrees apart as the subject sees them (median)"
+    if median <= FAR_APART:
+        yield CaptureFinding("ok", "spacing", f"{apart}; at most {next(iter(gaps.values()))}")
+        return
+    wide = ", ".join(list(gaps.values())[:_GAPS])
+    yield CaptureFinding("warn", "spacing", f"{apart}: far; photographs between these would help most: {wide}")
 
 
 def about_photos(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding]:

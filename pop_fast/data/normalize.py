@@ -102,14 +102,19 @@ def look_at_one_point(viewmats: np.ndarray) -> bool:
     return bool(np.mean(cosines >= np.cos(_LOOKS_AT)) >= _MOST_CAMERAS)
 
 
-def neighbour_degrees(viewmats: np.ndarray) -> float | None:
-    """Give the median angle from a camera to the nearest other one, seen from the point they look at.
+# degrees between neighbouring cameras from which what lies between them is guessed
+FAR_APART: Final = 15.0
+
+
+def nearest_cameras(viewmats: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Find the nearest other camera of each, as the point that they look at sees them.
 
     Args:
         viewmats: world -> camera. [V, 4, 4]
 
     Returns:
-        Degrees; None of a single camera, and where they look at no one point.
+        Its number, and the angle to it, degrees; [V] each. None of a single camera, and where they look at no one
+        point.
     """
     if len(viewmats) < 2 or not look_at_one_point(viewmats):
         return None
@@ -117,7 +122,13 @@ def neighbour_degrees(viewmats: np.ndarray) -> float | None:
     rays = offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12)
     cosines = rays @ rays.T
     np.fill_diagonal(cosines, -1.0)
-    return float(np.degrees(np.median(np.arccos(np.clip(cosines.max(axis=1), -1.0, 1.0)))))
+    return cosines.argmax(axis=1), np.degrees(np.arccos(np.clip(cosines.max(axis=1), -1.0, 1.0)))
+
+
+def neighbour_degrees(viewmats: np.ndarray) -> float | None:
+    """Give the median of the angles of `nearest_cameras`, degrees; None where there are none."""
+    found = nearest_cameras(viewmats)
+    return None if found is None else float(np.median(found[1]))
 
 
 def _from_cameras(viewmats: np.ndarray) -> np.ndarray:

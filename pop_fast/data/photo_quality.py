@@ -52,7 +52,7 @@ _FEATURES: Final = 500
 # mean difference of two thumbnails, of 255: noise and compression leave less, a step to the side more
 _SAME: Final = 1.2
 # photographs of a set under which there is too little to see from all sides
-_FEW: Final = 20
+FEW: Final = 20
 
 
 @dataclass(frozen=True)
@@ -161,8 +161,8 @@ def about_quality(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
 
 def about_number(count: int) -> Iterator[CaptureFinding]:
     """Tell that there are few photographs."""
-    if count < _FEW:
-        fix = f"{_FEW} to 200 that overlap by two thirds show a scene from all sides"
+    if count < FEW:
+        fix = f"{FEW} to 200 that overlap by two thirds show a scene from all sides"
         yield CaptureFinding("warn", "photographs", f"{count} {number(count, 'is', 'are')} few; {fix}")
 
 

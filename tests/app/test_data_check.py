@@ -20,7 +20,7 @@ from pop_fast.data import load_capture, sfm
 from pop_fast.demo.scene import make_scene
 from pop_fast.demo.tracer import render_view
 from pop_fast.io import images
-from tests.app.captures import colmap_capture, look_at, photograph, write_photograph
+from tests.app.captures import colmap_capture, look_at, photograph, ring, write_model, write_photograph
 from tests.app.conftest import Pop
 from tests.app.damage import says
 
@@ -280,7 +280,21 @@ def test_a_sound_capture_is_ready(pop: Pop, shared_capture: Path) -> None:
     assert "8 of 40x32 px" in finding(lines, "ok", "photographs")
     assert "mean error" in finding(lines, "ok", "reprojection")
     assert "at factor 4" in finding(lines, "ok", "memory")
-    assert not any(line.startswith(("LOOK", "BAD")) for line in lines)
+    # eight photographs around a still life are far apart
+    assert [line.split()[1] for line in lines if line.startswith(("LOOK", "BAD"))] == ["spacing"]
+
+
+def test_the_widest_gaps_between_cameras_are_named(pop: Pop, tmp_path: Path) -> None:
+    whole = colmap_capture(tmp_path / "whole", count=36)
+    found = finding(check(pop, whole, 0), "ok", "spacing")
+    assert "neighbours 9.5 degrees apart as the subject sees them (median)" in found
+    # every fourth of these cameras, and one more beside the first
+    numbers = [0, 1, *range(4, 36, 4)]
+    names = [f"{number:02d}.png" for number in numbers]
+    write_model(whole / "sparse" / "0", names, ring(36)[numbers])
+    found = finding(check(pop, whole, 0), "LOOK", "spacing")
+    assert "far; photographs between these would help most: 38 degrees between" in found
+    assert "00.png and 01.png" not in found
 
 
 def test_every_problem_of_a_damaged_capture_is_listed_at_once(pop: Pop, capture: Path) -> None:

@@ -11,6 +11,8 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
+from pop_fast.data.normalize import FAR_APART
+from pop_fast.data.photo_quality import FEW
 from pop_fast.train.automatic import LOOKS
 from pop_fast.view.report.checks import Checks
 from pop_fast.view.report.curves import Window
@@ -21,8 +23,6 @@ _SOME_OVERFITTING: Final = 3.0
 _OVERFITTED: Final = 6.0
 _ONE_VIEW: Final = 1.0  # dB that a single held-out view takes off the mean
 _FELL: Final = 0.3  # dB between the best held-out measurement and the last
-_FEW: Final = 20
-_FAR_APART: Final = 15.0  # degrees between neighbouring cameras
 _DRIFT: Final = 0.15  # stops, standard deviation over the photographs
 _ONE_OFF: Final = 0.35  # stops, of a single photograph
 _FLOATERS: Final = 0.01  # of the pixels
@@ -218,7 +218,7 @@ def _photographs(checks: Checks) -> Iterator[Finding]:
     """Judge count and spacing against the gap that was found: what leaves a wide one is not enough."""
     n, apart, gap = checks.photographs, checks.neighbour_degrees, _gap(checks)
     spacing = "" if apart is None else f", neighbours {apart:.1f} degrees apart as the subject sees them (median)"
-    few, far = n < _FEW, apart is not None and apart > _FAR_APART
+    few, far = n < FEW, apart is not None and apart > FAR_APART
     missing = gap >= _OVERFITTED
     if not few and not far and not missing:
         yield Finding("good", "Photographs", f"{n} trained on{spacing}: enough.")
