@@ -42,11 +42,17 @@ class Trainee:
         """Take steps of several views each: "view" lists them."""
         return self.taken_steps(short)
 
-    def learned_exposures(self, short: ShortTraining, rate: float) -> list[np.ndarray]:
-        """Return the exposures of all photographs after every step, of which each learns at a rate. [V, 3, 4]"""
+    def learned_exposures(self, short: ShortTraining, rate: float, stops: tuple[int, ...] = ()) -> list[np.ndarray]:
+        """Return the exposures of all photographs after every step, of which each learns at a rate. [V, 3, 4]
+
+        Args:
+            short: what is trained.
+            rate: of exposures.
+            stops: `coarse_stop_iters`: the first steps see their photographs shrunk.
+        """
         config = importlib.import_module("pop_ref.settings")
         rates = config.AppearanceRates(exposures=rate, exposures_decay=1.0)
-        run = self._run(short, exposure=True, appearance_lr=rates)
+        run = self._run(short, exposure=True, appearance_lr=rates, coarse_stop_iters=stops)
         found: list[np.ndarray] = []
         for step in range(short.steps):
             self._step(run, step)

@@ -16,7 +16,7 @@ from pop_ref.activations import opacities_from_logits, scales_from_log_scales
 from pop_ref.conformance.error_bounds import PixelErrorBounds, pixel_error_bounds
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.scenes import Scene
-from pop_ref.conformance.views import cameras, clear_of_extents, gaussians
+from pop_ref.conformance.views import SIZE, cameras, clear_of_extents, gaussians
 from pop_ref.constants import PAPER
 from pop_ref.density import Statistics, accumulate, zero_statistics
 from pop_ref.density_config import DensityConfig
@@ -27,6 +27,8 @@ from pop_ref.render import Render, render, render_vjp
 
 VIEWS = 3
 BACKGROUND = (0.25, 0.5, 0.75)
+# width and height of the view that has a size of its own, px
+_OTHER = 12, 14
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,7 @@ class Watch:
         masked: whether views have pixels that do not count, those among them that rounding decides.
         antialiased: whether opacities make up for the low-pass.
         sh_interval: steps between bands.
+        mixed: whether the second view has a size of its own.
         regularizers: weights of the settings' own terms of the loss, by name; the oracle's gradients leave them out.
     """
 
@@ -51,6 +54,7 @@ class Watch:
     masked: bool = False
     antialiased: bool = False
     sh_interval: int = 2
+    mixed: bool = False
     regularizers: Mapping[str, float] = field(default_factory=dict[str, float])
 
     @property
@@ -76,8 +80,12 @@ class Watch:
     @functools.cached_property
     def cameras(self) -> list[Camera]:
         """Return the views' cameras in numbers of single precision."""
-        single = [(c.viewmat.astype(np.float32), c.K.astype(np.float32), c) for c in cameras(VIEWS)]
-        return [Camera(viewmat.astype(np.float64), K.astype(np.float64), c.width, c.height) for viewmat, K, c in single]
+        single = [(c.viewmat.astype(np.float32), c.K.astype(np.float32)) for c in cameras(VIEWS)]
+        sizes = [_OTHER if self.mixed and view == 1 else SIZE for view in range(VIEWS)]
+        return [
+            Camera(viewmat.astype(np.float64), K.astype(np.float64), *size)
+            for (viewmat, K), size in zip(single, sizes, strict=True)
+        ]
 
     def photo(self, view: int) -> np.ndarray:
         """Return a view's photograph. uint8 [H, W, 3]"""

@@ -208,6 +208,21 @@ def test_gradients_under_the_lower_ceiling_are_the_oracles(backend, scene):
     _gradients_agree(backend, scene)
 
 
+def _opaque(scene):
+    """Return a scene that is opaque, so that alphas pass the ceiling near the centres."""
+    return scene.with_overrides(opacities=np.ones(len(scene.gaussians.means)))
+
+
+@law(
+    "gradients",
+    GRADIENTS,
+    INRIAS,
+    scene=scenes(profile=INRIA, anchored=True, max_gaussians=3, size=plain_sizes(), max_side=12).map(_opaque),
+)
+def test_gradients_under_inrias_ceiling_pass_through_it_as_the_oracles_do(backend, scene):
+    _gradients_agree(backend, scene)
+
+
 @law(
     "gradients",
     GRADIENTS,

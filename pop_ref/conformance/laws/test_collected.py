@@ -27,8 +27,9 @@ DIVISOR = 4
 
 
 @functools.cache
-def _watch(first_seed, batch=1, masked=False, antialiased=False, sh_interval=2, **settings):
+def _watch(first_seed, batch=1, masked=False, antialiased=False, sh_interval=2, mixed=False, **settings):
     options = {"batch": batch, "masked": masked, "antialiased": antialiased, "sh_interval": sh_interval}
+    options |= {"mixed": mixed}
     return clear_watch(first_seed, order=ORDER, settings={**BLUR, **settings}, **options)
 
 
@@ -94,6 +95,12 @@ def test_the_views_of_one_step_are_collected_one_after_the_other(backend):
         _assert_flags(_assert_collected(backend, 0, batch=2, blur_window=window))
     for got, wanted in _assert_collected(backend, 0, batch=2, masked=True, blur_window="sum"):
         assert_same_bits("dominated pixels", got["dominant_sum"], wanted.window.dominant_sum)
+
+
+@law("training", "collected_statistics")
+def test_views_of_one_step_are_collected_at_their_own_sizes(backend):
+    for masked in (False, True):
+        _assert_flags(_assert_collected(backend, 0, batch=2, mixed=True, masked=masked))
 
 
 @law("training", "collected_statistics")

@@ -83,6 +83,14 @@ def test_antialiasing_hides_a_point_and_hardly_touches_a_large_splat(backend, ep
     assert_close("footprint.energy", factors, np.array([0.0, 1.0]), 1.0, backend.dtype)
 
 
+@law("footprint", "compensations", power=st.integers(4, 10), eps2d=dyadic(0.125, 1.0))
+def test_antialiasing_dims_a_speck_as_much_as_the_low_pass_widens_it(backend, power, eps2d):
+    # a disc: its variance over the widened one, down to a thousandth of a pixel
+    variance = 2.0 ** (-2 * power)
+    factor = backend.stage("compensations")(variance * np.eye(2)[None], eps2d)[0]
+    assert_close("footprint.energy", factor * (variance + eps2d) / variance, 1.0, 16.0, backend.dtype)
+
+
 @law("footprint", "radii_from_covars2d", covar=covariances(), opacity=opacities())
 def test_no_point_as_bright_as_the_floor_lies_outside_the_extent(backend, covar, opacity):
     # D2: the ellipse o exp(-sigma) = floor, walked around, stays within the rectangle

@@ -6,6 +6,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
+from pop_ref.conformance.capabilities import SCALE
 from pop_ref.conformance.law import law
 from pop_ref.conformance.scenes import pattern
 from pop_ref.conformance.strategies import arrays_of, dyadic
@@ -49,6 +50,16 @@ def test_similarity_is_symmetric_at_most_one_and_the_loss_is_its_complement(back
     assert_close("losses.ssim", other, one, 1.0, backend.dtype)
     assert_close("losses.ssim", backend.stage("d_ssim")(image, target, padding), 1.0 - one, 2.0, backend.dtype)
     assert_close("losses.ssim", similarity(image, image, padding), 1.0, 1.0, backend.dtype)
+
+
+@law("losses", *SSIM_NAMES, SCALE)
+def test_a_large_picture_is_as_similar_as_its_halves_are(backend):
+    # 288,000 values: more than a program compares at once; the halves share the ten rows that windows reach over
+    image, target = np.random.default_rng(7).random((2, 320, 300, 3))
+    for name in SSIM_NAMES:
+        loss = backend.stage(name)
+        halves = [loss(image[rows], target[rows], "valid") for rows in (slice(0, 165), slice(155, 320))]
+        assert_close("losses.ssim", loss(image, target, "valid"), np.mean(halves), 2.0, backend.dtype)
 
 
 @law("losses", "ssim", level=dyadic(0.0, 1.0), other=dyadic(0.0, 1.0))

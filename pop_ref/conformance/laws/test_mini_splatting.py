@@ -63,6 +63,14 @@ def test_a_point_is_as_large_as_its_three_neighbours_are_far(backend, points):
     assert_close("mini_splatting.scales", found, np.repeat(expected[:, None], 3, 1), 20.0, backend.dtype)
 
 
+@law("mini_splatting", "nearest_log_scales", points=points, count=st.integers(1, 3))
+def test_of_fewer_than_four_points_the_mean_is_over_those_that_there_are(backend, points, count):
+    found = backend.stage("nearest_log_scales")(points[:count])
+    squared = np.sum((points[:count, None] - points[None, :count]) ** 2, axis=2)
+    expected = 0.5 * np.log(np.maximum(np.sum(squared, axis=1) / max(count - 1, 1), 1e-7))
+    assert_close("mini_splatting.scales", found, np.repeat(expected[:, None], 3, 1), 20.0, backend.dtype)
+
+
 @law("mini_splatting", "nearest_log_scales", points=points, shift=arrays_of((3,), -4.0, 4.0))
 def test_sizes_move_with_their_points_and_grow_with_the_scene(backend, points, shift):
     size = backend.stage("nearest_log_scales")

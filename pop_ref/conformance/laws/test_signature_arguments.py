@@ -76,6 +76,18 @@ def test_the_near_and_the_far_plane_are_where_the_call_says(backend):
 
 
 @law("signature", *JUDGED, PLANES)
+def test_the_far_plane_culls_by_depth_and_not_by_distance(backend):
+    frame = frames(backend, 5)[0]
+    camera, means = frame.scene.camera, frame.scene.gaussians.means
+    seen = means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    shown = expectations(backend, Call(((frame,),)))[0][0].render.splats.visible
+    beyond = np.where(shown, np.linalg.norm(seen, axis=1) - seen[:, 2], 0.0)
+    between = float(seen[np.argmax(beyond), 2] + 0.5 * np.max(beyond))
+    assert np.min(np.abs(seen[:, 2] - between)) > 2.0**-8, "a depth is at the plane"
+    assert_call_is_the_oracles(backend, Call(((frame,),), planes={"far_plane": between}))
+
+
+@law("signature", *JUDGED, PLANES)
 def test_a_centre_on_the_far_plane_is_drawn_and_one_on_the_near_plane_as_the_profile_says(backend):
     (frame,) = frames(backend, 5)
     one = {"means": [[0.0, 0.0, 3.0]], "scales": [[0.5, 0.5, 0.5]], "opacities": [0.75], "viewmat": np.eye(4)}

@@ -65,6 +65,15 @@ def test_a_splat_that_cannot_be_seen_has_no_box_and_no_tiles_under_the_floor(bac
         assert len(backend.stage("accutile")(at, conic, opacity, (0, 0, ACROSS, DOWN), SIZE)) == 0
 
 
+@law("tight_tiles", "accutile", at=quarters, opacity=seen_opacities, x=st.integers(0, 2), y=st.integers(0, 2))
+def test_a_conic_without_an_ellipse_keeps_its_whole_rectangle(backend, at, opacity, x, y):
+    # rounding leaves such conics of needles: a determinant of 0, and one under it
+    whole = {(column, row) for row in range(y, y + 2) for column in range(x, x + 3)}
+    for conic in ([1.0, 1.0, 1.0], [0.25, 0.5, 0.5]):
+        tiles = backend.stage("accutile")(at, np.array(conic), opacity, (x, y, x + 3, y + 2), SIZE)
+        assert sorted((int(column), int(row)) for column, row in tiles) == sorted(whole)
+
+
 @law("tight_tiles", "accutile", at=quarters, a=variances, c=variances, leaning=leanings, opacity=seen_opacities)
 def test_a_tile_is_kept_exactly_if_it_meets_the_ellipse_of_what_can_be_seen(backend, at, a, c, leaning, opacity):
     conic = _conic(a, c, leaning)

@@ -81,6 +81,18 @@ def test_lists_run_front_to_back_and_equal_depths_keep_index_order(backend, plac
         assert keys == sorted(keys)
 
 
+@law("tiles", "tile_lists", depth=dyadic(0.5, 64.0), tile_size=tile_sizes)
+def test_depths_that_differ_in_their_last_bit_alone_are_told_apart(backend, depth, tile_size):
+    depths = [backend.dtype(depth)]
+    while len(depths) < 5:
+        depths.append(np.nextafter(depths[-1], backend.dtype(0.0), dtype=backend.dtype))
+    at = [(0.5 * W, 0.5 * H, 1, float(one)) for one in depths]
+    # each is nearer than the one before it
+    listed = [list(map(int, ids)) for ids in _lists(backend, at, tile_size) if len(ids)]
+    assert listed
+    assert all(ids == [4, 3, 2, 1, 0] for ids in listed)
+
+
 @law("tiles", "tile_lists", "tile_rects", placed=placed, tile_size=tile_sizes)
 def test_lists_hold_each_splat_once_in_each_tile_of_its_rectangle(backend, placed, tile_size):
     means2d, radii, _ = _columns(placed)

@@ -178,6 +178,17 @@ def test_an_exposure_learns_to_be_that_of_its_photograph(backend):
     assert_close("steps.still", exposures[seen] - exposures[1 - seen], np.full((3, 4), rate), 1.0, backend.dtype)
 
 
+@law("training", "learned_exposures")
+def test_a_shrunk_photograph_has_the_exposure_of_its_photograph(backend):
+    short = _Bright("pop", STILL, SHORT, (0,), seed=22, background=(0.05, 0.05, 0.05))
+    # the same order of views: the one that learns is the one that learns of whole photographs
+    whole, shrunk = (backend.stage("learned_exposures")(short, 2.0**-6, stops)[0] for stops in ((), (5,)))
+    seen = [int(exposures[1, 0, 3] > exposures[0, 0, 3]) for exposures in (whole, shrunk)]
+    assert seen[0] == seen[1], f"photograph {seen[0]} was seen shrunk, and photograph {seen[1]} learned"
+    # with as many places further on for each size, the last would be right by chance
+    assert seen[0] < short.views - 1
+
+
 class _Bright(ShortTraining):
     """A short training of white photographs."""
 
