@@ -117,10 +117,12 @@ def about_spacing(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:
     if found is None:
         return
     nearest, degrees = found
-    median, gaps = float(np.median(degrees)), {}
-    for k in np.argsort(-degrees, kind="stable"):
-        pair = tuple(sorted((shots[k].name, shots[nearest[k]].name)))
-        gaps.setdefault(pair, f"{degrees[k]:.0f} degrees between {pair[0]} and {pair[1]}")
+    median = float(np.median(degrees))
+    gaps: dict[tuple[int, int], str] = {}
+    for k in np.argsort(-degrees, kind="stable").tolist():
+        first, second = sorted((k, int(nearest[k])))
+        gap = f"{degrees[k]:.0f} degrees between {shots[first].name} and {shots[second].name}"
+        gaps.setdefault((first, second), gap)
     apart = f"neighbours {median:.1f} degrees apart as the subject sees them (median)"
     if median <= FAR_APART:
         yield CaptureFinding("ok", "spacing", f"{apart}; at most {next(iter(gaps.values()))}")

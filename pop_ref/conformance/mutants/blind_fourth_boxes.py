@@ -39,7 +39,7 @@ def _low_pass_factor_is_a_constant(sound: Rasterization, given: Given) -> Any:
 
 def _absolute_gradient_of_the_sum(given: Given, images: Any, alphas: Any, meta: Any) -> _Told:
     means2d = meta["means2d"]
-    absolute = getattr(means2d, "absgrad", None)
+    absolute: Any = getattr(means2d, "absgrad", None)
 
     def tell(gradient: Any) -> None:
         absolute.copy_(gradient.detach().abs())
