@@ -147,6 +147,14 @@ def few_photographs() -> str:
     return str(script["table_of"](known, (*weights, "--method gsplat")))
 
 
+def estimates() -> str:
+    """Make the table of what runs without a preset foretold and took, as benchmarks/estimates.py does."""
+    known = json.loads((ROOT / "benchmarks" / "results" / "estimates.json").read_text(encoding="utf-8"))
+    machine = known["machine"]
+    made = str(runpy.run_path(str(ROOT / "benchmarks" / "estimates.py"))["table_of"](known))
+    return f"{made}\n\n{machine['cpu']}, one thread, commit {machine['commit']}."
+
+
 def _of_faults(name: str) -> Callable[[], str]:
     """Make a table as benchmarks/fault_tables.py does."""
     return lambda: str(runpy.run_path(str(ROOT / "benchmarks" / "fault_tables.py"))[name]())
@@ -193,6 +201,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "results": results,
     "differences": differences,
     "few_photographs": few_photographs,
+    "estimates": estimates,
     **{name: _of_faults(name) for name in ("fuzzed", "disturbed", "sanitized", "loads")},
     "blocks": blocks,
     "recipes": recipes,
