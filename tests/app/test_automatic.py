@@ -39,7 +39,7 @@ from pop_fast.train.automatic import (
 from pop_fast.train.presets import QUICK_BETA2_UNTIL, QUICK_SCALER
 from pop_fast.view.paths import VideoFile
 from pop_fast.view.report.source import read_result
-from tests.app.conftest import Pop
+from tests.app.conftest import ROOT, Pop
 from tests.app.damage import says
 from tests.app.interruptions import interrupt
 from tests.app.tiny import tiny_capture
@@ -423,3 +423,13 @@ def test_the_line_before_the_first_step_is_read_back_for_the_table_of_estimates(
     assert table.splitlines()[2:] == ["| toy, 60 | 256x512, 300 | 3720 s, 1860 s | 0.50 | 35,000, 40,000 | 1.3, 1.2 |"]
     with pytest.raises(ValueError, match="no line says"):
         estimates.foretold("trained")
+
+
+def test_what_was_foretold_of_four_captures_came_within_thirty_percent() -> None:
+    known = json.loads((ROOT / "benchmarks" / "results" / "estimates.json").read_text(encoding="utf-8"))
+    rows = [row for name, row in known.items() if name != "machine"]
+    assert len(rows) == 4
+    for row in rows:
+        for name, said in row["foretold"].items():
+            assert said / 1.3 < row["came"][name] < 1.3 * said, (row, name)
+    assert "What was foretold came within 30 % on the four captures" in (ROOT / "docs" / "guide.md").read_text()
