@@ -31,7 +31,7 @@ from pop_fast.io.images import find_image, list_images, read_image, read_mask, u
 
 # bytes of a Gaussian in training: 59 float32 numbers, each with its gradient and two moments of Adam
 BYTES_IN_TRAINING = 59 * 4 * 4
-# gaps between cameras that are named
+# pairs of neighbouring cameras far apart that are named
 _GAPS = 3
 
 
@@ -112,7 +112,10 @@ def about_cameras(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:
 
 
 def about_spacing(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:
-    """Tell how far apart neighbouring cameras are, and where the widest gaps are that photographs would fill."""
+    """Tell how far apart neighbouring cameras are, and which stand farthest from the nearest other one.
+
+    A gap between two groups of cameras that stand close together each is not seen.
+    """
     found = nearest_cameras(np.stack([shot.viewmat for shot in shots])) if shots else None
     if found is None:
         return

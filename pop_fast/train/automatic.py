@@ -43,9 +43,9 @@ SHORTEST: Final = 0.01
 # fewer of a step's kind do not tell how long it takes
 _TIMED_STEPS: Final = 40
 _TIMED_SECONDS: Final = 4.0
-# steps of a run take this share of what they took when they were timed, before any training: while Gaussians still grow
-# as much, and 0.8 at the end of the paper's schedule, when most are opaque or gone. Short runs took 1.03 (fox), 0.97
-# (bear_512), 0.91 (bonsai) and 1.16 (garden) of it by processor time, whole ones 0.72 (fox) and 0.85 (bear_512)
+# steps of a run take this share of what they took when they were timed, before any training: all of it in short
+# schedules, and 0.8 on average over the paper's, in which most Gaussians become opaque. Short runs took 1.03 (fox),
+# 0.97 (bear_512), 0.91 (bonsai) and 1.16 (garden) of it by processor time, whole ones 0.72 (fox) and 0.85 (bear_512)
 _TRAINED: Final = ((0.1, 1.0), (1.0, 0.8))
 # and those of a run with few steps, whose first photographs are coarse, this share of that: whole runs of preset
 # "quick" took 0.76 to 0.88 of what they would have if all their steps had taken what the last ones did

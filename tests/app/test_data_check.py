@@ -284,7 +284,7 @@ def test_a_sound_capture_is_ready(pop: Pop, shared_capture: Path) -> None:
     assert [line.split()[1] for line in lines if line.startswith(("LOOK", "BAD"))] == ["spacing"]
 
 
-def test_the_widest_gaps_between_cameras_are_named(pop: Pop, tmp_path: Path) -> None:
+def test_cameras_that_stand_farthest_from_the_nearest_other_are_named(pop: Pop, tmp_path: Path) -> None:
     whole = colmap_capture(tmp_path / "whole", count=36)
     found = finding(check(pop, whole, 0), "ok", "spacing")
     assert "neighbours 9.5 degrees apart as the subject sees them (median)" in found

@@ -193,7 +193,7 @@ def near_limit(view: View, points: np.ndarray) -> float | None:
     Returns:
         The limit, world units; None where too few points are in the picture to tell.
     """
-    # a row of numbers for each axis: of hundreds of views and as many thousand points, that takes a tenth of the time
+    # a row of numbers for each axis: of hundreds of views and as many thousand points, that takes a fifth of the time
     seen = view.viewmat[:3, :3] @ points.T + view.viewmat[:3, 3:]
     columns, rows, depths = view.K @ seen
     before = seen[2] > 1e-6
