@@ -38,12 +38,12 @@ STAGES = (
     Stage(
         "L1, L2, SSIM and both objectives",
         "eqs. 2, 4, 9",
-        ("losses", "ssim", "loss_magnitudes"),
+        ("losses", "ssim", "magnitudes"),
         ("compiled/losses.py",),
     ),
     Stage("importance mask and POP loss", "eqs. 7, 8", ("polarization",)),
     Stage("terms for few photographs: sparse depth, mean opacity, mean scale", "–", ("regularizers",)),
-    Stage("density control", "eqs. 3, 6", ("density", "density_config", "density_rows")),
+    Stage("density control", "eqs. 3, 6", ("density", "density_rows")),
     Stage("Adam and its schedules", "4.1", ("optimizer",), ("train/model.py", "train/schedule.py")),
     Stage("exposure of photographs, random backgrounds", "–", ("appearance",), ("train/appearance.py",)),
     Stage("corrections of cameras", "–", ("refinement",), ("stages/appearance.py",)),
@@ -75,9 +75,7 @@ STAGES = (
     Stage("Taming-3DGS's budget and score", "4.2", ("taming",)),
     Stage("selection by score, by mass, by draw", "4.2", ("selection",)),
     Stage("exact tile lists (SnugBox, AccuTile)", "4.2", ("tight_tiles",), ("stages/tiles.py",)),
-    Stage(
-        "distance of every decision from flipping", "–", ("margins", "extent_margins", "pixel_margins", "magnitudes")
-    ),
+    Stage("distance of every decision from flipping", "–", ("margins", "magnitudes")),
 )
 
 # modules of pop_ref that are data or types, not stages

@@ -162,7 +162,7 @@ AMBIGUITIES: Final = (
         "L",
         "Are both ends of the blur window in it?",
         "yes: 41 densification steps",
-        "pop_ref.density_config:blurs_at",
+        "pop_ref.density:blurs_at",
         ("DensityConfig.blur_stop_iter = 6999",),
     ),
     Ambiguity(
@@ -203,7 +203,7 @@ AMBIGUITIES: Final = (
         "M",
         "Are opacities reset at step 0, as gsplat 1.1 to 1.5.2 does?",
         "no, in no row: as gsplat's main since August 2025",
-        "pop_ref.density_config:resets_at",
+        "pop_ref.density:resets_at",
         ("DensityConfig.reset_at_zero = True",),
     ),
     Ambiguity(

@@ -8,10 +8,11 @@ Between two densification steps each view adds to the window's statistics. At a 
     prune      opacity too low, or far too large
     forget     the window's statistics start again from zero (A3: row identities changed)
 
-The row operations are in `density_rows`, the constants in `settings`, the schedule in `density_config`; all are
-re-exported here.
+Steps count from 0 as in gsplat: the densification step of step s follows the Adam update of step s.
 
-Labels decided here: A2, A3, A4, A8, A14, A16, A18, A23; which reading is taken is a field of `DensityConfig`.
+The row operations are in `density_rows`, the constants in `settings`; both are re-exported here.
+
+Labels decided here: A2, A3, A4, A8, A14, A16, A17, A18, A23; which reading is taken is a field of `DensityConfig`.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ import numpy as np
 
 from pop_ref._shapes import Bool, Float64, Int64
 from pop_ref.activations import opacities_from_logits, scales_from_log_scales
-from pop_ref.density_config import GSPLAT, POP, DensityConfig, blurs_at, densifies_at, resets_at
 from pop_ref.density_rows import Rows, clone_rows, prune_rows, reset_opacities, rows_from_params, split_rows
+from pop_ref.settings import GSPLAT, POP, DensityConfig
 
 __all__ = ["GSPLAT", "POP", "DensityConfig", "blurs_at", "densifies_at", "resets_at"]
 __all__ += ["Rows", "rows_from_params", "clone_rows", "split_rows", "prune_rows", "reset_opacities"]
@@ -300,3 +301,70 @@ def densify_and_prune(
     scales = scales_from_log_scales(rows.params["scales"])
     rows = prune_rows(rows, prune_mask(opacities, scales, scene_scale, step, config))
     return rows, zero_statistics(len(rows))
+
+
+def densifies_at(step: int, config: DensityConfig) -> bool:
+    """Tell whether the Gaussians are grown and pruned after this step (A17).
+
+    `refine_start_iter < step < refine_stop_iter`, and step is a multiple of `refine_every`: 600, 700 ... 14900; but not
+    within `pause_refine_after_reset` steps of a reset.
+
+    Source: POP paper section 4.1 (every 100 iterations from 0.5K to 15K).
+    Departs: nothing; both bounds are exclusive, as in Inria's and gsplat's code.
+
+    Args:
+        step: from 0.
+        config: the schedule.
+
+    Returns:
+        True at a densification step.
+
+    Example:
+        >>> [step for step in range(0, 900, 50) if densifies_at(step, POP)]
+        [600, 700, 800]
+    """
+    if config.reset_every > 0 and step % config.reset_every < config.pause_refine_after_reset:
+        return False
+    return config.refine_start_iter < step < config.refine_stop_iter and step % config.refine_every == 0
+
+
+def blurs_at(step: int, config: DensityConfig) -> bool:
+    """Tell whether the blur rule takes part in densification after this step: both ends of its window included (A19).
+
+    Source: POP paper section 4.1 (between 3K and 7K iterations).
+    Departs: nothing.
+
+    Args:
+        step: from 0.
+        config: the schedule.
+
+    Returns:
+        True inside the blur window.
+
+    Example:
+        >>> [blurs_at(step, POP) for step in (2999, 3000, 7000, 7001)]
+        [False, True, True, False]
+    """
+    return config.blur_start_iter <= step <= config.blur_stop_iter
+
+
+def resets_at(step: int, config: DensityConfig) -> bool:
+    """Tell whether opacities are reset after this step: never in POP (A22), 3000, 6000, 9000, 12000 in gsplat.
+
+    Source: POP paper section 3.1 (every 3,000 iterations).
+    Departs: gsplat up to 1.5.2 resets at step 0 too (`reset_at_zero`, A25), and 1.5.3 by mistake never.
+
+    Args:
+        step: from 0.
+        config: the schedule.
+
+    Returns:
+        True at a reset.
+
+    Example:
+        >>> [step for step in range(0, 16000, 1000) if resets_at(step, GSPLAT)]
+        [3000, 6000, 9000, 12000]
+    """
+    if config.reset_every == 0 or step >= config.refine_stop_iter or step % config.reset_every != 0:
+        return False
+    return step > 0 or config.reset_at_zero

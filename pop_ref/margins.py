@@ -8,6 +8,10 @@ be needed to flip the decision. Margins are infinite where both sides are exact,
 Two questions are answered. Which Gaussians, and which pixels, must come out with the same integers from any sound
 implementation (`safe_gaussians`, `safe_pixels`)? Which decisions were close (`near_threshold`, `nearest`)? A close D5,
 D6 or D7 can be taken the other way by moving the profile's constant by the tolerance.
+
+`extent_margins` has the decisions of one Gaussian's extent: cull and size (D2), tile rectangle (D3). `pixel_margins`
+has those of one pixel: floor (D5), ceiling (D6), stop (D7), dominance (D8); it carries the errors of `magnitudes` on
+through exponent, alpha and transmittance, as plain floats because it is the innermost loop.
 """
 
 from __future__ import annotations
@@ -21,8 +25,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pop_ref._shapes import Bool, Float64
+from pop_ref.alpha import falloff, sigma_at_pixel
 from pop_ref.constants import DECISIONS, PAPER, Profile
-from pop_ref.extent_margins import ExtentMargins, Rect, extent_margins
 from pop_ref.magnitudes import (
     Magnitudes,
     Rounded,
@@ -31,11 +35,13 @@ from pop_ref.magnitudes import (
     depths_magnitudes,
     distance,
     frustum_limits,
+    in_float32,
     splat_magnitudes,
 )
-from pop_ref.pixel_margins import PixelMargins, pixel_margins
+from pop_ref.pixel import stops
 from pop_ref.records import Camera, Gaussians, Render
 from pop_ref.render import render
+from pop_ref.tiles import grid_size, tile_span
 
 _HORIZON = 1e-2
 
@@ -248,3 +254,225 @@ def _depth_gaps(ids: Sequence[int], gaussians: Gaussians, depths: Sequence[Round
         same = bool(np.all(gaussians.means[front] == gaussians.means[back]))
         gaps.append(math.inf if same else distance(depths[front], depths[back]))
     return gaps
+
+
+PixelMargins = dict[str, list[tuple[tuple[int, ...], float]]]
+
+
+def pixel_margins(
+    ids: Sequence[int], magnitudes: Sequence[Magnitudes | None], px: float, py: float, profile: Profile
+) -> PixelMargins:
+    """Measure D5 to D8 at one pixel, over the list entries visited until it stops.
+
+    Source: Higham 2002, section 3.3, applied to `pixel.composite_pixel`.
+    Departs: nothing.
+
+    Args:
+        ids: the tile's list, front to back.
+        magnitudes: of every Gaussian; those in the list are not None.
+        px: the pixel's centre along x, its index + 0.5.
+        py: the same along y.
+        profile: floor, ceiling and stop.
+
+    Returns:
+        For each decision the splats it is about and its distance in units of eps: D5, D6, D7 of each entry that gets
+        that far, D8 of the winner against each rival.
+
+    Example:
+        >>> from pop_ref.constants import PAPER
+        >>> one, half = Rounded(1.0), Rounded(0.5)
+        >>> m = Magnitudes(one, (half, half), (one, one), (one, Rounded(0.0), one), one, (one, Rounded(0.0), one), half)
+        >>> found = pixel_margins([0, 1], [m, m], 0.5, 0.5, PAPER)
+        >>> found["D8"]
+        [((0, 1), inf)]
+    """
+    floor, ceiling = constant(profile.alpha_floor), constant(profile.alpha_ceiling)
+    stop = constant(profile.transmittance_stop)
+    found: PixelMargins = {"D5": [], "D6": [], "D7": [], "D8": []}
+    left = Rounded(1.0)
+    weights: list[tuple[int, Rounded]] = []
+    for i in ids:
+        m = magnitudes[i]
+        assert m is not None
+        sigma = _sigma(m, px, py)
+        if sigma.value < 0.0:
+            found["D5"].append(((i,), distance(sigma, Rounded(0.0))))
+            continue
+        raw = _raw_alpha(sigma, m.opacity)
+        found["D5"].append(((i,), distance(raw, floor)))
+        if raw.value < floor.value:
+            continue
+        # sigma < 0 is only possible if rounding makes the conic indefinite
+        definite = m.conic[0] * m.conic[2] - m.conic[1] * m.conic[1]
+        sign = max(distance(sigma, Rounded(0.0)), distance(definite, Rounded(0.0)))
+        found["D5"].append(((i,), sign))
+        found["D6"].append(((i,), distance(raw, ceiling)))
+        alpha = raw if raw.value <= ceiling.value else ceiling
+        next_left = left * (Rounded(1.0) - alpha)
+        found["D7"].append(((i,), distance(next_left, stop)))
+        if stops(next_left.value, profile):
+            break
+        weights.append((i, left * alpha))
+        left = next_left
+    found["D8"] = _dominance(weights)
+    return found
+
+
+def _dominance(weights: Sequence[tuple[int, Rounded]]) -> list[tuple[tuple[int, ...], float]]:
+    if not weights:
+        return []
+    winner, best = max(weights, key=lambda pair: pair[1].value)
+    return [((winner, i), distance(best, weight)) for i, weight in weights if i != winner]
+
+
+def _sigma(m: Magnitudes, px: float, py: float) -> Rounded:
+    A, B, C = m.conic
+    u, v = m.mean2d
+    value = sigma_at_pixel((u.value, v.value), (A.value, B.value, C.value), px, py)
+    dx, dy = u.value - px, v.value - py
+    inherited = 0.5 * (A.error * dx * dx + C.error * dy * dy) + B.error * abs(dx * dy)
+    inherited += abs(A.value * dx + B.value * dy) * u.error + abs(B.value * dx + C.value * dy) * v.error
+    if inherited == 0.0 and in_float32(value):
+        return Rounded(value)
+    terms = 0.5 * (A.value * dx * dx + C.value * dy * dy) + abs(B.value * dx * dy)
+    # each term is a product of four rounded factors, then summed
+    return Rounded(value, inherited + 5.0 * terms)
+
+
+def _raw_alpha(sigma: Rounded, opacity: Rounded) -> Rounded:
+    G = falloff(sigma.value)
+    if sigma.value == 0.0 and sigma.error == 0.0:
+        return opacity
+    # exp turns an absolute error into a relative one and adds about an eps; the product adds another
+    return Rounded(opacity.value * G, G * opacity.error + opacity.value * G * (sigma.error + 2.0))
+
+
+Rect = tuple[int, int, int, int]
+
+
+class ExtentMargins(NamedTuple):
+    """Distances in units of eps, and which tiles a flip can touch.
+
+    Attributes:
+        visible: is it on the screen at all (D2).
+        size: do its integer extents change (D2); infinite where it is culled.
+        overlap: does its tile rectangle change with the extents fixed (D3); infinite where it is culled.
+        outer: the rectangle one px larger, as if it were not culled.
+        inner: the rectangle one px smaller; flips of size and overlap touch tiles in `outer` and not in `inner`.
+    """
+
+    visible: float
+    size: float
+    overlap: float
+    outer: Rect
+    inner: Rect
+
+
+class _Axis(NamedTuple):
+    center: Rounded
+    radius: int
+    size: int
+
+
+def extent_margins(m: Magnitudes, width: int, height: int, profile: Profile) -> ExtentMargins:
+    """Measure D2 and D3 of one Gaussian in front of the camera.
+
+    A Gaussian is kept if all conditions hold, so the distance is the smallest of the conditions' when it is kept and
+    the largest of the failing ones' when it is culled. Of numbers that overflowed nothing is known: the distance is 0.
+
+    Source: the conditions of `footprint.radii_from_covars2d`, `footprint.on_screen` and `tiles.tile_rects`.
+    Departs: nothing.
+
+    Args:
+        m: the Gaussian's numbers with their errors.
+        width: px.
+        height: px.
+        profile: the kind of extent, and the tile size.
+
+    Returns:
+        The distances.
+
+    Example:
+        >>> from pop_ref.constants import PAPER
+        >>> one = Rounded(1.0, 1.0)
+        >>> m = Magnitudes(one, (Rounded(4.0), Rounded(4.0)), (one, one), (one, one, one), one, (one, one, one), one)
+        >>> extent_margins(m, 8, 8, PAPER).outer
+        (0, 0, 1, 1)
+    """
+    reaches = _reaches(m, profile)
+    if not all(math.isfinite(number.value) for number in (*m.mean2d, m.det, *reaches)):
+        # what has overflowed may be anywhere, or nowhere
+        return ExtentMargins(
+            0.0, math.inf, math.inf, (0, 0, *grid_size(width, height, profile.tile_size)), (0, 0, 0, 0)
+        )
+    conditions = [(m.det.value > 0.0, distance(m.det, Rounded(0.0)))]
+    if profile.extent == "opacity_aware":
+        floor = constant(profile.alpha_floor)
+        conditions.append((m.opacity.value >= floor.value, distance(m.opacity, floor)))
+    radii = [max(1, math.ceil(reach.value)) for reach in reaches]
+    axes = [_Axis(m.mean2d[0], radii[0], width), _Axis(m.mean2d[1], radii[1], height)]
+    for axis in axes:
+        conditions.extend(_on_screen(axis, profile))
+    visible = all(holds for holds, _ in conditions)
+    outer, inner = (_rect(m, [r + grow for r in radii], width, height, profile) for grow in (1, -1))
+    if not visible:
+        return ExtentMargins(max(d for holds, d in conditions if not holds), math.inf, math.inf, outer, inner)
+    return ExtentMargins(
+        visible=min(d for _, d in conditions),
+        size=min(distance(reach, Rounded(float(max(1, round(reach.value))))) for reach in reaches),
+        overlap=min(_overlap(axis, profile) for axis in axes),
+        outer=outer,
+        inner=inner,
+    )
+
+
+def _reaches(m: Magnitudes, profile: Profile) -> tuple[Rounded, Rounded]:
+    a, _, c = m.blurred
+    largest_k = constant(profile.extent_sigmas)
+    if profile.extent == "square":
+        middle = Rounded(0.5) * (a + c)
+        spread = middle * middle - m.det
+        if spread.value < 0.1:
+            spread = constant(0.1)
+        reach = largest_k * (middle + spread.sqrt()).sqrt()
+        return reach, reach
+    # under the floor the Gaussian is culled whatever its reach; log 1 = 0 stands in
+    ratio = m.opacity / constant(profile.alpha_floor)
+    log = Rounded(math.log(max(1.0, ratio.value)), ratio.error / max(1.0, ratio.value))
+    k = (Rounded(2.0) * log).sqrt()
+    if k.value > largest_k.value:
+        k = largest_k
+    return k * a.sqrt(), k * c.sqrt()
+
+
+def _on_screen(axis: _Axis, profile: Profile) -> list[tuple[bool, float]]:
+    radius = Rounded(float(axis.radius))
+    first, last = axis.center - radius, axis.center + radius
+    low, high = Rounded(0.0), Rounded(float(axis.size))
+    if profile.extent == "square":
+        # the tile rectangle is not empty: trunc((u - 0.5 + r + t - 1) / t) >= 1 and trunc((u - 0.5 - r) / t) < tiles
+        tiles, _ = grid_size(axis.size, 1, profile.tile_size)
+        low, high = Rounded(1.5), Rounded(tiles * profile.tile_size + 0.5)
+        return [(last.value >= low.value, distance(last, low)), (first.value < high.value, distance(first, high))]
+    return [(last.value > low.value, distance(last, low)), (first.value < high.value, distance(first, high))]
+
+
+def _overlap(axis: _Axis, profile: Profile) -> float:
+    size = profile.tile_size
+    tiles, _ = grid_size(axis.size, 1, size)
+    first, last = axis.center - Rounded(float(axis.radius)), axis.center + Rounded(float(axis.radius))
+    last_edges = (0, tiles - 1)
+    if profile.extent == "square":
+        first, last = first - Rounded(0.5), last + Rounded(size - 1.5)
+        last_edges = (1, tiles)
+    # only a flip across an edge inside the grid changes the clipped rectangle
+    first_edge = min(max(round(first.value / size), 1), tiles)
+    last_edge = min(max(round(last.value / size), last_edges[0]), last_edges[1])
+    return min(distance(first, Rounded(float(first_edge * size))), distance(last, Rounded(float(last_edge * size))))
+
+
+def _rect(m: Magnitudes, radii: list[int], width: int, height: int, profile: Profile) -> Rect:
+    tiles_x, tiles_y = grid_size(width, height, profile.tile_size)
+    x0, x1 = tile_span(m.mean2d[0].value, radii[0], tiles_x, profile.tile_size, profile)
+    y0, y1 = tile_span(m.mean2d[1].value, radii[1], tiles_y, profile.tile_size, profile)
+    return x0, y0, x1, y1

@@ -19,7 +19,7 @@ from typing import Final
 
 import numpy as np
 
-from pop_ref.density_config import densifies_at
+from pop_ref.density import densifies_at
 from pop_ref.settings import BETAS, EPS, MAX_SH_DEGREE, LearningRates, Recipe, UpdateRules
 
 LEARNING_RATES: Final = LearningRates().by_parameter()

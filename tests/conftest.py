@@ -23,7 +23,7 @@ SHAPES_CHECKED = tuple(
     for module in (
         *("activations", "covariance", "harmonics", "camera", "projection", "footprint", "tiles", "compositing"),
         *("dominance", "splatting", "render", "losses", "ssim", "polarization", "density", "density_rows"),
-        *("loss_magnitudes", "optimizer", "training", "margins", "extent_margins"),
+        *("magnitudes", "optimizer", "training", "margins"),
         *("contributions", "sensitivity", "fisher", "chord", "selection", "taming", "mini_splatting", "tight_tiles"),
     )
 )

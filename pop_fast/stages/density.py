@@ -52,7 +52,7 @@ def average_grads(statistics: Statistics, config: Any) -> Tensor:
 
 
 def blurs_at(step: int, config: Any) -> bool:
-    """See `pop_ref.density_config.blurs_at`."""
+    """See `pop_ref.density.blurs_at`."""
     return config.blur_start_iter <= step <= config.blur_stop_iter
 
 

@@ -59,7 +59,6 @@ STAGE_MODULES = (
     "regularizers",
     "appearance",
     "refinement",
-    "density_config",
     "density_rows",
     "density",
     "optimizer",

@@ -17,7 +17,7 @@ from typing import Any
 from pop_ref.conformance import torch_strategy
 from pop_ref.conformance.strategy_script import Script
 from pop_ref.conformance.torch_strategy import ScriptedPasses, arrays_of
-from pop_ref.density_config import DensityConfig
+from pop_ref.density import DensityConfig
 from pop_ref.settings import AppearanceRates, LearningRates, Recipe, UpdateRules
 
 # `pop_ref.optimizer.adam_step` on tensors
@@ -150,11 +150,11 @@ class Trainer:
         return self._statistics(state, statistics.grad_sum)
 
     def densifies_at(self, step: int, config: DensityConfig) -> bool:
-        """See `pop_ref.density_config.densifies_at`."""
+        """See `pop_ref.density.densifies_at`."""
         return bool(self._strategy(config).is_refine_step(step))
 
     def resets_at(self, step: int, config: DensityConfig) -> bool:
-        """See `pop_ref.density_config.resets_at`."""
+        """See `pop_ref.density.resets_at`."""
         return bool(self._strategy(config).is_reset_step(step))
 
     def densify_and_prune(

@@ -13,7 +13,7 @@ from pop_ref.activations import opacities_from_logits, scales_from_log_scales
 from pop_ref.conformance.scenes import pattern
 from pop_ref.conformance.vector_schema import entry, equal, output
 from pop_ref.density import Statistics, densify_and_prune, grow_masks, rows_from_params
-from pop_ref.loss_magnitudes import d_ssim_magnitudes, pixelwise_magnitudes
+from pop_ref.magnitudes import d_ssim_magnitudes, pixelwise_magnitudes
 from pop_ref.optimizer import BETAS, EPS, adam_step
 from pop_ref.polarization import importance_mask, pop_loss, pop_loss_vjp
 from pop_ref.settings import GSPLAT, POP, DensityConfig

@@ -14,8 +14,8 @@ from pop_ref.conformance import capabilities
 from pop_ref.conformance.calls import Call, Frame, without_backgrounds
 from pop_ref.conformance.scenes import Record, Scene, pack, rigid
 from pop_ref.constants import PAPER
-from pop_ref.extent_margins import extent_margins
 from pop_ref.magnitudes import constant, depths_magnitudes, distance, splat_magnitudes
+from pop_ref.margins import extent_margins
 from pop_ref.records import Camera, Gaussians
 from pop_ref.splatting import project
 

@@ -18,8 +18,7 @@ from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.scenes import Scene
 from pop_ref.conformance.views import SIZE, cameras, clear_of_extents, gaussians
 from pop_ref.constants import PAPER
-from pop_ref.density import Statistics, accumulate, zero_statistics
-from pop_ref.density_config import DensityConfig
+from pop_ref.density import DensityConfig, Statistics, accumulate, zero_statistics
 from pop_ref.losses import photometric_pop_vjp
 from pop_ref.optimizer import sh_degree_at
 from pop_ref.records import Camera, Gaussians

@@ -20,7 +20,7 @@ from pop_fast.stages.polarization import importance_mask, pop_loss, pop_loss_vjp
 from pop_ref import losses as oracle_losses
 from pop_ref import polarization as oracle
 from pop_ref import ssim as oracle_ssim
-from pop_ref.loss_magnitudes import Form, LossMagnitudes, d_ssim_magnitudes, pixelwise_magnitudes
+from pop_ref.magnitudes import Form, LossMagnitudes, d_ssim_magnitudes, pixelwise_magnitudes
 
 NAMES = ("l1", "l2", "ssim", "d_ssim", "photometric_3dgs", "photometric_pop")
 COMPILED = pytest.mark.skipif(not compiled.available(), reason=compiled.why_not() or "")
@@ -255,7 +255,7 @@ EVERYWHERE = [
     *(pytest.param(compiled_losses, name, id=f"compiled {name}", marks=COMPILED) for name in PADDED),
 ]
 # units of rounding that value and gradient of a term may need, in both precisions: twice the worst that 3,000 random
-# cases of the strategy below did, of torch and of the compiled stage alike; one unit is what `loss_magnitudes` bounds
+# cases of the strategy below did, of torch and of the compiled stage alike; one unit is what `magnitudes` bounds
 UNITS = {"l1": (2.5, 2.0), "l2": (2.5, 2.5), "d_ssim": (1.0, 0.5)}
 # what an objective is mixed of
 TERMS = {

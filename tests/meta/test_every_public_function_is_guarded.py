@@ -264,9 +264,9 @@ TESTS = {
     "taming.taming_scores": "test_methods.test_scores_of_a_population_add_over_views_that_are_rendered_and_weighed",
     "fisher.screen_moments": "test_methods.test_the_view_direction_counts_and_channels_do_not_leak_into_each_other",
     "fisher.fisher_blocks": "test_methods.test_the_view_direction_counts_and_channels_do_not_leak_into_each_other",
-    "density_config.densifies_at": SCHEDULE,
-    "density_config.resets_at": SCHEDULE,
-    "density_config.blurs_at": "test_density.test_split_only_blur_splits_small_ones_and_may_clone_them_as_well",
+    "density.densifies_at": SCHEDULE,
+    "density.resets_at": SCHEDULE,
+    "density.blurs_at": "test_density.test_split_only_blur_splits_small_ones_and_may_clone_them_as_well",
     "appearance.expose": "test_appearance.test_an_exposure_mixes_channels_row_by_row",
     "appearance.centred_exposures": "test_appearance.test_centred_exposures_have_the_identity_as_mean",
     "appearance.color_correct": "test_appearance.test_correction_takes_back_gain_and_offset_by_channel",
@@ -283,12 +283,12 @@ TESTS = {
     "ssim.replace_left_out": "test_losses.test_l1_at_equality_has_the_mean_of_its_one_sided_slopes",
     "magnitudes.in_float32": "test_margins.test_rounded_numbers_inherit_errors_as_their_derivatives_say",
     "magnitudes.frustum_limits": "test_margins.test_values_under_error_analysis_are_those_of_the_stages",
-    "extent_margins.extent_margins": "test_margins.test_d2_is_near_for_an_opacity_next_to_the_floor",
+    "margins.extent_margins": "test_margins.test_d2_is_near_for_an_opacity_next_to_the_floor",
     "magnitudes.constant": FLOOR_MARGIN,
     "magnitudes.depths_magnitudes": FLOOR_MARGIN,
     "magnitudes.splat_magnitudes": FLOOR_MARGIN,
     "margins.margins": FLOOR_MARGIN,
-    "pixel_margins.pixel_margins": FLOOR_MARGIN,
+    "margins.pixel_margins": FLOOR_MARGIN,
 }
 LADDER = (
     "training.start",
@@ -308,7 +308,7 @@ DOCTESTS = (
     "depth.with_depth_channel",
     *("constants.profile_named", "notation.symbol_named", "magnitudes.distance", "magnitudes.colors_magnitudes"),
     *("methods.scripted_steps", "methods.method_settings", "short_training.taken_steps"),
-    *("loss_magnitudes.d_ssim_magnitudes", "loss_magnitudes.pixelwise_magnitudes"),
+    *("magnitudes.d_ssim_magnitudes", "magnitudes.pixelwise_magnitudes"),
 )
 
 

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.law import law
 from pop_ref.conformance.strategies import arrays_of, dyadic, opacities
-from pop_ref.density import GSPLAT, POP, Rows, Statistics, densify_and_prune
-from pop_ref.density_config import DensityConfig
+from pop_ref.density import GSPLAT, POP, DensityConfig, Rows, Statistics, densify_and_prune
 
 # powers of two, so that a size in units of the scene is exact
 scene_scales = st.sampled_from([0.125, 0.5, 1.0, 4.0])

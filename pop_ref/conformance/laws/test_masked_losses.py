@@ -10,7 +10,7 @@ from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.law import law
 from pop_ref.conformance.scenes import pattern
 from pop_ref.conformance.strategies import dyadic
-from pop_ref.loss_magnitudes import d_ssim_magnitudes, pixelwise_magnitudes
+from pop_ref.magnitudes import d_ssim_magnitudes, pixelwise_magnitudes
 
 ORACLE = OracleAdapter()
 H, W = 11, 12

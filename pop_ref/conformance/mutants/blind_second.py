@@ -95,7 +95,7 @@ _ORACLE: Final = (
     (
         "refinement_starts_at_its_start",
         "the step that refinement starts after is its first",
-        "density_config.py",
+        "density.py",
         "config.refine_start_iter < step",
         "config.refine_start_iter <= step",
         "test_density:the_gaussians_change_every_hundred_steps_and_opacities_are_reset_where_that_is_asked_for",
