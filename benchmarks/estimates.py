@@ -36,7 +36,7 @@ _LINE: Final = re.compile(
     r"chosen for this \w+: (?P<width>\d+)x(?P<height>\d+) px.*?, (?P<steps>[\d,]+) steps, "
     r"about (?P<gaussians>[\d,]+) Gaussians, (?P<time>[^,]+), (?P<memory>[\d.]+) GB"
 )
-_BY_PROCESSOR: Final = "by-processor-time"
+BY_PROCESSOR: Final = "by-processor-time"
 _UNITS: Final = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
 
@@ -65,7 +65,7 @@ def measured(capture: Path, minutes: float) -> dict[str, Any]:
     with TemporaryDirectory() as folder:
         words = [str(capture), "--minutes", f"{minutes:g}", "--out", f"{folder}/run", "--threads", "1"]
         with open(f"{folder}/said", "w+", encoding="utf-8") as said:
-            child = subprocess.Popen(module_command("benchmarks.estimates", _BY_PROCESSOR, *words), stdout=said)
+            child = subprocess.Popen(module_command("benchmarks.estimates", BY_PROCESSOR, *words), stdout=said)
             _, status, used = os.wait4(child.pid, 0)
             child.returncode = os.waitstatus_to_exitcode(status)
             if child.returncode:
@@ -105,7 +105,7 @@ def table_of(known: Mapping[str, Any]) -> str:
 def main(words: list[str] | None = None) -> int:
     """Measure, a row for each capture."""
     given = sys.argv[1:] if words is None else words
-    if given[:1] == [_BY_PROCESSOR]:
+    if given[:1] == [BY_PROCESSOR]:
         return train_by_processor_time(given[1:])
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("captures", type=Path, nargs="*", help="without any, the rows of --json are laid out")
