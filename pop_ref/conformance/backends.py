@@ -18,8 +18,6 @@ SHIPPED = ("oracle", "fast64", "fast32")
 ELSEWHERE = (
     "compiled64",
     "compiled32",
-    "mirror64",
-    "mirror32",
     "cuda",
     "gsplat",
     "gsplat-torch64",
@@ -135,11 +133,6 @@ def _elsewhere(name: str) -> Any:
         if reason is not None:
             raise Unavailable(reason)
         return program(name, "pop_fast", "compiled", _dtype(name))
-    if name.startswith("mirror"):
-        compiler = importlib.import_module("cuda_ext.compiler")
-        if compiler.find_compiler() is None:
-            raise Unavailable(f"the host mirror needs one: {compiler.no_compiler()}")
-        return importlib.import_module(f"{kit}.mirror_adapter").mirror(name)
     if name == "cuda":
         reason = importlib.import_module("cuda_ext").why_not()
         if reason is not None:
