@@ -216,15 +216,14 @@ class _Logging(OracleAdapter):
 def record() -> list[Any]:
     """Return calls, as JSON holds them, that tell mutants from the oracle, each where a law makes one."""
     from pop_ref.conformance.backends import shipped
-    from pop_ref.conformance.mutants import MUTANTS
+    from pop_ref.conformance.mutants import MUTANTS, PROGRAM, ROUNDS
     from pop_ref.conformance.mutants.copies import living
-    from pop_ref.conformance.mutants.trainers import TRAINERS
     from pop_ref.conformance.mutants.trial import law_named, obeys
 
     sound = shipped("fast64")
     found: list[Any] = []
     kept: list[tuple[str, list[Any]]] = []
-    for mutant in (*MUTANTS, *TRAINERS):
+    for mutant in (*MUTANTS, *(m for m in PROGRAM if m.name in ROUNDS["trainers"])):
         if mutant.law.startswith("test_strategies"):
             # vectors of trainings are about those
             continue
