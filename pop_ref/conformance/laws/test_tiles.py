@@ -1,4 +1,4 @@
-"""Laws of tiles: rectangles, lists in order of depth, and exact lists that are shorter and draw the same (D3, D4, D5)."""
+"""Laws of tiles: rectangles, lists in order of depth, and exact ones that are shorter and draw the same (D3, D4, D5)."""
 
 from __future__ import annotations
 
