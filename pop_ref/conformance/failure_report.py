@@ -14,10 +14,8 @@ from pop_ref.conformance.capabilities import GRADIENTS, RENDER
 from pop_ref.conformance.cases import sensitivity
 from pop_ref.conformance.error_bounds import REACH, PixelErrorBounds, pixel_error_bounds
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
-from pop_ref.conformance.narrowing import Check, breaks, cause, narrowed
-from pop_ref.conformance.pairs import CHECKS
-from pop_ref.conformance.scene_files import save_scene
-from pop_ref.conformance.scenes import Scene, cotangents, scene_as_code
+from pop_ref.conformance.pairs import CHECKS, Check, breaks, cause, narrowed
+from pop_ref.conformance.scenes import Scene, cotangents, save_scene, scene_as_code
 from pop_ref.margins import margins
 
 ORACLE = OracleAdapter()

@@ -15,11 +15,11 @@ from typing import Any, Final
 import numpy as np
 
 from pop_ref.conformance import tolerances
+from pop_ref.conformance.adapter import error_bounds_of
 from pop_ref.conformance.assertions import assert_close
 from pop_ref.conformance.calls import Call, Frame
 from pop_ref.conformance.error_bounds import PixelErrorBounds
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
-from pop_ref.conformance.reference import error_bounds_of
 from pop_ref.conformance.scenes import Scene
 from pop_ref.conformance.short_training import ShortTraining
 from pop_ref.conformance.signature import Expected

@@ -23,10 +23,10 @@ from pop_ref.conformance import tolerances
 from pop_ref.conformance.adapter import Adapter, OracleAdapter, projected
 from pop_ref.conformance.assertions import WORST_CONDITION
 from pop_ref.conformance.backends import Unavailable, shipped
-from pop_ref.conformance.corners import corners
 from pop_ref.conformance.error_bounds import PixelErrorBounds, pixel_error_bounds
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.scenes import Scene, cotangents, rounded_to
+from pop_ref.conformance.strategies import corners
 from pop_ref.records import Splats
 
 # far below every decision's distance from its threshold, and far above rounding

@@ -13,7 +13,7 @@ import numpy as np
 from pop_ref.conformance.adapter import Adapter
 from pop_ref.conformance.calls import Call, Frame
 from pop_ref.conformance.signature import Expected, expectations
-from pop_ref.conformance.vector_schema import IMAGES, INPUTS, entry, equal, output
+from pop_ref.conformance.vector_check import IMAGES, INPUTS, entry, equal, output
 from pop_ref.conformance.views import call_for, clear_call
 from pop_ref.depth import RenderMode
 from pop_ref.splatting import project

@@ -18,7 +18,7 @@ from pop_ref.conformance.adapter import under
 from pop_ref.conformance.backends import ELSEWHERE, Absent, Unavailable, made_by, shipped, shipped_or_absent
 from pop_ref.conformance.capabilities import DERIVATIVES, EXTENTS, GRADIENTS, INRIAS, LOWER_CEILING, PROFILES, RENDER
 from pop_ref.conformance.failure_report import failure_report
-from pop_ref.conformance.inria_adapter import inria
+from pop_ref.conformance.foreign_adapters import inria
 from pop_ref.conformance.law import missing
 from pop_ref.conformance.mutants import MUTANTS, living
 from pop_ref.conformance.mutants.trial import every_law, law_named, obeys

@@ -23,9 +23,8 @@ import numpy as np
 import pytest
 
 import pop_ref
-from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.adapter import OracleAdapter, forget
 from pop_ref.conformance.mutants.trial import every_law, law_named, obeys
-from pop_ref.conformance.reference import forget
 from pop_ref.magnitudes import Rounded
 from tests.golden import ten_losses
 

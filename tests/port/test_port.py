@@ -18,8 +18,7 @@ from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.assertions import assert_same_image
 from pop_ref.conformance.error_bounds import pixel_error_bounds
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
-from pop_ref.conformance.program_adapter import ProgramAdapter
-from pop_ref.conformance.program_pipe import ProgramError
+from pop_ref.conformance.program_adapter import ProgramAdapter, ProgramError
 from pop_ref.conformance.scenes import Scene, cotangents, golden_scene
 from pop_ref.conformance.strategies import scenes
 from pop_ref.constants import PAPER

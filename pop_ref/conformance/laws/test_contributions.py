@@ -16,15 +16,15 @@ from hypothesis import strategies as st
 from pop_ref.chord import dominant_points
 from pop_ref.compositing import composite, composite_vjp
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
-from pop_ref.conformance.gradient_error_bounds import parameter_error_bounds
-from pop_ref.conformance.law import law
-from pop_ref.conformance.scenes import Scene
-from pop_ref.conformance.score_error_bounds import (
+from pop_ref.conformance.gradient_error_bounds import (
     moment_error_bounds,
+    parameter_error_bounds,
     screened,
     sensitivity_error_bounds,
     weight_error_bounds,
 )
+from pop_ref.conformance.law import law
+from pop_ref.conformance.scenes import Scene
 from pop_ref.conformance.strategies import arrays_of, dyadic, faint_opacities, plain_sizes, quats, scenes
 from pop_ref.constants import INRIA, PROFILES
 from pop_ref.contributions import contributions

@@ -27,8 +27,7 @@ from pop_ref.conformance.capabilities import (
     SPARSE_GRAD,
 )
 from pop_ref.conformance.law import law
-from pop_ref.conformance.meta import assert_rows
-from pop_ref.conformance.signature import assert_call_is_the_oracles, expectations
+from pop_ref.conformance.signature import assert_call_is_the_oracles, assert_rows, expectations
 from pop_ref.conformance.views import clear_of_extents, frames
 
 

@@ -12,7 +12,7 @@ from pop_ref.conformance.calls import Call, Frame
 from pop_ref.conformance.capabilities import CAMERAS, EXTENTS, PACKED, PRINCIPAL_POINT, SCALE, SIGNATURE
 from pop_ref.conformance.corpus import corpus_scene
 from pop_ref.conformance.law import law
-from pop_ref.conformance.meta import (
+from pop_ref.conformance.signature import (
     ROWS,
     assert_dominance,
     assert_keys,
@@ -20,8 +20,8 @@ from pop_ref.conformance.meta import (
     assert_sizes,
     assert_tiles,
     lacks_for_tiles,
+    made,
 )
-from pop_ref.conformance.signature import made
 from pop_ref.conformance.views import call_for, frames
 
 SIZES = ("width", "height", "tile_size", "tile_width", "tile_height", "n_cameras", "n_batches")

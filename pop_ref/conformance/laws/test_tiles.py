@@ -1,4 +1,4 @@
-"""Laws of tiles: rectangles, lists in order of depth, and exact ones that are shorter and draw the same (D3, D4, D5)."""
+"""Laws of tiles: rectangles, lists by depth, and exact ones that are shorter and draw the same (D3, D4, D5)."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from pop_ref.compositing import composite
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.capabilities import INRIAS
-from pop_ref.conformance.cases import rounded
+from pop_ref.conformance.gradient_error_bounds import screened
 from pop_ref.conformance.law import law
 from pop_ref.conformance.laws.test_contributions import plain
-from pop_ref.conformance.score_error_bounds import screened
+from pop_ref.conformance.scenes import rounded
 from pop_ref.conformance.strategies import dyadic, scenes
 from pop_ref.constants import INRIA, PAPER, SPEEDY_SPLAT
 
