@@ -46,40 +46,12 @@ from pop_ref.splatting import project, project_vjp
 from pop_ref.tiles import tile_lists
 
 STAGE_MODULES = (
-    "activations",
-    "covariance",
-    "harmonics",
-    "camera",
-    "projection",
-    "footprint",
-    "tiles",
-    "alpha",
-    "pixel",
-    "compositing",
-    "dominance",
-    "margins",
-    "ssim",
-    "losses",
-    "polarization",
-    "regularizers",
-    "appearance",
-    "refinement",
-    "density_config",
-    "density_rows",
-    "density",
-    "optimizer",
-    "training",
-    "methods",
-    "short_training",
-    "contributions",
-    "sensitivity",
-    "fisher",
-    "chord",
-    "selection",
-    "taming",
-    "mini_splatting",
+    "activations", "covariance", "harmonics", "camera", "projection", "footprint", "tiles", "alpha", "pixel",
+    "compositing", "dominance", "margins", "ssim", "losses", "polarization", "regularizers", "appearance",
+    "refinement", "density_config", "density_rows", "density", "optimizer", "training", "methods",
+    "short_training", "contributions", "sensitivity", "fisher", "chord", "selection", "taming", "mini_splatting",
     "tight_tiles",
-)
+)  # fmt: skip
 # what a view may tell of dominance, by capability
 TOLD_OF_DOMINANCE = {
     DOMINANCE: "dominant_ids",
@@ -211,7 +183,7 @@ class Adapter:
 
     def render(self, scene: Scene) -> View:
         """Draw a scene; by default the oracle projects and lists, and `composite` blends."""
-        camera, size = scene.camera, scene.profile.tile_size if scene.tile_size is None else scene.tile_size
+        camera, size = scene.camera, scene.side
         splats, lists = projected(scene)
         drawn = self.stage("composite")(
             splats, lists, camera.width, camera.height, size, scene.background, scene.profile
@@ -226,7 +198,7 @@ class Adapter:
     def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
         """Return cotangents by name: means, quats, scales, opacities, sh, and those of viewmat, background, means2d,
         means2d_abs that the implementation offers; by default those of `composite_vjp`, projected by the oracle."""
-        camera, size = scene.camera, scene.profile.tile_size if scene.tile_size is None else scene.tile_size
+        camera, size = scene.camera, scene.side
         splats, lists = projected(scene)
         v = self.stage("composite_vjp")(
             splats, lists, camera.width, camera.height, size, v_image, v_T_final, scene.background, scene.profile
@@ -276,7 +248,7 @@ def _shown(splats: Any) -> dict[str, Any]:
 def projected(scene: Scene) -> tuple[Splats, list[list[int]]]:
     """Project a scene and list its splats, by the oracle: what stage functions of whole views take."""
     camera = scene.camera
-    size = scene.profile.tile_size if scene.tile_size is None else scene.tile_size
+    size = scene.side
     # the square extent's cull reads the grid from the profile
     profile = replace(scene.profile, tile_size=size)
     splats = project(scene.gaussians, camera, scene.sh_degree, profile, scene.antialiased)
@@ -340,12 +312,12 @@ class OracleAdapter(Adapter):
     def full_render(self, scene: Scene) -> Any:
         """Draw a scene and return the oracle's own `Render`, with the splats and tile lists."""
         module = importlib.import_module(f"{self.package}.render")
-        return module.render(*self._own(scene), **self._options(scene))
+        return module.render(*self._own(scene), **scene.options)
 
     def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
         """Return the cotangents of `render.render_vjp`."""
         module = importlib.import_module(f"{self.package}.render")
-        g = module.render_vjp(*self._own(scene), v_image=v_image, v_T_final=v_T_final, **self._options(scene))
+        g = module.render_vjp(*self._own(scene), v_image=v_image, v_T_final=v_T_final, **scene.options)
         return {f.name: np.asarray(getattr(g, f.name)) for f in fields(g) if getattr(g, f.name) is not None}
 
     def call(self, call: Call, v_images: Any = None, v_alphas: Any = None) -> Called:
@@ -360,7 +332,7 @@ class OracleAdapter(Adapter):
         images, alphas, pulled = [], [], []
         for b, c, frame in call.each:
             scene = drawn_scene(call, frame)
-            options = {**self._options(scene), "colors": frame.colors, "render_mode": call.render_mode}
+            options = {**scene.options, "colors": frame.colors, "render_mode": call.render_mode}
             drawn = module.render(*self._own(scene), **options)
             images.append(drawn.image)
             alphas.append(1.0 - drawn.T_final)
@@ -378,15 +350,6 @@ class OracleAdapter(Adapter):
         own_g = g if isinstance(g, types.Gaussians) else types.Gaussians(g.means, g.quats, g.scales, g.opacities, g.sh)
         own_c = c if isinstance(c, types.Camera) else types.Camera(c.viewmat, c.K, c.width, c.height)
         return own_g, own_c
-
-    def _options(self, scene: Scene) -> dict[str, Any]:
-        return {
-            "background": scene.background,
-            "sh_degree": scene.sh_degree,
-            "profile": scene.profile,
-            "tile_size": scene.tile_size,
-            "antialiased": scene.antialiased,
-        }
 
 
 def _folded(rows: list[np.ndarray], shape: tuple[int, int]) -> np.ndarray:

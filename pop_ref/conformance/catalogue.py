@@ -56,8 +56,8 @@ trainer's strategies, row operations, schedules and optimizers, and `TorchAdapte
 `--strategy gsplat.strategy:DefaultStrategy` judges somebody's strategy by the laws of training that are about no
 method. An engine with an Adam of its own moves the rows by it (`training_stages(package, adam)`). An
 engine's own steps are watched, too (`short_training.py`): with rates of 0 they draw photographs, go back, collect and
-move nothing, and after each step gradient sums, views, blur flags, dominated pixels, extents and gradients that wait are
-the oracle's; so are the sums of passes over photographs.
+move nothing, and after each step gradient sums, views, blur flags, dominated pixels, extents and gradients that wait
+are the oracle's; so are the sums of passes over photographs.
 
 What training adds where photographs are few or unlike, depth at sparse points, means of opacities and sizes,
 exposures, other backgrounds, corrections of cameras, is judged as stage functions of these names, with gradients.

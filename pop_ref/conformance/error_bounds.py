@@ -216,7 +216,7 @@ def _listed(i: int, scene: Scene, tile_lists: list[list[int]] | None) -> np.ndar
     H, W = scene.camera.height, scene.camera.width
     if tile_lists is None:
         return np.ones((H, W), dtype=bool)
-    size = scene.tile_size or scene.profile.tile_size
+    size = scene.side
     tile = (np.arange(H)[:, None] // size) * -(-W // size) + np.arange(W)[None, :] // size
     return np.array([i in ids for ids in tile_lists])[tile]
 
@@ -247,7 +247,7 @@ def _layer(i: int, scene: Scene, window: Window, reach: float, listed: np.ndarra
         near_threshold |= raw >= profile.alpha_floor * (1.0 - reach)
     alpha = np.minimum(raw, profile.alpha_ceiling)
     e_alpha = np.where(raw > profile.alpha_ceiling, 1.0, e_raw)
-    half = 0.5 * (scene.tile_size or profile.tile_size)
+    half = 0.5 * scene.side
     far_x, far_y = np.abs(dx) + half, np.abs(dy) + half
     expanded = 0.5 * (abs(A) * far_x * far_x + abs(C) * far_y * far_y) + abs(B) * far_x * far_y
     e_expanded = np.where(raw > profile.alpha_ceiling, 1.0, e_raw + raw * expanded)
@@ -391,7 +391,7 @@ def _conic_error_bounds(covars2d: np.ndarray, e_covars2d: np.ndarray) -> tuple[n
 def _color_error_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return colours, their error bounds, and the sums before the clamp at 0."""
     g = scene.gaussians
-    degree = round(np.sqrt(g.sh.shape[1])) - 1 if scene.sh_degree is None else scene.sh_degree
+    degree = scene.degree
     n_sh = (degree + 1) ** 2
     dirs = view_dirs(g.means, scene.camera.viewmat)
     length = np.maximum(np.linalg.norm(dirs, axis=1), TINY)

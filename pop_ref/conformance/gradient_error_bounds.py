@@ -94,8 +94,7 @@ def sums_over_pixels(
 ) -> tuple[dict[str, Bound], np.ndarray]:
     """Bound the cotangents of splats, by name, and the error bound of the background's; windows of one image add up."""
     N = len(scene.gaussians)
-    size = scene.tile_size or scene.profile.tile_size
-    pixels = _pixel_bounds(scene, error_bounds, np.abs(v_image), np.abs(v_T_final), 0.5 * size)
+    pixels = _pixel_bounds(scene, error_bounds, np.abs(v_image), np.abs(v_T_final), 0.5 * scene.side)
     T = error_bounds.layers[-1].T_after if error_bounds.layers else np.ones(v_T_final.shape)
     background = np.einsum("hw,hwc->c", 2.0 * T + error_bounds.T_final, np.abs(v_image))
     shapes = {"means2d": (2,), "conics": (3,), "opacities": (), "colors": v_image.shape[2:]}
@@ -277,7 +276,7 @@ def _point_bound(s: ScreenErrorBounds, K: np.ndarray, v_means2d: Bound, v_J: Bou
 
 def _color_bounds(scene: Scene, v_colors: Bound) -> tuple[Bound, np.ndarray]:
     g = scene.gaussians
-    degree = round(np.sqrt(g.sh.shape[1])) - 1 if scene.sh_degree is None else scene.sh_degree
+    degree = scene.degree
     n_sh = (degree + 1) ** 2
     center = camera_center(scene.camera.viewmat)
     dirs = g.means - center
@@ -371,10 +370,9 @@ def screened(backend: Any, scene: Scene) -> Screened:
     splats, lists = projected(seen)
     columns = ("means2d", "depths", "conics", "opacities", "colors")
     near = rounded(tuple(getattr(splats, name) for name in columns), backend.dtype)
-    size = seen.profile.tile_size if seen.tile_size is None else seen.tile_size
     sure, smooth = (_clear_rows(error_bounds, where) for where in (error_bounds.unambiguous, error_bounds.smooth))
     splats = replace(splats, **dict(zip(columns, near, strict=True)))
-    return Screened(seen, splats, lists, size, error_bounds, sure, smooth)
+    return Screened(seen, splats, lists, seen.side, error_bounds, sure, smooth)
 
 
 def _clear_rows(error_bounds: PixelErrorBounds, unambiguous: np.ndarray) -> np.ndarray:

@@ -53,19 +53,9 @@ from typing import IO, Any, Final
 
 import numpy as np
 
+from pop_ref.conformance import capabilities
 from pop_ref.conformance.adapter import Adapter, View
 from pop_ref.conformance.calls import Call, Called, Frame
-from pop_ref.conformance.capabilities import (
-    ANTIALIASING,
-    DETERMINISTIC,
-    DOMINANCE,
-    DOMINANT_COUNTS,
-    DOMINANT_WEIGHTS,
-    GRADIENTS,
-    RENDER,
-    ROWWISE,
-    SCALE,
-)
 from pop_ref.conformance.program_values import decoded, encoded, line_of, shape_of, signature_of
 from pop_ref.conformance.scenes import Scene, scene_arrays
 from pop_ref.constants import PROFILES, profile_named
@@ -99,10 +89,10 @@ OF_GRADIENTS: Final = {
 SHAPES: Final = {**OF_A_VIEW, **OF_GRADIENTS}
 INTEGERS: Final = frozenset({"dominant_ids", "dominant_counts", "n_blended", "n_traversed", "radii"})
 ABILITIES: Final = {
-    "antialiased": ANTIALIASING,
-    "deterministic": DETERMINISTIC,
-    "rowwise": ROWWISE,
-    "thousands": SCALE,
+    "antialiased": capabilities.ANTIALIASING,
+    "deterministic": capabilities.DETERMINISTIC,
+    "rowwise": capabilities.ROWWISE,
+    "thousands": capabilities.SCALE,
 }
 RASTERIZATION: Final = ("rasterization", "rasterization_vjp")
 _TOGETHER: Final = (("image", "T_final"), ("v_means", "v_quats", "v_scales", "v_opacities", "v_sh"))
@@ -164,14 +154,14 @@ class ProgramAdapter(Adapter):
     def has(self, need: str) -> bool:
         """Tell whether the program offers it."""
         known = {
-            RENDER: ("image", "rasterization"),
-            GRADIENTS: ("v_means", "rasterization_vjp"),
-            DOMINANCE: ("dominant_ids",),
-            DOMINANT_WEIGHTS: ("dominant_weights",),
-            DOMINANT_COUNTS: ("dominant_counts",),
+            capabilities.RENDER: ("image", "rasterization"),
+            capabilities.GRADIENTS: ("v_means", "rasterization_vjp"),
+            capabilities.DOMINANCE: ("dominant_ids",),
+            capabilities.DOMINANT_WEIGHTS: ("dominant_weights",),
+            capabilities.DOMINANT_COUNTS: ("dominant_counts",),
         }
-        if need == SCALE:
-            return SCALE in self.able
+        if need == capabilities.SCALE:
+            return capabilities.SCALE in self.able
         return any(word in self.offers for word in known[need]) if need in known else super().has(need)
 
     def render(self, scene: Scene) -> View:
@@ -288,8 +278,8 @@ class ProgramAdapter(Adapter):
             "n_sh": n_sh,
             "width": scene.camera.width,
             "height": scene.camera.height,
-            "tile_size": scene.tile_size or scene.profile.tile_size,
-            "sh_degree": round(np.sqrt(n_sh)) - 1 if scene.sh_degree is None else scene.sh_degree,
+            "tile_size": scene.side,
+            "sh_degree": scene.degree,
             "antialiased": int(scene.antialiased),
         }
         constants = {k: v for k, v in dataclasses.asdict(scene.profile).items() if k not in ("name", "tile_size")}

@@ -82,6 +82,21 @@ class Scene:
         # Hypothesis prints dataclasses by field unless asked otherwise; a scene must paste
         printer.text(repr(self))
 
+    @property
+    def side(self) -> int:
+        """Return the side of a tile, px."""
+        return self.profile.tile_size if self.tile_size is None else self.tile_size
+
+    @property
+    def degree(self) -> int:
+        """Return the degree of the harmonics that are used."""
+        return round(np.sqrt(self.gaussians.sh.shape[1])) - 1 if self.sh_degree is None else self.sh_degree
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Return, by the names of `pop_ref.render.render`, what is neither Gaussians nor camera."""
+        return {f.name: getattr(self, f.name) for f in fields(self)[2:]}
+
     def with_overrides(self, **changes: Any) -> Scene:
         """Return this scene with some fields, of the Gaussians or the camera too, replaced."""
         gaussians = {k: changes.pop(k) for k in list(changes) if k in ("means", "quats", "scales", "opacities", "sh")}

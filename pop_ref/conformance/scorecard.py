@@ -12,23 +12,11 @@ from dataclasses import dataclass, field
 from html import escape
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
-from pop_ref.conformance.capabilities import (
-    ANTIALIASING,
-    DETERMINISTIC,
-    DOMINANCE,
-    DOMINANT_COUNTS,
-    DOMINANT_WEIGHTS,
-    GRADIENTS,
-    INSTRUMENTS,
-    RENDER,
-    SCALE,
-    SIGNATURE,
-    STAGES,
-)
+from pop_ref.conformance.capabilities import DOMINANCE, GRADIENTS, RENDER, SIGNATURE, STAGES, WHOLE
 from pop_ref.conformance.law import missing
 from pop_ref.conformance.mutants.trial import every_law
 from pop_ref.conformance.views import ASKED
@@ -253,10 +241,6 @@ article p,article li{{font:.82rem/1.45 ui-monospace,monospace;overflow-wrap:anyw
 article ul{{padding-left:1.1rem;margin:.2rem 0}} details{{margin-top:1rem}}
 dt{{margin-top:.5rem}} dd{{margin-left:1rem}}
 </style><h1>{title}</h1>"""
-
-
-WHOLE: Final = (RENDER, GRADIENTS, DOMINANCE, DOMINANT_WEIGHTS, DOMINANT_COUNTS, ANTIALIASING, INSTRUMENTS,
-                DETERMINISTIC, SCALE)  # fmt: skip
 
 
 def introduction(backend: Any) -> list[str]:

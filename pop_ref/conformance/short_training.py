@@ -290,11 +290,9 @@ class _Look:
     @classmethod
     def at(cls, watch: Watch, view: int, step: int, dtype: Any) -> _Look:
         scene, mask = watch.scene(view, step), watch.mask(view)
-        options: dict[str, Any] = {"sh_degree": scene.sh_degree, "profile": scene.profile}
-        options |= {"background": scene.background, "antialiased": scene.antialiased}
-        seen = render(scene.gaussians, scene.camera, **options)
+        seen = render(scene.gaussians, scene.camera, **scene.options)
         v_image = photometric_pop_vjp(seen.image, watch.photo(view) / 255.0, 1.0, 0.0, "valid", mask)
-        pulled = render_vjp(scene.gaussians, scene.camera, v_image, **options)
+        pulled = render_vjp(scene.gaussians, scene.camera, v_image, **scene.options)
         bounds = pixel_error_bounds(scene, dtype)
         units = gradient_error_bounds(scene, bounds, np.abs(v_image), np.zeros(v_image.shape[:2]), e_cotangents=(
             _slope(mask, v_image.shape) * _of_image(bounds) + np.abs(v_image), np.zeros(v_image.shape[:2]),

@@ -420,7 +420,7 @@ def _index(call: Call, meta: dict[str, Any], flat: np.ndarray) -> tuple[np.ndarr
 
 
 def _assert_list(e: Expected, clear: np.ndarray, tile: int, listed: np.ndarray, tiles_x: int, frame: str) -> None:
-    size, (y, x) = e.scene.tile_size or e.scene.profile.tile_size, divmod(tile, tiles_x)
+    size, (y, x) = e.scene.side, divmod(tile, tiles_x)
     window = (slice(y * size, (y + 1) * size), slice(x * size, (x + 1) * size))
     sure = e.error_bounds.unambiguous[window]
     shown = [layer.id for layer in e.error_bounds.layers if np.any(layer.blended[window] & sure)]

@@ -52,7 +52,7 @@ def _scenes(dtype: Any) -> Iterator[tuple[Scene, PixelErrorBounds]]:
 
 def _drawn(scene: Scene, moved: Callable[[Splats], Splats], background: float = 0.0) -> np.ndarray:
     splats, lists = projected(scene)
-    camera, size = scene.camera, scene.tile_size or scene.profile.tile_size
+    camera, size = scene.camera, scene.side
     behind = scene.background + background
     drawn = composite(moved(splats), lists, camera.width, camera.height, size, behind, scene.profile)
     return np.concatenate([drawn.image, drawn.T_final[..., None]], axis=2)

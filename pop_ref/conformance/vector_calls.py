@@ -200,7 +200,7 @@ def _entry(call: Call, b: int, row: list[Expected]) -> dict[str, np.ndarray]:
     arrays["alphas"] = 1.0 - np.stack([e.render.T_final for e in row])
     arrays["error_bound_alphas"] = np.stack([e.error_bounds.T_final + 1.0 for e in row])
     arrays |= {"T_final": 1.0 - arrays["alphas"], "error_bound_T_final": arrays["error_bound_alphas"]}
-    told = (len(row), len(call.frames), call.tile_size or call.profile.tile_size)
+    told = (len(row), len(call.frames), call.tile_size)
     arrays |= {name: np.array(value) for name, value in zip(_TOLD, told, strict=True)}
     for name in ("dominant_ids", "n_blended"):
         arrays[name] = np.stack([getattr(e.render, name) for e in row])

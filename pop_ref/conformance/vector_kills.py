@@ -23,29 +23,11 @@ from typing import Any
 
 import numpy as np
 
+from pop_ref.conformance import capabilities
 from pop_ref.conformance import vector_training as training
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.backends import SHIPPED, shipped
 from pop_ref.conformance.calls import Call, Frame, unpacked
-from pop_ref.conformance.capabilities import (
-    ANTIALIASING,
-    BATCHES,
-    CAMERA_COLORS,
-    CAMERAS,
-    CHANNELS,
-    COLORS,
-    COVARS,
-    DEPTH,
-    DOMINANCE,
-    GRADIENTS,
-    NO_BACKGROUND,
-    PACKED,
-    PLANES,
-    RADIUS_CLIP,
-    RENDER,
-    SCALE,
-    SIGNATURE,
-)
 from pop_ref.conformance.mutants import FAMILIES
 from pop_ref.conformance.mutants.trial import alive
 from pop_ref.conformance.scenes import Scene, scene_from
@@ -176,13 +158,13 @@ def answered(backend: Any, kind: str, arrays: Arrays, options: dict[str, Any]) -
 
 def _image(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
     scene = scene_from(arrays, options)
-    able = backend.has(RENDER) and (len(scene.gaussians) < LARGE or backend.has(SCALE))
+    able = backend.has(capabilities.RENDER) and (len(scene.gaussians) < LARGE or backend.has(capabilities.SCALE))
     if not able or not _same(backend.sees(scene), scene):
         return {}
     view = backend.render(scene)
     found = {"image": view.image, "T_final": view.T_final, "n_blended": view.n_blended, "radii": view.radii}
     found |= {name: getattr(view, name) for name in ("means2d", "depths", "conics")}
-    if backend.has(DOMINANCE):
+    if backend.has(capabilities.DOMINANCE):
         found["dominant_ids"] = view.dominant_ids
     if isinstance(backend, OracleAdapter):
         splats = backend.full_render(scene).splats
@@ -190,7 +172,7 @@ def _image(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
     if "depths" not in arrays:
         # a large vector asks for the image alone
         found = {name: found.get(name) for name in ("image", "T_final", "n_blended", "dominant_ids")}
-    if backend.has(GRADIENTS):
+    if backend.has(capabilities.GRADIENTS):
         v = backend.gradients(scene, arrays["v_image"], arrays["v_T_final"])
         found |= {f"v_{name}": value for name, value in v.items()}
     return {name: np.asarray(value) for name, value in found.items() if value is not None}
@@ -207,7 +189,7 @@ def _call(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
         return {}
     batched = len(call.batch) > 0
     whole = {name: value if batched else value[None] for name, value in arrays.items()}
-    cotangents = (whole["v_images"], whole["v_alphas"]) if backend.has(GRADIENTS) else ()
+    cotangents = (whole["v_images"], whole["v_alphas"]) if backend.has(capabilities.GRADIENTS) else ()
     called = backend.call(call, *cotangents)
     found = {"images": called.images, "alphas": called.alphas}
     for name, key in (("dominant_ids", "dominant_ids"), ("n_blended", "n_contrib")):
@@ -287,19 +269,19 @@ def _frames(arrays: Arrays, options: dict[str, Any], profile: Profile, plain: bo
 def _needs(call: Call) -> list[str]:
     """Return what a rasterizer has to offer to be asked for a call."""
     asked = {
-        COLORS: call.sh_degree is None,
-        CHANNELS: call.sh_degree is None,
-        CAMERA_COLORS: call.camera_colors,
-        DEPTH: call.render_mode != "RGB",
-        ANTIALIASING: call.antialiased,
-        PLANES: bool(call.planes),
-        RADIUS_CLIP: call.radius_clip > 0.0,
-        PACKED: call.packed,
-        COVARS: call.covars,
-        BATCHES: bool(call.batch),
-        NO_BACKGROUND: call.no_background,
+        capabilities.COLORS: call.sh_degree is None,
+        capabilities.CHANNELS: call.sh_degree is None,
+        capabilities.CAMERA_COLORS: call.camera_colors,
+        capabilities.DEPTH: call.render_mode != "RGB",
+        capabilities.ANTIALIASING: call.antialiased,
+        capabilities.PLANES: bool(call.planes),
+        capabilities.RADIUS_CLIP: call.radius_clip > 0.0,
+        capabilities.PACKED: call.packed,
+        capabilities.COVARS: call.covars,
+        capabilities.BATCHES: bool(call.batch),
+        capabilities.NO_BACKGROUND: call.no_background,
     }
-    return [SIGNATURE, CAMERAS, *(need for need, holds in asked.items() if holds)]
+    return [capabilities.SIGNATURE, capabilities.CAMERAS, *(need for need, holds in asked.items() if holds)]
 
 
 def _loss(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:

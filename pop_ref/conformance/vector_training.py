@@ -8,7 +8,6 @@ after the other. A training that parts from the recorded one asks for what is no
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any, Final
 
@@ -30,21 +29,14 @@ from pop_ref.scripted import Pass, ScriptedView
 from pop_ref.settings import GSPLAT, POP, DensityConfig, LearningRates
 
 Vector = tuple[dict[str, np.ndarray], dict[str, Any]]
+# by the module of the loss and of its gradient
 LOSSES = {
-    "l1": losses.l1,
-    "l2": losses.l2,
-    "ssim": ssim.ssim,
-    "d_ssim": ssim.d_ssim,
-    "photometric_3dgs": losses.photometric_3dgs,
-    "photometric_pop": losses.photometric_pop,
-}
-_PULLED: dict[str, Callable[..., Any]] = {
-    "l1": losses.l1_vjp,
-    "l2": losses.l2_vjp,
-    "ssim": ssim.ssim_vjp,
-    "d_ssim": ssim.d_ssim_vjp,
-    "photometric_3dgs": losses.photometric_3dgs_vjp,
-    "photometric_pop": losses.photometric_pop_vjp,
+    "l1": losses,
+    "l2": losses,
+    "ssim": ssim,
+    "d_ssim": ssim,
+    "photometric_3dgs": losses,
+    "photometric_pop": losses,
 }
 V_LOSS = 0.75
 SHARE = 0.25
@@ -111,9 +103,9 @@ def _loss(
         "picture": picture,
         "target": target,
         "mask": mask,
-        "loss": np.array(LOSSES[name](picture, target, *arguments)),
+        "loss": np.array(getattr(LOSSES[name], name)(picture, target, *arguments)),
         "error_bound_loss": np.array(of_value),
-        "v_picture": _PULLED[name](picture, target, V_LOSS, *arguments),
+        "v_picture": getattr(LOSSES[name], f"{name}_vjp")(picture, target, V_LOSS, *arguments),
         "error_bound_v_picture": of_gradient + 1.0 / picture.size,
     }
     return arrays, options

@@ -181,12 +181,7 @@ def export(folder: Path) -> list[str]:
 
 def _full_options(scene: Scene) -> dict[str, Any]:
     """Return the scene's options with every default written out: a port has no defaults to take."""
-    options = scene_options(scene)
-    if options["tile_size"] is None:
-        options["tile_size"] = scene.profile.tile_size
-    if options["sh_degree"] is None:
-        options["sh_degree"] = round(np.sqrt(scene.gaussians.sh.shape[1])) - 1
-    return options
+    return scene_options(scene) | {"tile_size": scene.side, "sh_degree": scene.degree}
 
 
 _BANDS = tuple((0.125 * (k % 5) - 0.25, 0.0625 * (k % 7) - 0.125, 0.25 - 0.0625 * (k % 3)) for k in range(15))

@@ -194,7 +194,7 @@ def _clearly_culled(call: Call, dtype: Any) -> bool:
 def clear_of_extents(scene: Scene, dtype: Any) -> np.ndarray:
     """Return the Gaussians whose culls, extents and tiles rounding does not decide (D1, D2, D3). [N]"""
     g, camera = scene.gaussians, scene.camera
-    profile = replace(scene.profile, tile_size=scene.tile_size or scene.profile.tile_size)
+    profile = replace(scene.profile, tile_size=scene.side)
     near, far, reach = constant(profile.near_plane), constant(profile.far_plane), 64.0 * float(np.finfo(dtype).eps)
     clear = np.zeros(len(g), dtype=bool)
     for i, depth in enumerate(depths_magnitudes(g, camera)):
