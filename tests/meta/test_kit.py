@@ -21,7 +21,6 @@ from pop_ref.conformance.failure_report import failure_report
 from pop_ref.conformance.law import missing
 from pop_ref.conformance.mutants import MUTANTS, living
 from pop_ref.conformance.mutants.trial import every_law, law_named, obeys
-from pop_ref.conformance.poison import POISONED_INTEGER, poisoned_allocations
 from pop_ref.conformance.scenes import (
     Scene,
     cotangents,
@@ -37,6 +36,7 @@ from pop_ref.conformance.tolerances import TABLE
 from pop_ref.conformance.torch_strategy import StrategyAdapter
 from pop_ref.constants import INRIA
 from pop_ref.records import Camera, Gaussians
+from tests.judged import POISONED_INTEGER, poisoned_allocations
 
 ROOT = Path(__file__).resolve().parents[2]
 SEEN = settings(max_examples=200, derandomize=True, database=None, suppress_health_check=list(HealthCheck))

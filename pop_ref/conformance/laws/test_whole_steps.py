@@ -15,9 +15,8 @@ import numpy as np
 from hypothesis import strategies as st
 
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
-from pop_ref.conformance.judged_steps import assert_steps
 from pop_ref.conformance.law import law
-from pop_ref.conformance.short_training import ShortTraining
+from pop_ref.conformance.short_training import ShortTraining, assert_steps
 from pop_ref.methods import KEYS, RECIPE_OF
 from pop_ref.settings import LearningRates
 from pop_ref.short_training import Trained
