@@ -556,4 +556,4 @@ _LOSSES: Final[tuple[tuple[Any, ...], ...]] = (
      ("photometric_3dgs",)),
 )  # fmt: skip
 
-TENSORS: Final = (*(BlackBox(*line) for line in _BOXES), *(Loss(*line) for line in _LOSSES))
+TENSORS: Final = (*(BlackBox(*line) for line in _BOXES), *(Loss(*line) for line in list[Any](_LOSSES)))
