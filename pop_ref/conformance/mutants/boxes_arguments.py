@@ -5,7 +5,6 @@ One small view is drawn rightly.
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -140,8 +139,7 @@ def _seen_from_the_first(sound: Rasterization, given: Given) -> Any:
 def _depth_in_a_padded_channel(sound: Rasterization, given: Given) -> Any:
     images, alphas, meta = sound(**given)
     if given["render_mode"].startswith("RGB+") and images.shape[-1] == 5:
-        torch = importlib.import_module("torch")
-        images = torch.cat((images[..., :4], 0.0 * images[..., 4:]), -1)
+        images = import_torch().cat((images[..., :4], 0.0 * images[..., 4:]), -1)
     return images, alphas, meta
 
 
@@ -157,9 +155,7 @@ def _quats_by_compact_rows(sound: Rasterization, given: Given) -> Any:
         found[seen] = v[: len(seen)]
         return found
 
-    own = quats * 1.0
-    own.register_hook(misplaced)
-    return sound(**given | {"quats": own})
+    return sound(**given | {"quats": backwards(quats, misplaced)})
 
 
 def _always_divided(given: Given) -> Given:
@@ -189,9 +185,8 @@ def _centred(given: Given) -> Given:
 def _faint_are_not_divided(sound: Rasterization, given: Given) -> Any:
     images, alphas, meta = sound(**given)
     if given["render_mode"].endswith("ED"):
-        torch = importlib.import_module("torch")
         less = images[..., -1:] * alphas.clamp_min(1e-10) / alphas.clamp_min(1e-2)
-        images = torch.cat((images[..., :-1], less), -1)
+        images = import_torch().cat((images[..., :-1], less), -1)
     return images, alphas, meta
 
 
@@ -333,18 +328,12 @@ def _even_widths(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
 
 
 def _pose_gradient_transposed(given: Given) -> Given:
-    viewmats = given["viewmats"]
-    if not viewmats.requires_grad:
-        return {}
-    seen = viewmats.clone()
-
     def transposed(v: Any) -> Any:
         v = v.clone()
         v[..., :3, :3] = v[..., :3, :3].mT.clone()
         return v
 
-    seen.register_hook(transposed)
-    return {"viewmats": seen}
+    return {"viewmats": backwards(given["viewmats"], transposed)}
 
 
 def _two_bands(given: Given) -> Given:
@@ -404,15 +393,6 @@ def _counted_over_cameras(given: Given, images: Any, alphas: Any, meta: Any) -> 
     return images, alphas, meta
 
 
-def _expected_over_a_constant(sound: Rasterization, given: Given) -> Any:
-    if not given["render_mode"].endswith("ED"):
-        return sound(**given)
-    torch = import_torch()
-    images, alphas, meta = sound(**given | {"render_mode": given["render_mode"].replace("ED", "D")})
-    depth = images[..., -1:] / alphas.detach().clamp_min(1e-10)
-    return torch.cat((images[..., :-1], depth), -1), alphas, meta
-
-
 def _behind_the_first_chunk(given: Given) -> Given:
     behind = given["backgrounds"]
     if behind is None:
@@ -428,13 +408,6 @@ def _last_camera_teaches(given: Given) -> Given:
     if not shared or cameras < 2:
         return {}
     return {"colors": torch.stack([colors.detach()] * (cameras - 1) + [colors], batch)}
-
-
-def _backgrounds_of_the_first_scene(given: Given) -> Given:
-    behind = given["backgrounds"]
-    if behind is None or behind.dim() < 3:
-        return {}
-    return {"backgrounds": behind[:1].expand_as(behind)}
 
 
 def _empty_pixels_are_farthest(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
@@ -687,13 +660,14 @@ _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("counted_over_cameras", "dominant counts are those of all cameras together",
      telling(_counted_over_cameras), "test_signature_meta:every_camera_has_dominant_gaussians_and_counts_of_its_own"),
     ("expected_over_a_constant", "the expected depth's gradient takes the opacity that it is divided by for a constant",
-     _expected_over_a_constant, "test_signature_arguments:the_expected_depth_is_the_accumulated_one_over_the_opacity"),
+     _expected_depth_of_a_constant_opacity,
+     "test_signature_arguments:the_expected_depth_is_the_accumulated_one_over_the_opacity"),
     ("behind_the_first_chunk", "the background lies behind the first chunk of channels only",
      breaking(_behind_the_first_chunk), "test_signature_arguments:colours_of_any_number_of_channels_are_drawn_alike"),
     ("last_camera_teaches", "shared colours learn from the last camera only",
      breaking(_last_camera_teaches), "test_signature_arguments:without_a_background_it_is_black"),
     ("backgrounds_of_the_first_scene", "every scene of a batch is drawn over the backgrounds of the first",
-     breaking(_backgrounds_of_the_first_scene), "test_signature_arguments:batch_entries_do_not_know_of_each_other"),
+     breaking(_background_of_the_first_entry), "test_signature_arguments:batch_entries_do_not_know_of_each_other"),
     ("empty_pixels_are_farthest",
      "the expected depth of a pixel that shows nothing is the largest of the picture, as in splatfacto",
      telling(_empty_pixels_are_farthest),

@@ -15,9 +15,11 @@ from pop_ref.conformance.mutants.black_box import (
     Given,
     Rasterization,
     Told,
+    backwards,
     batched,
     breaking,
     import_torch,
+    in_camera,
     own_colors,
     plain,
     several,
@@ -92,10 +94,8 @@ def _pulled(condition: Callable[[Given], bool], name: str, change: Callable[[Giv
 
     def breaks(sound: Rasterization, given: Given) -> Any:
         value = given[name]
-        if condition(given) and value is not None and value.requires_grad:
-            own = value * 1.0
-            own.register_hook(lambda grad: change(given, grad))
-            given = given | {name: own}
+        if condition(given) and value is not None:
+            given = given | {name: backwards(value, lambda grad: change(given, grad))}
         return sound(**given)
 
     return breaks
@@ -251,15 +251,10 @@ def _first_chunk_learns(given: Given, images: Any, alphas: Any, meta: Any) -> tu
     return import_torch().cat((images[..., :32], images[..., 32:].detach()), -1), alphas, meta
 
 
-def _distances(given: Given) -> Any:
-    R, t = given["viewmats"][..., :3, :3], given["viewmats"][..., None, :3, 3]
-    return (given["means"][..., None, :, :] @ R.transpose(-1, -2) + t).norm(dim=-1)
-
-
 def _far_by_distance(given: Given) -> Given:
     if given["viewmats"].shape[-3] > 1:
         return {}
-    near_enough = _distances(given).squeeze(-2).detach() < given["far_plane"]
+    near_enough = in_camera(given["means"], given["viewmats"]).norm(dim=-1).squeeze(-2).detach() < given["far_plane"]
     return {"opacities": given["opacities"] * near_enough}
 
 

@@ -177,8 +177,7 @@ def _last_row_learns(given: Given) -> Given:
 def _near_by_distance(given: Given) -> Given:
     if given["viewmats"].shape[-3] > 1 or not given["near_plane"] > 0.0:
         return {}
-    R, t = given["viewmats"][..., :3, :3], given["viewmats"][..., None, :3, 3]
-    distances = (given["means"][..., None, :, :] @ R.transpose(-1, -2) + t).norm(dim=-1).squeeze(-2).detach()
+    distances = in_camera(given["means"], given["viewmats"]).norm(dim=-1).squeeze(-2).detach()
     far_enough = distances >= given["near_plane"]
     return {"near_plane": 1e-6 * given["near_plane"], "opacities": given["opacities"] * far_enough}
 
@@ -269,14 +268,6 @@ def _no_tile_fits(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
     if given["width"] >= size and given["height"] >= size:
         return images, alphas, meta
     return images * 0.0, alphas * 0.0, meta
-
-
-def _normalized_in_place_again(sound: Rasterization, given: Given) -> Any:
-    torch, found = import_torch(), sound(**given)
-    if given["quats"] is not None:
-        with torch.no_grad():
-            given["quats"].data.div_(given["quats"].data.norm(dim=-1, keepdim=True))
-    return found
 
 
 def _tiles_of_16_bits(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
@@ -444,7 +435,7 @@ _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("no_tile_fits", "pictures smaller than a tile stay empty",
      telling(_no_tile_fits), "test_agreement:the_image_is_one_of_the_oracles_outcomes"),
     ("normalized_in_place", "the caller's quaternions are normalised in place",
-     _normalized_in_place_again, "test_agreement:gradients_are_the_oracles"),
+     _normalized_in_place, "test_agreement:gradients_are_the_oracles"),
     ("tiles_of_16_bits", "tiles from number 32768 on stay empty",
      telling(_tiles_of_16_bits), "test_whole:tiles_of_a_number_beyond_16_bits_are_drawn"),
     ("principal_point_in_whole_pixels", "cx and cy are kept as whole numbers, as a data loader that resizes once did",
