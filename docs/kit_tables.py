@@ -30,8 +30,6 @@ JUDGED = {
     "pop_fast float32": ("pop_fast.json", "fast32"),
     "compiled float64": ("compiled.json", "compiled64"),
     "compiled float32": ("compiled.json", "compiled32"),
-    "host mirror float64": ("host_mirror.json", "mirror64"),
-    "host mirror float32": ("host_mirror.json", "mirror32"),
     "gsplat torch float64": ("gsplat.json", "gsplat-torch64"),
     "gsplat torch float32": ("gsplat.json", "gsplat-torch32"),
 }

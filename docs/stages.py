@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from pop_ref.conformance.laws import STANDS_IN
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -87,7 +89,7 @@ NOT_STAGES = frozenset(
 # stages whose laws stand in a file of another name: whole views, and what is tested elsewhere
 LAWS_ELSEWHERE = {
     "render": "pop_ref/conformance/laws/test_whole.py",
-    "depth": "pop_ref/conformance/laws/test_signature_depth.py",
+    "depth": "pop_ref/conformance/laws/test_signature_arguments.py",
     "training": "tests/golden",
     "appearance": "tests/oracle/test_appearance.py",
     "refinement": "tests/oracle/test_appearance.py",
@@ -125,5 +127,6 @@ def laws(stage: Stage) -> Iterator[Path]:
         if module in LAWS_ELSEWHERE:
             yield ROOT / LAWS_ELSEWHERE[module]
         folder = ROOT / "pop_ref" / "conformance" / "laws"
+        module = STANDS_IN.get(module, module)
         yield from sorted(folder.glob(f"test_{module}.py"))
         yield from sorted(folder.glob(f"test_{module}_*.py"))

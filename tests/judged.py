@@ -1,4 +1,4 @@
-"""Which laws are run here, and over which backends."""
+"""Which laws are run here, over which backends, and with allocations whose numbers show where nobody writes them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import functools
 import importlib
 import os
 import pkgutil
-from collections.abc import Iterable
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -61,3 +63,48 @@ def own_backends() -> tuple[list[Any], list[Any]]:
     An adapter asks its program once what it offers; made anew for each law, it would ask for each.
     """
     return [shipped(name) for name in SHIPPED], [shipped_or_absent(name) for name in ("compiled64", "compiled32")]
+
+
+ALLOCATORS = ("empty", "empty_like", "empty_strided")
+ALLOCATING_METHODS = ("new_empty", "new_empty_strided")
+# an index nobody means, far outside every array
+POISONED_INTEGER = -(2**30)
+
+
+@contextmanager
+def poisoned_allocations(package: str) -> Iterator[None]:
+    """Fill uninitialised tensors that a package asks for with NaN, integers with a wild index, truths with True."""
+    torch = importlib.import_module("torch")
+    places = [(torch, name) for name in ALLOCATORS] + [(torch.Tensor, name) for name in ALLOCATING_METHODS]
+    originals = {(owner, name): getattr(owner, name) for owner, name in places}
+    for (owner, name), original in originals.items():
+        setattr(owner, name, _poisoning(original, package, torch))
+    try:
+        yield
+    finally:
+        for (owner, name), original in originals.items():
+            setattr(owner, name, original)
+
+
+def _poisoning(original: Callable[..., Any], package: str, torch: Any) -> Callable[..., Any]:
+    @functools.wraps(original)
+    def allocate(*args: Any, **kwargs: Any) -> Any:
+        tensor = original(*args, **kwargs)
+        caller = sys._getframe(1).f_globals.get("__name__", "")
+        if caller.split(".")[0] == package:
+            _fill(tensor, torch)
+        return tensor
+
+    return allocate
+
+
+def _fill(tensor: Any, torch: Any) -> None:
+    with torch.no_grad():
+        if tensor.is_floating_point():
+            tensor.fill_(float("nan"))
+        elif tensor.dtype == torch.bool:
+            tensor.fill_(True)
+        elif tensor.dtype in (torch.int32, torch.int64):
+            tensor.fill_(POISONED_INTEGER)
+        else:
+            tensor.fill_(1)

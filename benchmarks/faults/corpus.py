@@ -37,7 +37,7 @@ from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.load_result import RECORD, CaptureRecord, record_text
 from pop_fast.view.live.state import KeyCamera, path_of
 from pop_fast.view.report.checks import Checks
-from pop_ref.conformance.scene_files import save_scene
+from pop_ref.conformance.scenes import save_scene
 from pop_ref.conformance.vectors import export
 
 from .ksplat import ksplat_of
@@ -370,7 +370,7 @@ def _write_vectors(folder: Path) -> None:
 
 
 def _write_kit(folder: Path) -> None:
-    from pop_ref.conformance.vector_scenes import vector_scenes
+    from pop_ref.conformance.vectors import vector_scenes
     from pop_ref.learn.course import COURSE, stage_named
     from pop_ref.learn.stubs import answer, start
 

@@ -49,7 +49,7 @@ from pop_fast.view.live.state import read_path
 from pop_fast.view.paths import frames_in
 from pop_fast.view.report.source import read_result
 from pop_ref.conformance import vector_check
-from pop_ref.conformance.scene_files import load_scene
+from pop_ref.conformance.scenes import load_scene
 from pop_ref.learn.course import stage_named
 from pop_ref.learn.progress import asked_before, course_map, state
 from pop_ref.learn.student import borrowing, read_work

@@ -1,4 +1,4 @@
-"""In a process of its own: the library of `POP_SANITIZED` in the place of the compiled backend's or the mirror's."""
+"""In a process of its own: the library of `POP_SANITIZED` in the place of the compiled backend's."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import os
 import sys
 from pathlib import Path
 
-import numpy as np
 import torch
 
 import pop_fast.compiled
@@ -30,12 +29,9 @@ METHODS = ("pop", "gsplat", "3dgs", "taming", "pup", "mini-splatting", "speedy-s
 def main() -> None:
     """Put the library in, and use all of it."""
     what, path = sys.argv[1], Path(os.environ["POP_SANITIZED"])
-    if what == "mirror":
-        _mirror(path)
-    else:
-        _compiled(path, threads=4 if what == "threads" else 2, steps=24 if what == "threads" else 40)
+    _compiled(path, threads=4 if what == "threads" else 2, steps=24 if what == "threads" else 40)
     loaded = Path("/proc/self/maps").read_text()
-    if str(path) not in loaded or "/_blend_" in loaded or "/pop_mirror_" in loaded:
+    if str(path) not in loaded or "/_blend_" in loaded:
         raise SystemExit("another library than the sanitized one was used")
 
 
@@ -112,22 +108,6 @@ def _draw(name: str, dtype: torch.dtype) -> int:
     passes.fisher_blocks()
     passes.dominant_points()
     return 1
-
-
-def _mirror(path: Path) -> None:
-    from cuda_ext.host import mirror
-    from pop_ref.conformance.mirror_adapter import FOLDER, MirrorAdapter
-
-    mirror.build_mirror = lambda folder: path
-    drawn = 0
-    for dtype in (np.float32, np.float64):
-        adapter = MirrorAdapter(FOLDER, dtype)
-        for name in PLANS:
-            scene = corpus_scene(name)
-            render = adapter.render(scene)
-            adapter.gradients(scene, np.ones_like(render.image), np.ones_like(render.T_final))
-            drawn += 1
-    print(f"{drawn} renders with gradients")
 
 
 if __name__ == "__main__":

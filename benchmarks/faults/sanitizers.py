@@ -1,4 +1,4 @@
-"""Every unit of C++ under sanitizers: of the compiled backend, of the host mirror, and of the kernels' emulator.
+"""Every unit of C++ under sanitizers: of the compiled backend and of the kernels' emulator.
 
 Two libraries are made of the compiled backend, one for AddressSanitizer and UndefinedBehaviorSanitizer, one for
 ThreadSanitizer. The first also counts which lines ran, so that a unit that nothing calls is a failure.
@@ -19,8 +19,6 @@ from typing import Any, Final
 import cuda_ext
 from cuda_ext.compiler import find_compiler
 from cuda_ext.host import emulate
-from cuda_ext.host.mirror import HERE as HOST
-from cuda_ext.host.mirror import mirror_sources
 from pop_fast.children import module_command
 from pop_fast.compiled.build import CUDA, HERE, SHARED, SOURCES, UNITS
 
@@ -73,18 +71,10 @@ CHECKS: Final[Mapping[str, Check]] = {
     "compiled backend, four threads": Check(
         _COMPILED, _OF_COMPILED, (*_TUNED, "-fsanitize=thread"), "libtsan.so", "threads", "ThreadSanitizer"
     ),
-    "host mirror": Check(
-        (HOST / "mirror.cpp",),
-        tuple(mirror_sources()),
-        (*_FLAGS, "-ffp-contract=off", *_MEMORY, *_COUNTED),
-        "libasan.so",
-        "mirror",
-        _ADDRESS,
-    ),
 }
 EMULATION: Final = "kernels under the emulator"
 # these are compiled by the emulator's own build, with the flags that POP_EMULATED_FLAGS adds
-EMULATED: Final = (HOST / "emulator.cpp", CUDA_EXT / "bindings.cpp", CUDA_EXT / "bindings_training.cpp")
+EMULATED: Final = (emulate.HERE / "emulator.cpp", CUDA_EXT / "bindings.cpp", CUDA_EXT / "bindings_training.cpp")
 # its fibers switch stacks, which AddressSanitizer must not follow
 _EMULATED_FLAGS: Final = "-fsanitize=address --param asan-stack=0"
 _EMULATED_TESTS: Final = tuple(f"tests/cuda/gpu/test_{name}.py" for name in ("smoke", "ten_steps"))
@@ -201,7 +191,7 @@ def _emulated(compile_first: bool) -> dict[str, Any]:
         reason = "its build takes minutes"
     if reason is not None:
         return {"about": about, "skipped": reason, "failures": []}
-    check, compiler = CHECKS["host mirror"], find_compiler() or []
+    check, compiler = CHECKS["compiled backend"], find_compiler() or []
     words = module_command("pytest", "-q", "-p", "no:cacheprovider", *_EMULATED_TESTS)
     told, failures = _ran(words, check, compiler, {"POP_EMULATED_FLAGS": _EMULATED_FLAGS, "POP_CUDA_ON": "emulated"})
     return {"about": about, "told": told[-1:], "failures": failures}

@@ -1,7 +1,7 @@
 // One splat at one pixel; the counterpart of pop_ref/alpha.py.
 //
-// Twice: as the oracle writes it, and as the kernels run it. The kernels' form folds log2(e) into the conic once per
-// splat, so that a pair costs two fused multiply-adds, a subtraction and a comparison before the first that needs exp2:
+// The kernels' form folds log2(e) into the conic once per splat, so that a pair costs two fused multiply-adds, a
+// subtraction and a comparison before the first that needs exp2:
 //     sigma log2(e) = hA dx^2 + dy (hC dy + B dx),    hA = A log2(e) / 2, B = B log2(e), hC = C log2(e) / 2.
 // That comparison is D5 as well: o 2^-x >= floor where x <= log2(o / floor), which is made once a splat.
 #pragma once
@@ -12,56 +12,6 @@ namespace pop {
 
 constexpr double LOG2_E = 1.44269504088896340736;
 constexpr double LN_2 = 0.693147180559945309417;
-
-template <class Real>
-struct Alpha {
-    Real alpha;
-    bool skipped;
-};
-
-template <class Real>
-POP_HD Real sigma_at_pixel(Vec2<Real> mean2d, Conic<Real> conic, Real px, Real py) {
-    const Real A = conic.xx, B = conic.xy, C = conic.yy;
-    const Real dx = mean2d.x - px;
-    const Real dy = mean2d.y - py;
-    return Real(0.5) * (A * dx * dx + C * dy * dy) + B * dx * dy;
-}
-
-template <class Real>
-POP_HD void sigma_at_pixel_vjp(Vec2<Real> mean2d, Conic<Real> conic, Real px, Real py, Real v_sigma,
-                               Vec2<Real>& v_mean2d, Conic<Real>& v_conic) {
-    const Real A = conic.xx, B = conic.xy, C = conic.yy;
-    const Real dx = mean2d.x - px;
-    const Real dy = mean2d.y - py;
-    v_mean2d = {v_sigma * (A * dx + B * dy), v_sigma * (B * dx + C * dy)};
-    v_conic = {v_sigma * Real(0.5) * dx * dx, v_sigma * dx * dy, v_sigma * Real(0.5) * dy * dy};
-}
-
-template <class Real>
-POP_HD Real falloff(Real sigma) {
-    return exp(-sigma);
-}
-
-template <class Real>
-POP_HD Real falloff_vjp(Real sigma, Real v_falloff) {
-    return -exp(-sigma) * v_falloff;
-}
-
-// D5, D6
-template <class Real>
-POP_HD Alpha<Real> alpha_from_sigma(Real sigma, Real opacity, const Profile<Real>& profile) {
-    if (sigma < Real(0)) return {Real(0), true};
-    const Real alpha = min_of(profile.alpha_ceiling, opacity * falloff(sigma));
-    return {alpha, alpha < profile.alpha_floor};
-}
-
-// B3
-template <class Real>
-POP_HD Vec2<Real> alpha_from_sigma_vjp(Real sigma, Real opacity, Real v_alpha, const Profile<Real>& profile) {
-    if (alpha_from_sigma(sigma, opacity, profile).skipped) return {Real(0), Real(0)};
-    if (opacity * falloff(sigma) > profile.alpha_ceiling && !profile.pass_ceiling) return {Real(0), Real(0)};
-    return {falloff_vjp(sigma, opacity * v_alpha), falloff(sigma) * v_alpha};
-}
 
 // what the kernels ask of a profile, with every strictness turned into a number
 template <class Real>

@@ -1,7 +1,7 @@
 // Numbers, small vectors and small matrices, for host and device, over Real = float or double.
 //
 // mul, add and fma round once each and are never contracted, so that the forward and the backward kernel compute the
-// same bits of alpha from the same splat, and the host mirror the same as both where the hardware's exp2 allows it.
+// same bits of alpha from the same splat.
 #pragma once
 
 #include <math.h>

@@ -1,1 +1,1 @@
-"""The kernels without a GPU: their mathematics as an ordinary library, and their own source under an emulator."""
+"""The kernels without a GPU: their own source, compiled for the host and run under an emulator."""

@@ -5,9 +5,8 @@
 A law is a sentence that every correct rasterizer obeys; it is written once, in `laws`, against an `Adapter`, and runs
 over every backend and over the oracle itself. Needs numpy, hypothesis and pytest; an adapter imports what it adapts.
 
-In reading order: `scenes` (what is drawn), `strategies` and `threshold_strategies` (how it is drawn), `adapter` (what
-is judged), `tolerances` and `error_bounds` (how much rounding costs), `threshold_outcomes` (what rounding may decide),
-`assertions`.
+In reading order: `scenes` (what is drawn), `strategies` (how it is drawn), `adapter` (what is judged), `tolerances` and
+`error_bounds` (how much rounding costs), `thresholds` (what rounding may decide), `assertions`.
 """
 
 from pop_ref.conformance.adapter import Adapter, View

@@ -2,6 +2,9 @@
 
 Everything crosses the border as NumPy float64 (ids int64), in the oracle's names and shapes, one camera at a time. An
 adapter says with `has` what its implementation can do; laws that need more are skipped by name.
+
+The oracle that others are compared with (`Reference`) keeps its latest answers: laws begin with the same scenes, and
+each backend is tried on those of the backend before it. The oracle that is judged itself keeps nothing.
 """
 
 from __future__ import annotations
@@ -10,10 +13,11 @@ import functools
 import importlib
 import importlib.util
 import inspect
-from collections.abc import Callable
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, fields, replace
 from types import ModuleType
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -33,6 +37,7 @@ from pop_ref.conformance.capabilities import (
     capabilities_of,
     same_constants,
 )
+from pop_ref.conformance.error_bounds import PixelErrorBounds, pixel_error_bounds
 from pop_ref.conformance.scenes import Scene, golden_scene, rounded_to
 from pop_ref.conformance.views import ASKED, refusal
 from pop_ref.constants import PAPER, Profile
@@ -41,39 +46,12 @@ from pop_ref.splatting import project, project_vjp
 from pop_ref.tiles import tile_lists
 
 STAGE_MODULES = (
-    "activations",
-    "covariance",
-    "harmonics",
-    "camera",
-    "projection",
-    "footprint",
-    "tiles",
-    "alpha",
-    "pixel",
-    "compositing",
-    "dominance",
-    "margins",
-    "ssim",
-    "losses",
-    "polarization",
-    "regularizers",
-    "appearance",
-    "refinement",
-    "density_rows",
-    "density",
-    "optimizer",
-    "training",
-    "methods",
-    "short_training",
-    "contributions",
-    "sensitivity",
-    "fisher",
-    "chord",
-    "selection",
-    "taming",
-    "mini_splatting",
+    "activations", "covariance", "harmonics", "camera", "projection", "footprint", "tiles", "alpha", "pixel",
+    "compositing", "dominance", "margins", "ssim", "losses", "polarization", "regularizers", "appearance",
+    "refinement", "density_config", "density_rows", "density", "optimizer", "training", "methods",
+    "short_training", "contributions", "sensitivity", "fisher", "chord", "selection", "taming", "mini_splatting",
     "tight_tiles",
-)
+)  # fmt: skip
 # what a view may tell of dominance, by capability
 TOLD_OF_DOMINANCE = {
     DOMINANCE: "dominant_ids",
@@ -205,7 +183,7 @@ class Adapter:
 
     def render(self, scene: Scene) -> View:
         """Draw a scene; by default the oracle projects and lists, and `composite` blends."""
-        camera, size = scene.camera, scene.profile.tile_size if scene.tile_size is None else scene.tile_size
+        camera, size = scene.camera, scene.side
         splats, lists = projected(scene)
         drawn = self.stage("composite")(
             splats, lists, camera.width, camera.height, size, scene.background, scene.profile
@@ -220,7 +198,7 @@ class Adapter:
     def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
         """Return cotangents by name: means, quats, scales, opacities, sh, and those of viewmat, background, means2d,
         means2d_abs that the implementation offers; by default those of `composite_vjp`, projected by the oracle."""
-        camera, size = scene.camera, scene.profile.tile_size if scene.tile_size is None else scene.tile_size
+        camera, size = scene.camera, scene.side
         splats, lists = projected(scene)
         v = self.stage("composite_vjp")(
             splats, lists, camera.width, camera.height, size, v_image, v_T_final, scene.background, scene.profile
@@ -270,7 +248,7 @@ def _shown(splats: Any) -> dict[str, Any]:
 def projected(scene: Scene) -> tuple[Splats, list[list[int]]]:
     """Project a scene and list its splats, by the oracle: what stage functions of whole views take."""
     camera = scene.camera
-    size = scene.profile.tile_size if scene.tile_size is None else scene.tile_size
+    size = scene.side
     # the square extent's cull reads the grid from the profile
     profile = replace(scene.profile, tile_size=size)
     splats = project(scene.gaussians, camera, scene.sh_degree, profile, scene.antialiased)
@@ -334,12 +312,12 @@ class OracleAdapter(Adapter):
     def full_render(self, scene: Scene) -> Any:
         """Draw a scene and return the oracle's own `Render`, with the splats and tile lists."""
         module = importlib.import_module(f"{self.package}.render")
-        return module.render(*self._own(scene), **self._options(scene))
+        return module.render(*self._own(scene), **scene.options)
 
     def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
         """Return the cotangents of `render.render_vjp`."""
         module = importlib.import_module(f"{self.package}.render")
-        g = module.render_vjp(*self._own(scene), v_image=v_image, v_T_final=v_T_final, **self._options(scene))
+        g = module.render_vjp(*self._own(scene), v_image=v_image, v_T_final=v_T_final, **scene.options)
         return {f.name: np.asarray(getattr(g, f.name)) for f in fields(g) if getattr(g, f.name) is not None}
 
     def call(self, call: Call, v_images: Any = None, v_alphas: Any = None) -> Called:
@@ -354,7 +332,7 @@ class OracleAdapter(Adapter):
         images, alphas, pulled = [], [], []
         for b, c, frame in call.each:
             scene = drawn_scene(call, frame)
-            options = {**self._options(scene), "colors": frame.colors, "render_mode": call.render_mode}
+            options = {**scene.options, "colors": frame.colors, "render_mode": call.render_mode}
             drawn = module.render(*self._own(scene), **options)
             images.append(drawn.image)
             alphas.append(1.0 - drawn.T_final)
@@ -372,15 +350,6 @@ class OracleAdapter(Adapter):
         own_g = g if isinstance(g, types.Gaussians) else types.Gaussians(g.means, g.quats, g.scales, g.opacities, g.sh)
         own_c = c if isinstance(c, types.Camera) else types.Camera(c.viewmat, c.K, c.width, c.height)
         return own_g, own_c
-
-    def _options(self, scene: Scene) -> dict[str, Any]:
-        return {
-            "background": scene.background,
-            "sh_degree": scene.sh_degree,
-            "profile": scene.profile,
-            "tile_size": scene.tile_size,
-            "antialiased": scene.antialiased,
-        }
 
 
 def _folded(rows: list[np.ndarray], shape: tuple[int, int]) -> np.ndarray:
@@ -407,3 +376,82 @@ def oracle_view(scene: Scene) -> View:
 
 
 __all__ = ["Adapter", "OracleAdapter", "View", "oracle_view", "projected", "rounded_to", "stage_function"]
+
+
+# answers, of small images; a law has at most fifty scenes, and its backends follow each other
+KEPT: Final = 192
+# Gaussians of the largest scene that is remembered
+LARGEST: Final = 256
+
+# the answers of every function that keeps some
+_ALL: Final[list[OrderedDict[Hashable, Any]]] = []
+
+
+def forget() -> None:
+    """Forget every answer; whoever breaks the oracle itself must, before and after."""
+    for kept in _ALL:
+        kept.clear()
+
+
+def remembered(answer: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of a scene and of arrays or plain values that keeps its latest answers, which are read only."""
+    kept: OrderedDict[Hashable, Any] = OrderedDict()
+    _ALL.append(kept)
+
+    @functools.wraps(answer)
+    def asked(scene: Scene, *more: Any) -> Any:
+        if len(scene.gaussians) > LARGEST:
+            return answer(scene, *more)
+        key = (_scene_key(scene), *map(_key, more))
+        if key not in kept:
+            kept[key] = answer(scene, *more)
+            if len(kept) > KEPT:
+                kept.popitem(last=False)
+        kept.move_to_end(key)
+        return kept[key]
+
+    return asked
+
+
+def _scene_key(scene: Scene) -> Hashable:
+    g, camera = scene.gaussians, scene.camera
+    arrays = (g.means, g.quats, g.scales, g.opacities, g.sh, camera.viewmat, camera.K, scene.background)
+    plain = (camera.width, camera.height, scene.profile, scene.tile_size, scene.sh_degree, scene.antialiased)
+    return (*map(_key, arrays), *plain)
+
+
+def _key(value: Any) -> Hashable:
+    # the bits, in which 0.0 and -0.0 differ
+    return (value.shape, value.dtype.str, value.tobytes()) if isinstance(value, np.ndarray) else value
+
+
+class Reference(OracleAdapter):
+    """The oracle, whose renders and gradients of a scene are computed once."""
+
+    def render(self, scene: Scene) -> View:
+        """Draw a scene, or return what was drawn of it."""
+        return _render(scene)
+
+    def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
+        """Return the cotangents of `render.render_vjp`."""
+        return dict(_gradients(scene, v_image, v_T_final))
+
+
+_ORACLE: Final = OracleAdapter()
+
+
+@remembered
+def _render(scene: Scene) -> View:
+    return _ORACLE.render(scene)
+
+
+@remembered
+def _gradients(scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
+    return _ORACLE.gradients(scene, v_image, v_T_final)
+
+
+@remembered
+def error_bounds_of(scene: Scene, dtype: Any) -> PixelErrorBounds:
+    """Return a scene's error bounds in a precision; of square extents with the oracle's own tile lists."""
+    lists = _ORACLE.full_render(scene).tile_lists if scene.profile.extent == "square" else None
+    return pixel_error_bounds(scene, dtype, lists)

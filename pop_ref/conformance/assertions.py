@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from pop_ref.conformance import tolerances
+from pop_ref.conformance.adapter import error_bounds_of
 from pop_ref.conformance.error_bounds import PixelErrorBounds
-from pop_ref.conformance.reference import error_bounds_of
 from pop_ref.conformance.scenes import Scene
 from pop_ref.margins import margins
 

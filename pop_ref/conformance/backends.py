@@ -18,14 +18,16 @@ SHIPPED = ("oracle", "fast64", "fast32")
 ELSEWHERE = (
     "compiled64",
     "compiled32",
-    "mirror64",
-    "mirror32",
     "cuda",
     "gsplat",
     "gsplat-torch64",
     "gsplat-torch32",
     "diff-gaussian-rasterization",
 )
+
+
+# imports torch, and gsplat or Inria's package when it is asked for one
+FOREIGN = "pop_ref.conformance.foreign_adapters"
 
 
 class Unavailable(Exception):  # noqa: N818  a state of the machine, not a fault of the program
@@ -63,7 +65,7 @@ def usual(path: str, dtype: str = "float32") -> tuple[str, str]:
     profile = "paper"
     if path.partition(":")[0].split(".")[0] == "gsplat":
         version = getattr(importlib.import_module("gsplat"), "__version__", "1.5")
-        profile = importlib.import_module("pop_ref.conformance.gsplat_adapter").constants_of(version).name
+        profile = importlib.import_module(FOREIGN).constants_of(version).name
     try:
         torch = importlib.import_module("torch")
     except ModuleNotFoundError as error:
@@ -129,32 +131,26 @@ def shipped(name: str) -> Any:
 
 
 def _elsewhere(name: str) -> Any:
-    kit = "pop_ref.conformance"
     if name.startswith("compiled"):
         reason = importlib.import_module("pop_fast.compiled").why_not()
         if reason is not None:
             raise Unavailable(reason)
         return program(name, "pop_fast", "compiled", _dtype(name))
-    if name.startswith("mirror"):
-        compiler = importlib.import_module("cuda_ext.compiler")
-        if compiler.find_compiler() is None:
-            raise Unavailable(f"the host mirror needs one: {compiler.no_compiler()}")
-        return importlib.import_module(f"{kit}.mirror_adapter").mirror(name)
     if name == "cuda":
         reason = importlib.import_module("cuda_ext").why_not()
         if reason is not None:
             raise Unavailable(reason)
         return adapter_for("pop_fast.cuda:rasterization", name, None, "float32", "cuda")
     if name.startswith("gsplat-torch"):
-        return importlib.import_module(f"{kit}.gsplat_adapter").gsplat_torch(name, _dtype(name))
+        return importlib.import_module(FOREIGN).gsplat_torch(name, _dtype(name))
     # the packages first: what is not installed cannot run anywhere
     importlib.import_module("gsplat" if name == "gsplat" else name.replace("-", "_"))
     if not importlib.import_module("torch").cuda.is_available():
         hint = "; gsplat-torch64 judges its torch stages" if name == "gsplat" else ""
         raise Unavailable(f"{name} needs a CUDA device, and torch finds none{hint}")
     if name == "gsplat":
-        return importlib.import_module(f"{kit}.gsplat_adapter").gsplat_cuda(name)
-    return importlib.import_module(f"{kit}.inria_adapter").inria(name)
+        return importlib.import_module(FOREIGN).gsplat_cuda(name)
+    return importlib.import_module(FOREIGN).inria(name)
 
 
 def _dtype(name: str) -> str:
@@ -171,9 +167,8 @@ def program(name: str, package: str, backend: str, dtype: str) -> Any:
         dtype: "float64" or "float32".
     """
     from pop_ref.conformance.torch_adapter import TorchAdapter
-    from pop_ref.conformance.torch_short_training import short_training_stages
+    from pop_ref.conformance.torch_short_training import photograph_stages
     from pop_ref.conformance.torch_training import training_stages
-    from pop_ref.conformance.torch_watched import watching_stages
 
     rasterization = partial(function_named(f"{package}.api.rasterize:rasterization"), backend=backend)
     stages = f"{package}.stages" if backend == "fast" else f"{package}.{backend}"
@@ -182,8 +177,7 @@ def program(name: str, package: str, backend: str, dtype: str) -> Any:
         # what trains in this precision is the native step, which has an Adam of its own
         native = importlib.import_module(f"{package}.compiled.native_step")
         own_adam = {name: getattr(native, name) for name in ("adam_step", "adam_steps")}
-    trains = training_stages(package, own_adam.get("adam_step")) | own_adam | watching_stages(package, backend, dtype)
-    trains |= short_training_stages(package, backend, dtype)
+    trains = training_stages(package, own_adam.get("adam_step")) | own_adam | photograph_stages(package, backend, dtype)
     if backend == "compiled":
         # one module of its own holds the passes over views
         scores = importlib.import_module(f"{package}.compiled.scores")

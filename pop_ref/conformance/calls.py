@@ -126,8 +126,7 @@ class Call:
     @property
     def tile_size(self) -> int:
         """Return the side of a tile, px."""
-        scene = self.first.scene
-        return scene.profile.tile_size if scene.tile_size is None else scene.tile_size
+        return self.first.scene.side
 
     @property
     def n_tiles(self) -> int:
@@ -171,10 +170,7 @@ class Call:
     @property
     def sh_degree(self) -> int | None:
         """Return the bands to use, None for plain colours."""
-        if self.first.colors is not None:
-            return None
-        stored = round(np.sqrt(self.first.scene.gaussians.sh.shape[1])) - 1
-        return stored if self.first.scene.sh_degree is None else self.first.scene.sh_degree
+        return self.first.scene.degree if self.first.colors is None else None
 
     def without_gradients(self) -> dict[str, np.ndarray | None]:
         """Return the quaternions and scales of a call with covariances, which go before them: others, or None."""
@@ -341,15 +337,8 @@ def oracle_frame_vjp(
 
 def _options(scene: Scene, colors: np.ndarray | None, render_mode: RenderMode) -> dict[str, Any]:
     n = 3 if colors is None else colors.shape[1]
-    return {
-        "background": scene.background if len(scene.background) == n else None,
-        "sh_degree": scene.sh_degree,
-        "profile": scene.profile,
-        "tile_size": scene.tile_size,
-        "antialiased": scene.antialiased,
-        "colors": colors,
-        "render_mode": render_mode,
-    }
+    behind = scene.background if len(scene.background) == n else None
+    return {**scene.options, "background": behind, "colors": colors, "render_mode": render_mode}
 
 
 def unpacked(call: Call, rows: np.ndarray, meta: Any) -> np.ndarray | None:

@@ -10,35 +10,11 @@ from typing import Final
 from pop_ref.constants import GSPLAT_1_6, INRIA, Profile
 
 STAGES: Final = (
-    "activations",
-    "covariance",
-    "harmonics",
-    "camera",
-    "projection",
-    "footprint",
-    "tiles",
-    "alpha",
-    "compositing",
-    "dominance",
-    "gradients",
-    "whole",
-    "losses",
-    "polarization",
-    "few_photographs",
-    "density",
-    "optimizer",
-    "training",
-    "autograd",
-    "contributions",
-    "sensitivity",
-    "fisher",
-    "chord",
-    "selection",
-    "taming",
-    "mini_splatting",
-    "tight_tiles",
-    "signature",
-)
+    "activations", "covariance", "harmonics", "camera", "projection", "footprint", "tiles", "alpha",
+    "compositing", "dominance", "gradients", "whole", "losses", "polarization", "few_photographs", "density",
+    "optimizer", "training", "autograd", "contributions", "sensitivity", "fisher", "chord", "selection", "taming",
+    "mini_splatting", "tight_tiles", "signature",
+)  # fmt: skip
 
 RENDER: Final = "render"
 GRADIENTS: Final = "gradients"
@@ -66,6 +42,10 @@ PLANES: Final = "planes and low-pass other than its defaults"
 NO_BACKGROUND: Final = "a call without backgrounds"
 SPARSE_GRAD: Final = "sparse_grad"
 SCALE: Final = "thousands of Gaussians in seconds"
+
+# what a scorecard lists of whole views
+WHOLE: Final = (RENDER, GRADIENTS, DOMINANCE, DOMINANT_WEIGHTS, DOMINANT_COUNTS, ANTIALIASING, INSTRUMENTS,
+                DETERMINISTIC, SCALE)  # fmt: skip
 
 # these follow from the constants that are implemented
 PROFILES: Final = "any profile"

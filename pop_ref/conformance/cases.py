@@ -156,13 +156,6 @@ def cotangent_like(value: Any) -> Any:
     return 0.5 * (v + np.swapaxes(v, 1, 2)) if square else v
 
 
-def rounded(inputs: tuple[Any, ...], dtype: Any) -> tuple[Any, ...]:
-    """Return the arguments with float arrays rounded to a dtype."""
-    return tuple(
-        a.astype(dtype).astype(np.float64) if isinstance(a, np.ndarray) and a.dtype.kind == "f" else a for a in inputs
-    )
-
-
 def error_bounds_of(case: Case, function: Callable[..., Any], inputs: tuple[Any, ...]) -> tuple[np.ndarray, ...]:
     """Bound the rounding of each output of a function, or of its transpose with the cotangent bound."""
     if case.magnitude is None:

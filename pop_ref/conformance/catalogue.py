@@ -30,7 +30,7 @@ do, and skips the laws that compare bits. `HYPOTHESIS_PROFILE` is `dev`, `ci` or
 examples on every machine, or `explore`, which draws anew (`--hypothesis-seed N`). What an implementation does not offer
 is skipped by name. A failing law prints the first stage, Gaussian, pixel or gradient that differs, the values on both
 sides, the nearest decision with its margin, and a scene to paste, which is also saved as npz (`--failures DIR`;
-`scene_files.load_scene` reads it). `--scorecard card.html`, or `.json`, sums up by stage.
+`scenes.load_scene` reads it). `--scorecard card.html`, or `.json`, sums up by stage.
 
 A rasterizer is asked once for every argument of gsplat's signature: several cameras, batches, packed rows, depth modes,
 plain colours of any number of channels, colours of each camera, covariances, radius_clip, planes, no background,
@@ -55,9 +55,9 @@ Taming-3DGS, Speedy-Splat and PUP-3DGS do at every step. `torch_training.trainin
 trainer's strategies, row operations, schedules and optimizers, and `TorchAdapter(stages=...)` takes any such functions.
 `--strategy gsplat.strategy:DefaultStrategy` judges somebody's strategy by the laws of training that are about no
 method. An engine with an Adam of its own moves the rows by it (`training_stages(package, adam)`). An
-engine's own steps are watched, too (`watched.py`): with rates of 0 they draw photographs, go back, collect and move
-nothing, and after each step gradient sums, views, blur flags, dominated pixels, extents and gradients that wait are
-the oracle's; so are the sums of passes over photographs.
+engine's own steps are watched, too (`short_training.py`): with rates of 0 they draw photographs, go back, collect and
+move nothing, and after each step gradient sums, views, blur flags, dominated pixels, extents and gradients that wait
+are the oracle's; so are the sums of passes over photographs.
 
 What training adds where photographs are few or unlike, depth at sparse points, means of opacities and sizes,
 exposures, other backgrounds, corrections of cameras, is judged as stage functions of these names, with gradients.

@@ -8,16 +8,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pop_ref.conformance.adapter import OracleAdapter, View
+from pop_ref.conformance.adapter import OracleAdapter, View, error_bounds_of
 from pop_ref.conformance.calls import Call, call_as_code
 from pop_ref.conformance.capabilities import GRADIENTS, RENDER
 from pop_ref.conformance.cases import sensitivity
-from pop_ref.conformance.error_bounds import REACH, PixelErrorBounds, pixel_error_bounds
+from pop_ref.conformance.error_bounds import REACH
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
-from pop_ref.conformance.narrowing import Check, breaks, cause, narrowed
-from pop_ref.conformance.pairs import CHECKS
-from pop_ref.conformance.scene_files import save_scene
-from pop_ref.conformance.scenes import Scene, cotangents, scene_as_code
+from pop_ref.conformance.pairs import CHECKS, Check, breaks, cause, narrowed
+from pop_ref.conformance.scenes import Scene, cotangents, save_scene, scene_as_code
 from pop_ref.margins import margins
 
 ORACLE = OracleAdapter()
@@ -64,8 +62,7 @@ def _calls(scene: Scene) -> Iterator[tuple[str, tuple[Any, ...]]]:
     yield "conics_from_covars2d", (blurred,)
     yield "radii_from_covars2d", (blurred, g.opacities, profile)
     dirs = oracle("view_dirs")(g.means, camera.viewmat)
-    degree = round(np.sqrt(g.sh.shape[1])) - 1 if scene.sh_degree is None else scene.sh_degree
-    yield "colors_from_sh", (g.sh, dirs, degree)
+    yield "colors_from_sh", (g.sh, dirs, scene.degree)
 
 
 def first_stage(backend: Any, scene: Scene) -> Difference | None:
@@ -89,7 +86,7 @@ def first_stage(backend: Any, scene: Scene) -> Difference | None:
 
 def first_shown(backend: Any, scene: Scene) -> Difference | list[str]:
     """Find the first stage whose result, as the rasterizer's meta shows it, differs; else the names of those shown."""
-    found, expected, error_bounds = backend.render(scene), ORACLE.render(scene), _error_bounds(backend, scene)
+    found, expected, error_bounds = backend.render(scene), ORACLE.render(scene), error_bounds_of(scene, backend.dtype)
     alike = []
     # rows that either side culls hold nothing to compare
     drawn = np.all(expected.radii > 0, axis=1)
@@ -109,15 +106,10 @@ def first_shown(backend: Any, scene: Scene) -> Difference | list[str]:
     return alike
 
 
-def _error_bounds(backend: Any, scene: Scene) -> PixelErrorBounds:
-    square = scene.profile.extent == "square"
-    return pixel_error_bounds(scene, backend.dtype, ORACLE.full_render(scene).tile_lists if square else None)
-
-
 def first_pixel(backend: Any, scene: Scene) -> tuple[Difference, tuple[int, int]] | None:
     """Find the first pixel that differs by more than rounding, near a threshold or not."""
     expected, found = ORACLE.render(scene), backend.render(scene)
-    error_bounds = _error_bounds(backend, scene)
+    error_bounds = error_bounds_of(scene, backend.dtype)
     limit = error_bounds.reach * (error_bounds.T_final + 1.0)
     colors = error_bounds.reach * (error_bounds.image + error_bounds.absolute)
     checks: list[tuple[str, Any]] = [
@@ -154,7 +146,7 @@ def first_gaussian(backend: Any, scene: Scene) -> str | None:
 
 def first_gradient(backend: Any, scene: Scene) -> Difference | None:
     """Find the first gradient that differs, of the standard cotangents where no decision is near its threshold."""
-    error_bounds = _error_bounds(backend, scene)
+    error_bounds = error_bounds_of(scene, backend.dtype)
     v_image, v_T_final = cotangents(scene)
     v_image, v_T_final = v_image * error_bounds.smooth[..., None], v_T_final * error_bounds.smooth
     expected, found = (side.gradients(scene, v_image, v_T_final) for side in (ORACLE, backend))

@@ -1,21 +1,29 @@
-"""What rounding costs in gradients: the backward pass on absolute values.
+"""What rounding costs in gradients, and in the scores of pruning and budgeting methods.
 
-Every cotangent carries a pair: an upper bound m of its terms' absolute sum, and an error bound e in units of eps. The
-rule is that of `screen_error_bounds`: a product a v costs `|a| e(v) + e(a) m(v) + |a| m(v)`. Sums over pixels may be
-taken about a tile's centre, so an offset counts as itself plus half a tile.
+Gradients are bounded by the backward pass on absolute values. Every cotangent carries a pair: an upper bound m of its
+terms' absolute sum, and an error bound e in units of eps. The rule is that of `error_bounds`: a product a v costs
+`|a| e(v) + e(a) m(v) + |a| m(v)`. Sums over pixels may be taken about a tile's centre, so an offset counts as itself
+plus half a tile.
+
+Scores are sums over pixels of products of bounded terms. The functions that are judged take splats and tile lists;
+these are the oracle's, rounded to the backend's precision, so the error bounds of a whole render bound theirs. A
+Gaussian is compared where every pixel that it may reach is unambiguous.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from pop_ref.camera import camera_center
-from pop_ref.conformance.error_bounds import Layer, PixelErrorBounds
-from pop_ref.conformance.scenes import Scene
-from pop_ref.conformance.screen_error_bounds import TINY, ScreenErrorBounds
+from pop_ref.conformance.adapter import projected
+from pop_ref.conformance.assertions import with_error_bounds
+from pop_ref.conformance.error_bounds import TINY, Layer, PixelErrorBounds, ScreenErrorBounds
+from pop_ref.conformance.scenes import Scene, rounded
 from pop_ref.covariance import covars_from_quats_scales, rotmats_from_quats
+from pop_ref.records import Splats
 
 # of what a splat has of each
 _WIDTHS = {"means2d": (2,), "conics": (3,), "opacities": (), "colors": (3,)}
@@ -86,8 +94,7 @@ def sums_over_pixels(
 ) -> tuple[dict[str, Bound], np.ndarray]:
     """Bound the cotangents of splats, by name, and the error bound of the background's; windows of one image add up."""
     N = len(scene.gaussians)
-    size = scene.tile_size or scene.profile.tile_size
-    pixels = _pixel_bounds(scene, error_bounds, np.abs(v_image), np.abs(v_T_final), 0.5 * size)
+    pixels = _pixel_bounds(scene, error_bounds, np.abs(v_image), np.abs(v_T_final), 0.5 * scene.side)
     T = error_bounds.layers[-1].T_after if error_bounds.layers else np.ones(v_T_final.shape)
     background = np.einsum("hw,hwc->c", 2.0 * T + error_bounds.T_final, np.abs(v_image))
     shapes = {"means2d": (2,), "conics": (3,), "opacities": (), "colors": v_image.shape[2:]}
@@ -269,7 +276,7 @@ def _point_bound(s: ScreenErrorBounds, K: np.ndarray, v_means2d: Bound, v_J: Bou
 
 def _color_bounds(scene: Scene, v_colors: Bound) -> tuple[Bound, np.ndarray]:
     g = scene.gaussians
-    degree = round(np.sqrt(g.sh.shape[1])) - 1 if scene.sh_degree is None else scene.sh_degree
+    degree = scene.degree
     n_sh = (degree + 1) ** 2
     center = camera_center(scene.camera.viewmat)
     dirs = g.means - center
@@ -326,3 +333,126 @@ def _viewmat_bound(scene: Scene, v_p: Bound, v_S: Bound, v_dirs: Bound) -> np.nd
     error_bound[:3, :3] += np.sum(2.0 * v_S.error_bound @ R @ covars, 0) + np.outer(t, np.sum(v_dirs.error_bound, 0))
     error_bound[:3, 3] = np.sum(v_p.error_bound, 0) + R @ np.sum(v_dirs.error_bound, 0)
     return error_bound
+
+
+@dataclass(frozen=True)
+class Screened:
+    """A scene as functions of a view's splats take it.
+
+    Attributes:
+        scene: as the backend reads it.
+        splats: rounded to the backend's precision.
+        lists: ids front to back, tile by tile.
+        tile_size: px.
+        error_bounds: of the render.
+        sure: every pixel that the row may reach is clear of rounding. [N]
+        smooth: and so is the ceiling there (D6). [N]
+    """
+
+    scene: Scene
+    splats: Splats
+    lists: list[list[int]]
+    tile_size: int
+    error_bounds: PixelErrorBounds
+    sure: np.ndarray
+    smooth: np.ndarray
+
+    @property
+    def view(self) -> tuple[Splats, list[list[int]], int, int, int]:
+        """Return what stage functions of a view begin with."""
+        camera = self.scene.camera
+        return self.splats, self.lists, camera.width, camera.height, self.tile_size
+
+
+def screened(backend: Any, scene: Scene) -> Screened:
+    """Project a scene for a backend; scenes that its precision cannot resolve are set aside."""
+    seen, error_bounds = with_error_bounds(backend, scene)
+    splats, lists = projected(seen)
+    columns = ("means2d", "depths", "conics", "opacities", "colors")
+    near = rounded(tuple(getattr(splats, name) for name in columns), backend.dtype)
+    sure, smooth = (_clear_rows(error_bounds, where) for where in (error_bounds.unambiguous, error_bounds.smooth))
+    splats = replace(splats, **dict(zip(columns, near, strict=True)))
+    return Screened(seen, splats, lists, seen.side, error_bounds, sure, smooth)
+
+
+def _clear_rows(error_bounds: PixelErrorBounds, unambiguous: np.ndarray) -> np.ndarray:
+    clear = np.ones(len(error_bounds.scene.gaussians), dtype=bool)
+    floor = error_bounds.scene.profile.alpha_floor * (1.0 - 1e-3)
+    for layer in error_bounds.layers:
+        clear[layer.id] = bool(np.all(unambiguous[layer.raw >= floor]))
+    return clear
+
+
+def weight_error_bounds(error_bounds: PixelErrorBounds) -> tuple[np.ndarray, np.ndarray]:
+    """Bound the rounding of sums of weights, and of distances, over the pixels of each Gaussian. [N], [N]"""
+    n = len(error_bounds.scene.gaussians)
+    weights, distances = np.zeros(n), np.zeros(n)
+    for layer in error_bounds.layers:
+        weights[layer.id] = np.sum(_weight(layer).error_bound)
+        away = np.hypot(layer.dx, layer.dy) + layer.e_dx + layer.e_dy
+        distances[layer.id] = np.sum(away * layer.blended)
+    return weights, distances
+
+
+def sensitivity_error_bounds(error_bounds: PixelErrorBounds) -> np.ndarray:
+    """Bound the rounding of Speedy-Splat's score: twice a term times its error bound, over pixels. [N]"""
+    s = error_bounds.screen
+    found = np.zeros(len(error_bounds.scene.gaussians))
+    for layer, channels in _alpha_bounds(error_bounds):
+        opacity = float(s.opacities[layer.id])
+        term = sum(channels[1:], start=channels[0]).times(opacity, s.e_opacities[layer.id])
+        found[layer.id] = np.sum(2.0 * term.m * term.error_bound)
+    return found
+
+
+def moment_error_bounds(error_bounds: PixelErrorBounds, half_tile: float) -> np.ndarray:
+    """Bound the rounding of the screen moments of Fisher blocks. [N, 31]"""
+    s = error_bounds.screen
+    found = np.zeros((len(error_bounds.scene.gaussians), 31))
+    passes = error_bounds.scene.profile.ceiling_gradient == "pass"
+    for layer, channels in _alpha_bounds(error_bounds):
+        weight = _weight(layer)
+        open_ = 1.0 if passes else np.where(layer.raw > error_bounds.scene.profile.alpha_ceiling, 0.0, 1.0)
+        seconds = np.zeros((5, 5))
+        for c, v_alpha in enumerate(channels):
+            v_sigma = v_alpha.times(layer.raw * open_, (layer.raw * layer.e_sigma + layer.raw) * open_)
+            q = exponent_slopes(layer, s, v_sigma, half_tile)
+            seconds += [[np.sum(_product(a, b)) for b in q] for a in q]
+            found[layer.id, 15 + 5 * c : 20 + 5 * c] = [np.sum(_product(a, weight)) for a in q]
+        found[layer.id, :15] = seconds[np.triu_indices(5)]
+        found[layer.id, 30] = np.sum(_product(weight, weight))
+    return found
+
+
+def _weight(layer: Layer) -> Bound:
+    T, T_error, alpha, e_alpha = layer.T, layer.T_error, layer.alpha, layer.e_alpha
+    return Bound(T * alpha * layer.blended, (T_error * alpha + T * e_alpha) * layer.blended)
+
+
+def _product(a: Bound, b: Bound) -> np.ndarray:
+    return a.m * b.e + a.e * b.m + 2.0 * a.m * b.m
+
+
+def _alpha_bounds(error_bounds: PixelErrorBounds) -> list[tuple[Layer, list[Bound]]]:
+    """Bound dC_c/dalpha of every layer and channel at each pixel, from back to front."""
+    s = error_bounds.screen
+    shape = error_bounds.T_final.shape
+    suffix_color = [
+        Bound(np.full(shape, abs(b)), np.full(shape, abs(b))) for b in error_bounds.scene.background.tolist()
+    ]
+    found: list[tuple[Layer, list[Bound]]] = []
+    for layer in reversed(error_bounds.layers):
+        shown = layer.blended.astype(np.float64)
+        channels: list[Bound] = []
+        for c in range(len(suffix_color)):
+            color, e_color = abs(float(s.colors[layer.id, c])), float(s.e_colors[layer.id, c])
+            color_bound = Bound(np.full(shape, color), np.full(shape, e_color + color))
+            channels.append((color_bound + suffix_color[c]).times(layer.T * shown, layer.T_error * shown))
+            mixed = color_bound.times(layer.alpha, layer.e_alpha) + suffix_color[c].times(
+                1.0 - layer.alpha, layer.e_alpha
+            )
+            suffix_color[c] = Bound(
+                np.where(layer.blended, mixed.m, suffix_color[c].m), np.where(layer.blended, mixed.e, suffix_color[c].e)
+            )
+        found.append((layer, channels))
+    return found

@@ -126,7 +126,7 @@ def _example_of(error: BaseException) -> _Watched | None:
 
 def is_crash(error: BaseException) -> bool:
     """Tell whether a law broke because the backend raised an error, not because of a comparison."""
-    from pop_ref.conformance.narrowing import RasterizerError
+    from pop_ref.conformance.pairs import RasterizerError
 
     return isinstance(error, RasterizerError) or bool(error.__dict__.get(_RAISED_BY_BACKEND))
 

@@ -107,7 +107,7 @@ def pytest_report_header(config: pytest.Config) -> list[str]:
     """Say what is judged, what is refused or not offered, and what to do next."""
     if not _chosen(config):
         return []
-    from pop_ref.conformance.surface import introduction
+    from pop_ref.conformance.scorecard import introduction
 
     return [line for backend in _chosen_backends(config) for line in introduction(backend)]
 
@@ -178,8 +178,7 @@ def _make_backends(config: pytest.Config) -> list[Any]:
         strategy_named,
         usual,
     )
-    from pop_ref.conformance.program_adapter import ProgramAdapter
-    from pop_ref.conformance.program_pipe import ProgramError
+    from pop_ref.conformance.program_adapter import ProgramAdapter, ProgramError
     from pop_ref.constants import profile_named
 
     try:
@@ -340,7 +339,7 @@ class _Recorder:
 
     def pytest_sessionfinish(self, session: pytest.Session) -> None:
         from pop_ref.conformance.pairs import judged_pairs
-        from pop_ref.conformance.surface import surface_of
+        from pop_ref.conformance.scorecard import surface_of
 
         judged = _chosen_backends(session.config)
         self.card.surfaces = {backend.name: surface_of(backend) for backend in judged}

@@ -1,12 +1,16 @@
-"""Scenes as a person would write them down, and as the rasterizer takes them.
+"""Scenes as a person would write them down, as the rasterizer takes them, and as npz files.
 
 A `Record` places one Gaussian on the screen: pixel, depth, size in pixels. Lists of records are what Hypothesis draws
 and shrinks; `pack` turns them into `Gaussians` in the world of a camera. Every value here prints as code that makes it.
+A file holds arrays by name, and everything else as one JSON string.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -77,6 +81,21 @@ class Scene:
     def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
         # Hypothesis prints dataclasses by field unless asked otherwise; a scene must paste
         printer.text(repr(self))
+
+    @property
+    def side(self) -> int:
+        """Return the side of a tile, px."""
+        return self.profile.tile_size if self.tile_size is None else self.tile_size
+
+    @property
+    def degree(self) -> int:
+        """Return the degree of the harmonics that are used."""
+        return round(np.sqrt(self.gaussians.sh.shape[1])) - 1 if self.sh_degree is None else self.sh_degree
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Return, by the names of `pop_ref.render.render`, what is neither Gaussians nor camera."""
+        return {f.name: getattr(self, f.name) for f in fields(self)[2:]}
 
     def with_overrides(self, **changes: Any) -> Scene:
         """Return this scene with some fields, of the Gaussians or the camera too, replaced."""
@@ -150,12 +169,22 @@ def rigid(quat: tuple[float, ...], shift: tuple[float, ...]) -> np.ndarray:
     return viewmat
 
 
+def in_precision(array: Any, dtype: Any = np.float32) -> np.ndarray:
+    """Return an array of float64 whose numbers are those of a dtype."""
+    return np.asarray(array, dtype=dtype).astype(np.float64)
+
+
+def rounded(inputs: tuple[Any, ...], dtype: Any) -> tuple[Any, ...]:
+    """Return arguments with float arrays rounded to a dtype."""
+    return tuple(in_precision(a, dtype) if isinstance(a, np.ndarray) and a.dtype.kind == "f" else a for a in inputs)
+
+
 def rounded_to(scene: Scene, dtype: Any) -> Scene:
     """Return the scene with every array rounded to a dtype, so that oracle and accused read the same numbers."""
     g, c = scene.gaussians, scene.camera
 
     def near(array: np.ndarray) -> np.ndarray:
-        return array.astype(dtype).astype(np.float64)
+        return in_precision(array, dtype)
 
     return replace(
         scene,
@@ -202,3 +231,61 @@ def golden_scene() -> Scene:
         Record(13.0, 13.0, 1.0, (1.0, 1.0, 1.0), opacity=0.001953125),
     ]
     return Scene(pack(records, camera), camera, np.array([0.125, 0.25, 0.5]))
+
+
+_CAMERA = ("viewmat", "K", "background")
+_ARRAYS = ("means", "quats", "scales", "opacities", "sh")
+
+
+def scene_arrays(scene: Scene) -> dict[str, np.ndarray]:
+    """Return the scene's arrays by name."""
+    arrays = {name: getattr(scene.gaussians, name) for name in _ARRAYS}
+    return {**arrays, "viewmat": scene.camera.viewmat, "K": scene.camera.K, "background": scene.background}
+
+
+def scene_options(scene: Scene) -> dict[str, Any]:
+    """Return everything of a scene that is not an array, as JSON can hold it."""
+    return {
+        "width": scene.camera.width,
+        "height": scene.camera.height,
+        "tile_size": scene.tile_size,
+        "sh_degree": scene.sh_degree,
+        "antialiased": scene.antialiased,
+        "profile": dataclasses.asdict(scene.profile),
+    }
+
+
+def save_scene(path: Path, scene: Scene) -> None:
+    """Write a scene."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    arrays: dict[str, Any] = {**scene_arrays(scene), "options": np.array(json.dumps(scene_options(scene)))}
+    np.savez(path, **arrays)
+
+
+def load_scene(path: Path) -> Scene:
+    """Read a scene that `save_scene` wrote.
+
+    Raises:
+        ValueError: the file is none; names it.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {name: np.asarray(stored[name], np.float64) for name in (*_ARRAYS, *_CAMERA)}
+            options = json.loads(str(stored["options"]))
+        return scene_from(arrays, options)
+    # what is damaged in a zip, in an array's head or in a scene ends in errors of many kinds
+    except Exception as error:
+        raise ValueError(f"{path}: is no scene of the kit ({error!r}); write it again") from error
+
+
+def scene_from(arrays: dict[str, np.ndarray], options: dict[str, Any]) -> Scene:
+    """Make a scene of its arrays and options."""
+    return Scene(
+        Gaussians(*(arrays[name] for name in _ARRAYS)),
+        Camera(arrays["viewmat"], arrays["K"], options["width"], options["height"]),
+        arrays["background"],
+        Profile(**options["profile"]),
+        options["tile_size"],
+        options["sh_degree"],
+        options["antialiased"],
+    )

@@ -23,10 +23,10 @@ from pop_ref.conformance import tolerances
 from pop_ref.conformance.adapter import Adapter, OracleAdapter, projected
 from pop_ref.conformance.assertions import WORST_CONDITION
 from pop_ref.conformance.backends import Unavailable, shipped
-from pop_ref.conformance.corners import corners
 from pop_ref.conformance.error_bounds import PixelErrorBounds, pixel_error_bounds
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.scenes import Scene, cotangents, rounded_to
+from pop_ref.conformance.strategies import corners
 from pop_ref.records import Splats
 
 # far below every decision's distance from its threshold, and far above rounding
@@ -52,7 +52,7 @@ def _scenes(dtype: Any) -> Iterator[tuple[Scene, PixelErrorBounds]]:
 
 def _drawn(scene: Scene, moved: Callable[[Splats], Splats], background: float = 0.0) -> np.ndarray:
     splats, lists = projected(scene)
-    camera, size = scene.camera, scene.tile_size or scene.profile.tile_size
+    camera, size = scene.camera, scene.side
     behind = scene.background + background
     drawn = composite(moved(splats), lists, camera.width, camera.height, size, behind, scene.profile)
     return np.concatenate([drawn.image, drawn.T_final[..., None]], axis=2)

@@ -386,7 +386,6 @@ class TorchAdapter(Adapter):
     def _call(self, scene: Scene, leaves: dict[str, Any], dominance: bool, counts: bool, **more: Any) -> Any:
         if self._rasterization is None:
             raise LookupError(f"{self.name} has no rasterization function")
-        n_bands = round(np.sqrt(scene.gaussians.sh.shape[1])) - 1
         asked = {"dominance": dominance, "counts": counts}
         options: dict[str, Any] = {**more, **{name: asked[name] for name in self._instruments}}
         if self._takes_profile:
@@ -403,13 +402,13 @@ class TorchAdapter(Adapter):
             self._tensor(scene.camera.K[None]),
             scene.camera.width,
             scene.camera.height,
-            sh_degree=n_bands if scene.sh_degree is None else scene.sh_degree,
+            sh_degree=scene.degree,
             backgrounds=leaves["background"],
             **self._taken(
                 near_plane=scene.profile.near_plane,
                 eps2d=scene.profile.eps2d,
                 packed=False,
-                tile_size=scene.profile.tile_size if scene.tile_size is None else scene.tile_size,
+                tile_size=scene.side,
                 **options,
             ),
         )

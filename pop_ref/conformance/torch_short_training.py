@@ -1,26 +1,30 @@
-"""A torch trainer that takes the steps of a `ShortTraining` as a run of a user does: settings, capture and engine.
+"""A torch trainer on photographs: it takes the steps of a `ShortTraining` or of a `Watch` as a run of a user does.
 
-Nothing is written: a run writes when it is run to its end, and here steps are asked for one by one.
+Settings, capture and engine are those that a run has. Nothing is written, but where a run is run to its end.
 """
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 
-from pop_ref.conformance.short_training import DEGREE, ShortTraining
+from pop_ref.conformance.short_training import BACKGROUND, DEGREE, VIEWS, ShortTraining, Watch
 from pop_ref.methods import KEYS
+from pop_ref.settings import AppearanceRates, LearningRates
 
 # settings of a training by the names of `Recipe` that a run calls otherwise
 _NAMES = {"pixelwise": "photometric", "padding": "ssim_padding"}
+# what a strategy keeps of a window
+KEPT = ("grad2d", "count", "views", "dominant_sum", "blurred", "radii", "sh_rest_sum")
+STILL = LearningRates(means=0.0, scales=0.0, quats=0.0, opacities=0.0, sh0=0.0, sh_rest=0.0)
 
 
 class Trainee:
-    """Takes steps of a run.
+    """Takes steps on photographs: those of a short training, or of one that moves nothing.
 
     Args:
         package: a trainer laid out as `pop_fast` is.
@@ -32,6 +36,9 @@ class Trainee:
         self._package, self._backend = package, backend
         self._torch: Any = importlib.import_module("torch")
         self._float = getattr(self._torch, dtype)
+
+    def _module(self, name: str) -> Any:
+        return importlib.import_module(f"{self._package}.{name}")
 
     def taken_steps(self, short: ShortTraining) -> list[dict[str, Any]]:
         """See `pop_ref.short_training.taken_steps`; the order of the views is the run's own."""
@@ -50,8 +57,7 @@ class Trainee:
             rate: of exposures.
             stops: `coarse_stop_iters`: the first steps see their photographs shrunk.
         """
-        config = importlib.import_module("pop_ref.settings")
-        rates = config.AppearanceRates(exposures=rate, exposures_decay=1.0)
+        rates = AppearanceRates(exposures=rate, exposures_decay=1.0)
         run = self._run(short, exposure=True, appearance_lr=rates, coarse_stop_iters=stops)
         found: list[np.ndarray] = []
         for step in range(short.steps):
@@ -66,8 +72,8 @@ class Trainee:
 
     def coarse_view(self, photo: np.ndarray, mask: np.ndarray | None, K: np.ndarray, factor: int) -> dict[str, Any]:
         """Return photograph, mask and intrinsics of a view that is shrunk by a power of 2, as far as it is."""
-        tensor, of = self._torch.as_tensor, importlib.import_module(f"{self._package}.train.coarse")
-        view = importlib.import_module(f"{self._package}.train.views").ViewTensors(
+        tensor, of = self._torch.as_tensor, self._module("train.coarse")
+        view = self._module("train.views").ViewTensors(
             name="0", photo=tensor(photo), mask=None if mask is None else tensor(mask),
             viewmat=self._torch.eye(4, dtype=self._float)[None], K=tensor(K).to(self._float)[None],
         )  # fmt: skip
@@ -83,7 +89,7 @@ class Trainee:
 
     def _step(self, run: Any, step: int) -> Any:
         # with the threads that a run has, on whose number the order of sums may depend
-        environment = importlib.import_module(f"{self._package}.train.environment")
+        environment = self._module("train.environment")
         with environment.reproducible(run.config.threads):
             return run.take_steps(step + 1)
 
@@ -104,13 +110,11 @@ class Trainee:
         """Return a run of the short training; the engine is the one that its settings have."""
         initial = {key: self._torch.as_tensor(value).to(self._float) for key, value in short.params.items()}
         config = self._config(short, folder, more)
-        engine = None
-        if self._float != self._torch.float32:
-            # whole steps are taken in single precision
-            engine = importlib.import_module(f"{self._package}.train.engines").torch_engine(self._backend)
-        TrainingRun = importlib.import_module(f"{self._package}.train.training_run").TrainingRun
+        # in single precision a run chooses its engine itself
+        engine = None if self._float == self._torch.float32 else self._engine(config)
+        TrainingRun = self._module("train.training_run").TrainingRun
         run = TrainingRun(config, self._capture(short), initial=initial, engine=engine)
-        drawn, Draws = short.draws(), importlib.import_module(f"{self._package}.density.protocol").Draws
+        drawn, Draws = short.draws(), self._module("density.protocol").Draws
         run.draws = Draws(
             lambda n: self._torch.as_tensor(drawn.normals(n)), lambda n: self._torch.as_tensor(drawn.uniforms(n))
         )
@@ -132,12 +136,12 @@ class Trainee:
             "sh_degree": DEGREE, "threads": 1, "progress": False, "backend": self._backend, "test_every": 0,
             "batch_size": short.batch, "background": short.background, "antialiased": short.antialiased,
         }  # fmt: skip
-        return importlib.import_module(f"{self._package}.train.config").TrainConfig.of(
+        return self._module("train.config").TrainConfig.of(
             method=short.method, **said, **({"result_dir": folder} if folder else {}), **more
         )
 
     def _capture(self, short: ShortTraining) -> Any:
-        data = importlib.import_module(f"{self._package}.data.capture")
+        data = self._module("data.capture")
 
         class Scaled(data.Capture):
             """A capture whose scale is told."""
@@ -157,14 +161,145 @@ class Trainee:
         points = short.cloud if short.sparse else np.zeros((1, 3))
         return Scaled("short", tuple(views), points, np.zeros((len(points), 3), np.uint8), source="formulas")
 
+    def collected_statistics(self, watch: Watch) -> list[dict[str, Any]]:
+        """Return what the strategy's state holds after every step, by the names of KEPT, parameters and moments."""
+        config, strategy = self._settings(watch)
+        params, views = self._params(watch), self._views(watch)
+        schedule = self._module("train.schedule")
+        appearance = self._module("train.appearance").Appearance(config, views)
+        stepper, optimizers, state = self._stepper(config, strategy, views, watch, appearance, params)
+        found: list[dict[str, Any]] = []
+        for step in range(watch.steps):
+            stepper.steps(step, step + 1, schedule.phase_at(config, strategy, step))
+            stepper.synchronize()
+            moments = {name: each.state[params[name]]["exp_avg"] for name, each in optimizers.items()}
+            kept = {name: _array(state.get(name)) for name in KEPT}
+            found.append(kept | {"params": _arrays(params), "first_moments": _arrays(moments)})
+        return found
 
-def short_training_stages(package: str, backend: str, dtype: str) -> dict[str, Callable[..., Any]]:
-    """Return the stage functions that take the steps of a `ShortTraining`."""
+    def view_passes(self, watch: Watch, view: int, divisor: int) -> dict[str, Any]:
+        """Return what passes over a training view of the Gaussians sum: contributions, scores, blocks, points."""
+        config, _ = self._settings(watch)
+        protocol = self._module("density.passes")
+        passes = protocol.Passes.of(self._module("api.registry").require_backend(self._backend), self._views(watch),
+                                    config)  # fmt: skip
+        params = {name: value.detach() for name, value in self._params(watch).items()}
+        H, W = watch.cameras[view].height, watch.cameras[view].width
+        weights = self._torch.arange(H * W).reshape(H, W).to(self._float) % 7.0
+        found = passes.contributions(params, view, 2, weights)
+        points, ids, T_final = passes.dominant_points(params, view, 2)
+        sums = ("weight_sum", "n_pixels", "map_sum", "distance_sum", "dominant_counts", "image", "radii", "depths")
+        return {name: _array(getattr(found, name)) for name in sums} | {
+            "sensitivities": _array(passes.sensitivities(params, view, 2)),
+            # which leave out how antialiased opacities depend on scales, and say so
+            "blocks": None if watch.antialiased else _array(passes.fisher(params, view, 2, divisor)),
+            "points": _array(points),
+            "ids": _array(ids),
+            "T_final": _array(T_final),
+        }
+
+    def written_meta(self, watch: Watch) -> list[str]:
+        """Write to every key of a view's meta before it is read, and return those that forget it."""
+        config, _ = self._settings(watch)
+        views, backend = self._module("train.views"), self._module("api.registry").require_backend(self._backend)
+        meta = views.render_view(backend, self._params(watch), self._views(watch)[0], config, 2).info
+        for name in list(meta):
+            meta[name] = name
+        return [name for name in list(meta) if meta[name] != name]
+
+    def blank_losses(self, watch: Watch, exposure: np.ndarray) -> list[float]:
+        """Return the photometric loss of steps over random backgrounds, with nothing drawn and clear photographs.
+
+        Args:
+            watch: the steps; its background, over which photographs have been laid, is left out: it is black.
+            exposure: of every photograph. [3, 4]
+        """
+        config, strategy = self._settings(watch)
+        config = replace(config, background=(0.0, 0.0, 0.0), random_background=True, exposure=True)
+        views = []
+        for view in self._views(watch):
+            blank = self._torch.zeros_like(view.photo)
+            views.append(replace(view, photo=blank, alpha=blank[..., 0]))
+        params = self._params(watch)
+        with self._torch.no_grad():
+            params["opacities"].fill_(-30.0)
+        appearance = self._module("train.appearance").Appearance(config, views)
+        with self._torch.no_grad():
+            appearance.params["exposures"].copy_(self._torch.as_tensor(exposure))
+        stats = self._stepper(config, strategy, views, watch, appearance, params)[0]
+        schedule = self._module("train.schedule")
+        taken = (stats.steps(k, k + 1, schedule.phase_at(config, strategy, k)) for k in range(watch.steps))
+        return [float(each.objective) for step in taken for each in step]
+
+    def view_order(self, n_views: int, seed: int, count: int) -> list[int]:
+        """Return the views of the first steps of a training of a view a step."""
+        order = self._module("train.schedule").ViewOrder(n_views, seed)
+        return [order.next() for _ in range(count)]
+
+    def scaled_settings(self, method: str, factor: float) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return a method's settings by name, and those of a schedule so many times as long."""
+        strategy = {"pop": "POPStrategy", "3dgs": "InriaStrategy"}[method]
+        made = getattr(self._module("density"), strategy)()
+        own, scaled = ({f.name: getattr(each, f.name) for f in fields(each)} for each in (made, made.scaled(factor)))
+        return own, scaled
+
+    def _stepper(
+        self, config: Any, strategy: Any, views: list[Any], watch: Watch, appearance: Any, params: dict[str, Any]
+    ) -> tuple[Any, Any, Any]:
+        """Return what takes the steps of a watch, its optimizers and the strategy's state."""
+        optimizers = self._module("train.model").make_optimizers(params)
+        state = strategy.initialize_state(1.0, count=len(params["means"]))
+        updates = self._module("train.schedule").updates_of_strategy(config, strategy, 1.0)
+        given = (config, strategy, views, list(watch.order), updates, 0, appearance)
+        stepper = self._engine(config).make_stepper(self._module("train.stepper").Task(*given))
+        stepper.rebind(params, optimizers, state)
+        return stepper, optimizers, state
+
+    def _settings(self, watch: Watch) -> tuple[Any, Any]:
+        strategy = self._module("density").POPStrategy(**watch.settings)
+        config = self._module("train.config").TrainConfig(
+            strategy=strategy, lr=STILL, lambda_ssim=0.0, sh_degree=2, sh_interval=watch.sh_interval, threads=1,
+            batch_size=watch.batch, background=BACKGROUND, antialiased=watch.antialiased, backend=self._backend,
+            progress=False, **watch.regularizers,
+        )  # fmt: skip
+        return config, strategy
+
+    def _engine(self, config: Any) -> Any:
+        engines = self._module("train.engines")
+        # whole steps are taken in single precision
+        return engines.engine_of(config) if self._float == self._torch.float32 else engines.torch_engine(self._backend)
+
+    def _params(self, watch: Watch) -> dict[str, Any]:
+        make = self._torch.nn.Parameter
+        return {name: make(self._torch.as_tensor(value).to(self._float)) for name, value in watch.params.items()}
+
+    def _views(self, watch: Watch) -> list[Any]:
+        ViewTensors = self._module("train.views").ViewTensors
+        found = []
+        for k, camera in enumerate(watch.cameras[:VIEWS]):
+            mask = watch.mask(k)
+            given = {
+                "photo": self._torch.as_tensor(watch.photo(k)),
+                "mask": None if mask is None else self._torch.as_tensor(mask),
+                "viewmat": self._torch.as_tensor(camera.viewmat).to(self._float)[None],
+                "K": self._torch.as_tensor(camera.K).to(self._float)[None],
+            }
+            found.append(ViewTensors(name=str(k), **given))
+        return found
+
+
+def photograph_stages(package: str, backend: str, dtype: str) -> dict[str, Callable[..., Any]]:
+    """Return the stage functions that take the steps of a `ShortTraining` or of a `Watch`."""
     trainee = Trainee(package, backend, dtype)
-    names = ("taken_steps", "batched_steps", "learned_exposures", "coarse_losses", "coarse_view", "whole_run")
-    return {name: getattr(trainee, name) for name in names}
+    return {name: getattr(trainee, name) for name in vars(Trainee) if not name.startswith("_")}
 
 
-def _array(value: Any) -> np.ndarray:
+def _array(value: Any) -> Any:
+    if not hasattr(value, "detach"):
+        return value
     array = value.detach().cpu().numpy().copy()
     return array.astype(np.float64) if array.dtype.kind == "f" else array
+
+
+def _arrays(params: dict[str, Any]) -> dict[str, np.ndarray]:
+    return {name: _array(value) for name, value in params.items()}

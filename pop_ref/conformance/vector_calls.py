@@ -13,7 +13,7 @@ import numpy as np
 from pop_ref.conformance.adapter import Adapter
 from pop_ref.conformance.calls import Call, Frame
 from pop_ref.conformance.signature import Expected, expectations
-from pop_ref.conformance.vector_schema import IMAGES, INPUTS, entry, equal, output
+from pop_ref.conformance.vector_check import IMAGES, INPUTS, entry, equal, output
 from pop_ref.conformance.views import call_for, clear_call
 from pop_ref.depth import RenderMode
 from pop_ref.splatting import project
@@ -200,7 +200,7 @@ def _entry(call: Call, b: int, row: list[Expected]) -> dict[str, np.ndarray]:
     arrays["alphas"] = 1.0 - np.stack([e.render.T_final for e in row])
     arrays["error_bound_alphas"] = np.stack([e.error_bounds.T_final + 1.0 for e in row])
     arrays |= {"T_final": 1.0 - arrays["alphas"], "error_bound_T_final": arrays["error_bound_alphas"]}
-    told = (len(row), len(call.frames), call.tile_size or call.profile.tile_size)
+    told = (len(row), len(call.frames), call.tile_size)
     arrays |= {name: np.array(value) for name, value in zip(_TOLD, told, strict=True)}
     for name in ("dominant_ids", "n_blended"):
         arrays[name] = np.stack([getattr(e.render, name) for e in row])

@@ -21,7 +21,8 @@ import numpy as np
 
 from pop_ref.conformance import tolerances
 from pop_ref.conformance.adapter import OracleAdapter, stage_function
-from pop_ref.conformance.vector_schema import entry, equal
+from pop_ref.conformance.scenes import in_precision
+from pop_ref.conformance.vector_check import entry, equal
 from pop_ref.constants import Profile
 from pop_ref.contributions import Contributions
 from pop_ref.density import Statistics
@@ -216,15 +217,14 @@ class _Logging(OracleAdapter):
 def record() -> list[Any]:
     """Return calls, as JSON holds them, that tell mutants from the oracle, each where a law makes one."""
     from pop_ref.conformance.backends import shipped
-    from pop_ref.conformance.mutants import MUTANTS
+    from pop_ref.conformance.mutants import MUTANTS, PROGRAM, ROUNDS
     from pop_ref.conformance.mutants.copies import living
-    from pop_ref.conformance.mutants.trainers import TRAINERS
     from pop_ref.conformance.mutants.trial import law_named, obeys
 
     sound = shipped("fast64")
     found: list[Any] = []
     kept: list[tuple[str, list[Any]]] = []
-    for mutant in (*MUTANTS, *TRAINERS):
+    for mutant in (*MUTANTS, *(m for m in PROGRAM if m.name in ROUNDS["trainers"])):
         if mutant.law.startswith("test_strategies"):
             # vectors of trainings are about those
             continue
@@ -234,7 +234,7 @@ def record() -> list[Any]:
             asked = _Logging()
             obeys(law_named(mutant.law), asked, _EXAMPLES)
             for name, args in asked.calls.values():
-                call = (name, [moved(arg, _in_float32) for arg in args])
+                call = (name, [moved(arg, in_precision) for arg in args])
                 # laws read parts of some records only, and a sound program may fill the rest otherwise
                 if _differs(backend, *call) and not (sound.has(name) and _differs(sound, *call)):
                     kept.append(call)
@@ -260,10 +260,6 @@ def _differs(backend: Any, name: str, args: list[Any]) -> bool:
         if np.any((np.abs(value - wanted[key]) > bound) & wanted[f"sure_{key}"]):
             return True
     return False
-
-
-def _in_float32(values: np.ndarray) -> np.ndarray:
-    return values.astype(np.float32).astype(np.float64)
 
 
 if __name__ == "__main__":

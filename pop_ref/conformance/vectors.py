@@ -1,32 +1,55 @@
 """Portable vectors: what an exact renderer makes of fixed inputs, so that ports are judged without Python.
 
-`export` writes one npz a vector and an `index.json` that explains every array and how it is compared (`vector_schema`):
-single images with every stage on the way (`vector_scenes`), calls of several cameras (`vector_calls`), the corpus at
-scale (`vector_large`), losses and training steps (`vector_training`). `vector_check` judges a port's results by that
-index alone. Needs numpy only.
+`export` writes one npz a vector and an `index.json` that explains every array and how it is compared: single images
+with every stage on the way, few scenes, one for each thing that goes wrong in a port; calls of several cameras
+(`vector_calls`); the corpus at scale, whose images and gradients are kept as weighted sums; losses and training steps
+(`vector_training`); single stages (`vector_stages`). `vector_check` judges a port's results by that index alone. Needs
+numpy only.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from pop_ref.conformance import vector_training as training
 from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.corpus import GRADIENTS as IN_RUNS
+from pop_ref.conformance.corpus import MAPS, PLANS, answers, corpus_scene, unambiguous_cotangents
 from pop_ref.conformance.error_bounds import PixelErrorBounds, pixel_error_bounds
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
-from pop_ref.conformance.scene_files import scene_arrays, scene_options
-from pop_ref.conformance.scenes import Scene, cotangents, rounded_to
+from pop_ref.conformance.scenes import (
+    Record,
+    Scene,
+    cotangents,
+    golden_scene,
+    pack,
+    rounded_to,
+    scene_arrays,
+    scene_options,
+)
 from pop_ref.conformance.vector_calls import FORMS, KINDS, call_arrays, call_kind, calls, kind_of
-from pop_ref.conformance.vector_large import large_kind, large_vectors
-from pop_ref.conformance.vector_methods import training_kind, training_vectors
-from pop_ref.conformance.vector_scenes import vector_scenes
-from pop_ref.conformance.vector_schema import GRADIENTS, render_kind, schema
+from pop_ref.conformance.vector_check import (
+    GRADIENTS,
+    IMAGES,
+    INPUTS,
+    WHERE,
+    close,
+    entry,
+    equal,
+    gradient,
+    render_kind,
+    schema,
+)
 from pop_ref.conformance.vector_stages import stage_kinds, stage_vectors
+from pop_ref.conformance.vector_training import training_kind, training_vectors
+from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER, Profile
 from pop_ref.margins import margins
+from pop_ref.records import Camera
 
 _TRAINING = {
     "loss": training.loss_vectors,
@@ -158,9 +181,119 @@ def export(folder: Path) -> list[str]:
 
 def _full_options(scene: Scene) -> dict[str, Any]:
     """Return the scene's options with every default written out: a port has no defaults to take."""
-    options = scene_options(scene)
-    if options["tile_size"] is None:
-        options["tile_size"] = scene.profile.tile_size
-    if options["sh_degree"] is None:
-        options["sh_degree"] = round(np.sqrt(scene.gaussians.sh.shape[1])) - 1
-    return options
+    return scene_options(scene) | {"tile_size": scene.side, "sh_degree": scene.degree}
+
+
+_BANDS = tuple((0.125 * (k % 5) - 0.25, 0.0625 * (k % 7) - 0.125, 0.25 - 0.0625 * (k % 3)) for k in range(15))
+
+
+def _camera(width: int = 12, height: int = 9, turned: bool = False) -> Camera:
+    K = np.array([[12.0, 0.0, 5.5], [0.0, 11.0, 4.75], [0.0, 0.0, 1.0]])
+    viewmat = np.eye(4)
+    if turned:
+        viewmat[:3] = [[0.0, 0.0, -1.0, 0.5], [0.6, 0.8, 0.0, -0.25], [0.8, -0.6, 0.0, 1.5]]
+    return Camera(viewmat, K, width, height)
+
+
+def _scene(records: list[Record], turned: bool = False, profile: Profile = PAPER) -> Scene:
+    camera = _camera(turned=turned)
+    return Scene(pack(records, camera), camera, np.array([0.125, 0.25, 0.5]), profile)
+
+
+def vector_scenes() -> dict[str, Scene]:
+    """Return the scenes by name."""
+    one = Record(5.75, 4.25, 2.0, (2.0, 2.0, 2.0), opacity=0.75, sh=((1.0, 0.5, -0.25),))
+    turned = dataclasses.replace(one, size=(3.0, 1.0, 0.5), quat=(1.0, 0.5, -0.25, 0.75))
+    coloured = dataclasses.replace(turned, sh=((0.5, 0.25, 1.0), *_BANDS))
+    stack = [dataclasses.replace(one, depth=1.0 + k, opacity=o) for k, o in enumerate((0.9, 0.99, 0.95, 1.0, 0.5))]
+    clones = [dataclasses.replace(one, opacity=0.5)] * 3
+    faint = [dataclasses.replace(one, opacity=o, depth=1.0 + o) for o in (0.0, 0.003, 0.0035, 0.005, 0.0625)]
+    far_out = [
+        dataclasses.replace(one, x=-30.0, size=(12.0, 12.0, 12.0)),
+        dataclasses.replace(one, y=40.0, size=(16.0,) * 3),
+    ]
+    hidden = [
+        one,
+        dataclasses.replace(one, depth=-1.0),
+        dataclasses.replace(one, depth=0.001),
+        dataclasses.replace(one, x=900.0),
+    ]
+    needle = dataclasses.replace(one, size=(24.0, 0.0625, 0.0625), quat=(1.0, 0.0, 0.0, 0.5), opacity=1.0)
+    scenes = {
+        "one round splat": _scene([one]),
+        "one turned splat": _scene([turned]),
+        "a turned camera": _scene([one, turned], turned=True),
+        "harmonics of degree three": _scene([coloured], turned=True),
+        "a stack that ends early": _scene(stack),
+        "coincident clones": _scene(clones),
+        "opacities about the floor": _scene(faint),
+        "a clamped jacobian": _scene([one, *far_out]),
+        "hidden splats": _scene(hidden),
+        "a needle": _scene([needle, one]),
+        "antialiased": _scene([one, dataclasses.replace(one, size=(0.25, 0.5, 0.25), opacity=1.0)]).with_overrides(
+            antialiased=True
+        ),
+        "the ceiling of 0.99": _scene(stack, profile=GSPLAT_1_6),
+        "inria": _scene([one, turned, *stack[2:]], profile=INRIA),
+        "golden": golden_scene(),
+    }
+    return {name.replace(" ", "_"): scene for name, scene in scenes.items()}
+
+
+_SUMS = {"image": "[blocks, 3]", "T_final": "[blocks, 1]", "dominant_ids": "[blocks, 1]", "n_blended": "[blocks, 1]"}
+_RUNS = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "sh": "3 n_sh", "means2d": 2, "means2d_abs": 2}
+
+# Gaussians of a vector; those of a larger scene would be a file of many megabytes
+MOST: Final = 10_000
+
+
+def large_kind() -> dict[str, Any]:
+    """Return what the index says of vectors at scale."""
+    arrays = {name: entry("input", *about) for name, about in INPUTS.items()}
+    for name, (shape, meaning) in IMAGES.items():
+        whole = name in ("dominant_ids", "n_blended")
+        more = {"reduce": "blocks", "expected": f"sums_{name}"}
+        rule = (
+            equal(WHERE[name], **more) if whole else close(f"scale.{name}", f"error_bound_{name}", WHERE[name], **more)
+        )
+        arrays[name] = entry("output", shape, meaning, "int64" if whole else "float64", [rule]) | {"stored": False}
+        arrays[f"sums_{name}"] = entry("sums", _SUMS[name], f"of {name}", "int64" if whole else "float64")
+        if not whole:
+            arrays[f"error_bound_{name}"] = entry("error_bound", _SUMS[name], f"what rounding may cost in sums_{name}")
+    for name in GRADIENTS:
+        shape = {"means2d": "[N, 2]", "means2d_abs": "[N, 2]"}.get(name) or INPUTS[name][0]
+        more = {"expected": f"sums_v_{name}"} | ({"reduce": "runs"} if name in IN_RUNS else {})
+        rule = close(f"scale.v_{name}", f"error_bound_v_{name}", **more)
+        arrays[f"v_{name}"] = entry("output", shape, gradient(name), compare=[rule]) | {"stored": False}
+        sums = f"[runs, {_RUNS[name]}]" if name in IN_RUNS else shape
+        arrays[f"sums_v_{name}"] = entry("sums", sums, f"of v_{name}")
+        arrays[f"error_bound_v_{name}"] = entry("error_bound", sums, f"what rounding may cost in sums_v_{name}")
+    meanings = ("every decision behind the pixel is clear of float32's rounding", "and no ceiling is near (D6)",
+                "and the dominant Gaussian is clear too")  # fmt: skip
+    arrays |= {name: entry("mask", "[H, W]", said, "bool") for name, said in zip(MAPS, meanings, strict=True)}
+    about = "up to 5,000 Gaussians: long lists, many tiles, tiles cut by the border; judged by weighted sums"
+    return {"about": about, "arrays": arrays}
+
+
+def large_vectors() -> dict[str, tuple[dict[str, np.ndarray], Scene, dict[str, list[int]]]]:
+    """Return arrays, scene and the shapes of what is not stored, by name."""
+    return {f"large_{name}": (*_vector(name),) for name, plan in PLANS.items() if plan.n <= MOST}
+
+
+def _vector(name: str) -> tuple[dict[str, np.ndarray], Scene, dict[str, list[int]]]:
+    scene, kept = corpus_scene(name), answers(name)
+    v_image, v_T_final = unambiguous_cotangents(scene, kept["smooth"])
+    arrays = {**scene_arrays(scene), "v_image": v_image, "v_T_final": v_T_final}
+    for key, part in (("image", np.s_[:, :3]), ("T_final", np.s_[:, 3:])):
+        arrays[f"sums_{key}"] = kept["blocks"][part]
+        arrays[f"error_bound_{key}"] = kept["e_blocks"][part].astype(np.float64)
+    arrays |= {"sums_dominant_ids": kept["winners"], "sums_n_blended": kept["blended"]}
+    for key in GRADIENTS:
+        arrays[f"sums_v_{key}"] = kept[f"v_{key}"]
+        arrays[f"error_bound_v_{key}"] = kept[f"e_{key}"].astype(np.float64)
+    arrays |= {key: kept[key] for key in MAPS}
+    H, W, g = scene.camera.height, scene.camera.width, scene.gaussians
+    shapes = {"image": [H, W, 3], "T_final": [H, W], "dominant_ids": [H, W], "n_blended": [H, W]}
+    shapes |= {f"v_{key}": list(np.shape(getattr(g, key))) for key in ("means", "quats", "scales", "opacities", "sh")}
+    shapes |= {"v_viewmat": [4, 4], "v_background": [3], "v_means2d": [len(g), 2], "v_means2d_abs": [len(g), 2]}
+    return arrays, scene, shapes

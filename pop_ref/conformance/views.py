@@ -12,7 +12,7 @@ import numpy as np
 
 from pop_ref.conformance import capabilities
 from pop_ref.conformance.calls import Call, Frame, without_backgrounds
-from pop_ref.conformance.scenes import Record, Scene, pack, rigid
+from pop_ref.conformance.scenes import Record, Scene, in_precision, pack, rigid
 from pop_ref.constants import PAPER
 from pop_ref.magnitudes import constant, depths_magnitudes, distance, splat_magnitudes
 from pop_ref.margins import extent_margins
@@ -72,6 +72,19 @@ def gaussians(seed: int, degree: int = 1, count: int = 14, size: tuple[int, int]
     return pack([one(k) for k in range(count)], cameras(1, size=size)[0])
 
 
+def raw_params(g: Gaussians) -> dict[str, np.ndarray]:
+    """Return what a trainer holds of Gaussians, logarithms and logits, in numbers of single precision."""
+    raw = {
+        "means": g.means,
+        "scales": np.log(g.scales),
+        "quats": g.quats,
+        "opacities": np.log(g.opacities / (1.0 - g.opacities)),
+        "sh0": g.sh[:, :1],
+        "shN": g.sh[:, 1:],
+    }
+    return {name: in_precision(array) for name, array in raw.items()}
+
+
 def frames(
     backend: Any,
     seed: int = 0,
@@ -115,7 +128,7 @@ def frames(
         own = Gaussians(g.means, g.quats, g.scales, g.opacities, g.sh * (1.0 - mixed))
         behind = np.zeros(channels or 3) if black else np.round(16.0 * rng.uniform(-0.25, 1.25, channels or 3)) / 16.0
         scene = backend.sees(Scene(own, camera, behind, profile, side, sh_degree, antialiased))
-        colors = (shared * (1.0 - mixed)).astype(backend.dtype).astype(np.float64) if channels else None
+        colors = in_precision(shared * (1.0 - mixed), backend.dtype) if channels else None
         found.append(Frame(scene, colors, c == blind))
     return tuple(found)
 
@@ -181,7 +194,7 @@ def _clearly_culled(call: Call, dtype: Any) -> bool:
 def clear_of_extents(scene: Scene, dtype: Any) -> np.ndarray:
     """Return the Gaussians whose culls, extents and tiles rounding does not decide (D1, D2, D3). [N]"""
     g, camera = scene.gaussians, scene.camera
-    profile = replace(scene.profile, tile_size=scene.tile_size or scene.profile.tile_size)
+    profile = replace(scene.profile, tile_size=scene.side)
     near, far, reach = constant(profile.near_plane), constant(profile.far_plane), 64.0 * float(np.finfo(dtype).eps)
     clear = np.zeros(len(g), dtype=bool)
     for i, depth in enumerate(depths_magnitudes(g, camera)):

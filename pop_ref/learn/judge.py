@@ -21,6 +21,7 @@ from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.capabilities import DOMINANCE, GRADIENTS, RENDER, capabilities_of
 from pop_ref.conformance.capabilities import DOUBLE as IN_DOUBLE
 from pop_ref.conformance.law import Law, missing
+from pop_ref.conformance.laws import STANDS_IN
 from pop_ref.conformance.scenes import Scene
 from pop_ref.constants import PAPER, Profile
 from pop_ref.density import POP, DensityConfig
@@ -207,7 +208,7 @@ def _set_aside() -> None:
 
 def _laws(stage: Stage) -> Iterator[Law]:
     """Go through the laws of a stage: those that speak of its functions first, then agreement with the oracle."""
-    modules = [*(f"test_{name}" for name in stage.laws), "test_agreement"]
+    modules = [*(f"test_{STANDS_IN.get(name, name)}" for name in stage.laws), "test_agreement"]
     modules += ["test_gradients"] if stage.more_laws else []
     seen = set()
     for module in modules:

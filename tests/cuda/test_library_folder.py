@@ -11,31 +11,27 @@ from pathlib import Path
 import pytest
 
 from cuda_ext.compiler import find_compiler
+from cuda_ext.host import emulate
 from cuda_ext.host import library_folder as place
-from cuda_ext.host.mirror import build_mirror
 
 ROOT = Path(__file__).parents[2]
 # what a library of somebody else would do: tell that it was loaded
 PLANTED = r"""
 #include <stdio.h>
 __attribute__((constructor)) static void loaded(void) { puts("planted"); fflush(stdout); }
-extern "C" int pop_mirror_f32(const char*, void*) { return 0; }
-extern "C" int pop_mirror_f64(const char*, void*) { return 0; }
 """
 LOAD = """
 import os
 from types import SimpleNamespace
 from unittest import mock
-from cuda_ext.host import mirror as host_mirror
-from cuda_ext.host import library_folder
+from cuda_ext.host import emulate, library_folder
 if {read_only}:
     library_folder.os = SimpleNamespace(**{{**vars(os), "access": lambda *_: False}})
 # compiling takes long, and which library is loaded is known before
-host_mirror.subprocess.run = mock.Mock(side_effect=RuntimeError("compiling"))
-from pop_ref.conformance.mirror_adapter import mirror
-mirror("mirror64")
+emulate._compile = mock.Mock(side_effect=RuntimeError("compiling"))
+emulate.loaded(emulate.build(library_folder.library_folder()))
 """
-needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="there is no C++ compiler")
+needs_compiler = pytest.mark.skipif(emulate.why_not() is not None, reason=str(emulate.why_not()))
 
 
 @pytest.fixture
@@ -84,7 +80,7 @@ def test_a_cache_that_is_open_to_others_is_refused(read_only: Path, mode: int) -
 @pytest.mark.parametrize("what", ["the folder", "a file"])
 def test_what_belongs_to_somebody_else_is_refused(read_only: Path, what: str, monkeypatch: pytest.MonkeyPatch) -> None:
     read_only.mkdir(parents=True, mode=0o700)
-    path = read_only if what == "the folder" else read_only / "pop_mirror_0123456789abcdef.so"
+    path = read_only if what == "the folder" else read_only / "emulated_0123456789abcdef"
     if what == "a file":
         path.write_bytes(b"")
     real = Path.lstat
@@ -108,31 +104,16 @@ def test_a_link_is_refused(read_only: Path, tmp_path: Path) -> None:
 
 
 def plant(folder: Path, tmp_path: Path) -> None:
-    """Compile a library that is not ours under the name of the mirror."""
-    name = build_mirror_name(tmp_path)
-    folder.mkdir(parents=True, exist_ok=True)
-    (tmp_path / "planted.cpp").write_text(PLANTED)
-    compiler = find_compiler() or []
-    subprocess.run([*compiler, "-shared", "-fPIC", "-o", folder / name, tmp_path / "planted.cpp"], check=True)
-
-
-def build_mirror_name(tmp_path: Path) -> str:
-    """Return the name that the mirror would get."""
+    """Compile a library that is not ours under the name of the emulated kernels."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("cuda_ext.host.mirror.subprocess.run", lambda command, **_: stop(command[-1]))
-        try:
-            build_mirror(tmp_path / "nothing")
-        except StopIteration as stopped:
-            return Path(stopped.value).with_suffix(".so").name
-    raise AssertionError("the mirror was not to be compiled")
-
-
-def stop(partial: str) -> None:
-    raise StopIteration(partial)
+        patch.setattr(emulate, "_compile", lambda compiler, library: None)
+        library = emulate.build(folder)
+    (tmp_path / "planted.cpp").write_text(PLANTED)
+    subprocess.run([*(find_compiler() or []), "-shared", "-fPIC", "-o", library, tmp_path / "planted.cpp"], check=True)
 
 
 def load(folder: Path, read_only: bool) -> subprocess.CompletedProcess[str]:
-    """Load the mirror in another process that has `folder` for temporary files and `cache` in it for its cache."""
+    """Load the emulated kernels in another process that has `folder` for temporary files, with a cache in it."""
     environment = {
         **os.environ,
         "TMPDIR": str(folder),
@@ -146,7 +127,7 @@ def load(folder: Path, read_only: bool) -> subprocess.CompletedProcess[str]:
 
 @needs_compiler
 def test_a_library_in_the_folder_for_temporary_files_is_not_loaded(tmp_path: Path) -> None:
-    plant(tmp_path / "pop_mirror", tmp_path)
+    plant(tmp_path / "emulated", tmp_path)
     assert "planted" not in load(tmp_path, read_only=False).stdout
     assert "planted" not in load(tmp_path, read_only=True).stdout
 

@@ -10,7 +10,7 @@ from pop_ref.conformance.assertions import assert_same_bits, assert_same_image, 
 from pop_ref.conformance.backends import SHIPPED, shipped
 from pop_ref.conformance.error_bounds import pixel_error_bounds
 from pop_ref.conformance.scenes import golden_scene
-from pop_ref.conformance.threshold_outcomes import assert_one_of_the_oracles_outcomes
+from pop_ref.conformance.thresholds import assert_one_of_the_oracles_outcomes
 from tests.golden.image import written
 
 

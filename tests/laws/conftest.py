@@ -18,7 +18,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.fixture(autouse=True, scope="module")
 def _allocations_are_poisoned() -> Iterator[None]:
-    from pop_ref.conformance.poison import poisoned_allocations
+    from tests.judged import poisoned_allocations
 
     with poisoned_allocations("pop_fast"):
         yield

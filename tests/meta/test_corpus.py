@@ -8,21 +8,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pop_ref.conformance.adapter import OracleAdapter
-from pop_ref.conformance.corners import corners
-from pop_ref.conformance.corpus import PLANS, corpus_scene
-from pop_ref.conformance.corpus_answers import (
+from pop_ref.conformance.adapter import KEPT, LARGEST, OracleAdapter, Reference, forget, remembered
+from pop_ref.conformance.corpus import (
     MAPS,
+    PLANS,
     answer,
     answers,
     bounded_windows,
+    corpus_scene,
     picked_pixels,
     weighted_blocks,
     weighted_runs,
 )
-from pop_ref.conformance.reference import KEPT, LARGEST, Reference, forget, remembered
 from pop_ref.conformance.scenes import Scene, cotangents
-from pop_ref.conformance.strategies import wide_scene
+from pop_ref.conformance.strategies import corners, wide_scene
 from pop_ref.constants import GSPLAT_1_6
 
 # in seconds; of the others a part is computed again

@@ -23,9 +23,8 @@ import numpy as np
 import pytest
 
 import pop_ref
-from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.adapter import OracleAdapter, forget
 from pop_ref.conformance.mutants.trial import every_law, law_named, obeys
-from pop_ref.conformance.reference import forget
 from pop_ref.magnitudes import Rounded
 from tests.golden import ten_losses
 
@@ -129,16 +128,16 @@ FLOOR_MARGIN = "test_margins.test_d5_is_near_where_alpha_is_next_to_the_floor"
 SCHEDULE = "test_density.test_schedule_has_144_densification_steps_41_with_blur_and_4_resets"
 VISIBLE = "density:the_density_statistic_averages_ndc_gradients_over_the_views_that_showed_the_gaussian"
 OUTCOME = "thresholds:at_a_depth_tie_the_order_is_one_of_the_two_and_by_index_where_the_tie_is_exact"
-IMPORTANCE = "mini_splatting:importance_is_weight_indoors_and_weight_a_pixel_for_who_dominates_outdoors"
+IMPORTANCE = "selection:importance_is_weight_indoors_and_weight_a_pixel_for_who_dominates_outdoors"
 RATES = "few_photographs:rates_of_exposures_and_cameras_fall_from_step_to_step_and_not_as_one_another"
-ADDED_IMPORTANCE = "mini_splatting:importance_adds_over_views_and_is_none_where_no_pixel_is_dominated"
+ADDED_IMPORTANCE = "selection:importance_adds_over_views_and_is_none_where_no_pixel_is_dominated"
 
 LAWS = {
-    "activations.scales_from_log_scales": "activations:scales_are_positive_and_one_at_zero",
+    "activations.scales_from_log_scales": "covariance:scales_are_positive_and_one_at_zero",
     "activations.scales_from_log_scales_vjp": "agreement:scales_from_log_scales_vjp_is_the_transpose",
-    "activations.opacities_from_logits": "activations:opposite_logits_give_opacities_that_sum_to_one",
+    "activations.opacities_from_logits": "covariance:opposite_logits_give_opacities_that_sum_to_one",
     "activations.opacities_from_logits_vjp": "agreement:opacities_from_logits_vjp_is_the_transpose",
-    "activations.unit_quats_from_quats": "activations:unit_quaternions_have_norm_one_and_forget_a_power_of_two",
+    "activations.unit_quats_from_quats": "covariance:unit_quaternions_have_norm_one_and_forget_a_power_of_two",
     "activations.unit_quats_from_quats_vjp": "agreement:unit_quats_from_quats_vjp_is_the_transpose",
     "alpha.sigma_at_pixel": "alpha:the_exponent_is_half_the_squared_distance_in_the_conics_metric",
     "alpha.sigma_at_pixel_vjp": "alpha:the_exponents_gradient_is_its_exact_change_for_a_quadratic",
@@ -207,11 +206,11 @@ LAWS = {
     "pixel.composite_pixel": "compositing:a_round_splat_on_the_axis_looks_as_the_formula_says",
     "pixel.composite_pixel_vjp": STEP,
     "pixel.zero_gradients": STEP,
-    "polarization.importance_mask": "polarization:a_gaussian_is_important_if_it_dominates_one_pixel",
+    "polarization.importance_mask": "losses:a_gaussian_is_important_if_it_dominates_one_pixel",
     "polarization.pop_loss": "agreement:pop_loss_vjp_is_the_transpose",
     "polarization.pop_loss_vjp": "agreement:pop_loss_vjp_is_the_transpose",
-    "polarization.opacity_entropy": "polarization:the_entropy_of_opacities_is_the_mean_of_what_each_leaves_open",
-    "polarization.opacity_entropy_vjp": "polarization:the_entropy_pulls_every_opacity_to_the_pole_that_it_is_nearer_to",
+    "polarization.opacity_entropy": "losses:the_entropy_of_opacities_is_the_mean_of_what_each_leaves_open",
+    "polarization.opacity_entropy_vjp": "losses:the_entropy_pulls_every_opacity_to_the_pole_that_it_is_nearer_to",
     "projection.project_means": "agreement:project_means_vjp_is_the_transpose",
     "projection.project_means_vjp": "agreement:project_means_vjp_is_the_transpose",
     "projection.projection_jacobians": "agreement:projection_jacobians_vjp_is_the_transpose",
@@ -231,26 +230,26 @@ LAWS = {
     "tiles.tile_span": OUTCOME,
     "tiles.tile_rects": "tiles:a_tile_is_listed_exactly_if_it_overlaps_the_open_extent",
     "contributions.contributions": "contributions:weights_and_the_light_that_is_left_cover_the_image",
-    "sensitivity.sensitivities": "sensitivity:one_splat_on_one_pixel_scores_its_opacity_times_its_contrast_squared",
-    "fisher.log_det_scores": "fisher:a_score_is_the_logarithm_of_the_determinant",
-    "chord.chord_midpoint": "chord:a_gaussian_is_densest_at_the_midpoint",
-    "chord.dominant_points": "chord:points_lie_on_the_rays_through_their_pixels_and_ahead_of_the_camera",
+    "sensitivity.sensitivities": "contributions:one_splat_on_one_pixel_scores_its_opacity_times_its_contrast_squared",
+    "fisher.log_det_scores": "contributions:a_score_is_the_logarithm_of_the_determinant",
+    "chord.chord_midpoint": "contributions:a_gaussian_is_densest_at_the_midpoint",
+    "chord.dominant_points": "contributions:points_lie_on_the_rays_through_their_pixels_and_ahead_of_the_camera",
     "selection.lowest_share": "selection:the_lowest_go_up_to_the_score_at_the_share_of_the_last_index",
     "selection.least_mass": "selection:the_least_mass_goes_with_the_first_that_exceeds_the_share",
     "selection.sample_without_replacement": "selection:a_draw_takes_the_first_arrivals_of_an_exponential_race",
-    "taming.budget_at": "taming:the_budget_is_a_parabola_from_the_start_to_the_target",
-    "taming.edge_map": "taming:edges_are_eight_times_the_grey_less_its_neighbours_and_the_frame_is_grey",
-    "taming.pixel_weights": "taming:pixels_weigh_up_to_fifty_by_error_and_up_to_fifty_by_edge",
-    "taming.scaled_to_median": "taming:a_term_is_its_weight_at_the_lower_median_of_what_is_positive",
-    "taming.view_score": "taming:a_views_score_is_nine_terms_and_nothing_for_what_it_does_not_show",
-    "taming.quotas": "taming:quotas_share_what_the_budget_leaves_and_never_ask_for_less_than_none",
+    "taming.budget_at": "selection:the_budget_is_a_parabola_from_the_start_to_the_target",
+    "taming.edge_map": "selection:edges_are_eight_times_the_grey_less_its_neighbours_and_the_frame_is_grey",
+    "taming.pixel_weights": "selection:pixels_weigh_up_to_fifty_by_error_and_up_to_fifty_by_edge",
+    "taming.scaled_to_median": "selection:a_term_is_its_weight_at_the_lower_median_of_what_is_positive",
+    "taming.view_score": "selection:a_views_score_is_nine_terms_and_nothing_for_what_it_does_not_show",
+    "taming.quotas": "selection:quotas_share_what_the_budget_leaves_and_never_ask_for_less_than_none",
     "mini_splatting.view_importance": IMPORTANCE,
     "mini_splatting.scene_importance": ADDED_IMPORTANCE,
-    "mini_splatting.samples_per_view": "mini_splatting:views_share_the_points_and_give_no_more_than_their_pixels",
-    "mini_splatting.nearest_log_scales": "mini_splatting:a_point_is_as_large_as_its_three_neighbours_are_far",
-    "tight_tiles.snug_box": "tight_tiles:the_box_touches_the_ellipse_of_what_can_be_seen_on_its_four_sides",
-    "tight_tiles.accutile": "tight_tiles:a_tile_is_kept_exactly_if_it_meets_the_ellipse_of_what_can_be_seen",
-    "tight_tiles.tight_tile_lists": "tight_tiles:tight_lists_are_parts_of_the_rectangles_in_the_same_order",
+    "mini_splatting.samples_per_view": "selection:views_share_the_points_and_give_no_more_than_their_pixels",
+    "mini_splatting.nearest_log_scales": "selection:a_point_is_as_large_as_its_three_neighbours_are_far",
+    "tight_tiles.snug_box": "tiles:the_box_touches_the_ellipse_of_what_can_be_seen_on_its_four_sides",
+    "tight_tiles.accutile": "tiles:a_tile_is_kept_exactly_if_it_meets_the_ellipse_of_what_can_be_seen",
+    "tight_tiles.tight_tile_lists": "tiles:tight_lists_are_parts_of_the_rectangles_in_the_same_order",
     "tiles.listed_pixels": "compositing:a_round_splat_on_the_axis_looks_as_the_formula_says",
     "compositing.background_or_black": "compositing:a_round_splat_on_the_axis_looks_as_the_formula_says",
     "tiles.tile_lists": "tiles:lists_run_front_to_back_and_equal_depths_keep_index_order",

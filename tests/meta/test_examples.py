@@ -16,11 +16,11 @@ from jaxtyping import TypeCheckError
 
 from pop_ref.activations import scales_from_log_scales
 from pop_ref.conformance.adapter import OracleAdapter
-from pop_ref.conformance.corners import corners
 from pop_ref.conformance.hypothesis_profiles import EXAMPLES
 from pop_ref.conformance.mutants import MUTANTS
 from pop_ref.conformance.mutants.copies import living
 from pop_ref.conformance.mutants.trial import every_law, law_named, obeys
+from pop_ref.conformance.strategies import corners
 from pop_ref.covariance import covars_from_quats_scales
 from pop_ref.losses import l2
 

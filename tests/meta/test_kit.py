@@ -21,15 +21,22 @@ from pop_ref.conformance.failure_report import failure_report
 from pop_ref.conformance.law import missing
 from pop_ref.conformance.mutants import MUTANTS, living
 from pop_ref.conformance.mutants.trial import every_law, law_named, obeys
-from pop_ref.conformance.poison import POISONED_INTEGER, poisoned_allocations
-from pop_ref.conformance.scene_files import load_scene, save_scene
-from pop_ref.conformance.scenes import Scene, cotangents, golden_scene, rounded_to, scene_as_code
+from pop_ref.conformance.scenes import (
+    Scene,
+    cotangents,
+    golden_scene,
+    load_scene,
+    rounded_to,
+    save_scene,
+    scene_as_code,
+)
 from pop_ref.conformance.scorecard import Entry, Scorecard, outcomes
 from pop_ref.conformance.strategies import FLOOR, scenes
 from pop_ref.conformance.tolerances import TABLE
 from pop_ref.conformance.torch_strategy import StrategyAdapter
 from pop_ref.constants import INRIA
 from pop_ref.records import Camera, Gaussians
+from tests.judged import POISONED_INTEGER, poisoned_allocations
 
 ROOT = Path(__file__).resolve().parents[2]
 SEEN = settings(max_examples=200, derandomize=True, database=None, suppress_health_check=list(HealthCheck))

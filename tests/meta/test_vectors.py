@@ -13,9 +13,8 @@ import pytest
 
 from pop_ref.conformance.backends import SHIPPED, shipped
 from pop_ref.conformance.mutants import FAMILIES, MUTANTS, living
-from pop_ref.conformance.vector_answer import answer
-from pop_ref.conformance.vector_check import check
-from pop_ref.conformance.vector_schema import schema
+from pop_ref.conformance.vector_check import check, schema
+from pop_ref.conformance.vector_kills import answer
 from pop_ref.conformance.vectors import export, kinds
 
 ROOT = Path(__file__).parents[2]

@@ -8,6 +8,7 @@ import numpy as np
 from hypothesis import assume
 from hypothesis import strategies as st
 
+from pop_ref.conformance.adapter import Reference
 from pop_ref.conformance.assertions import (
     assert_close,
     assert_same_bits,
@@ -25,14 +26,12 @@ from pop_ref.conformance.capabilities import (
     LOWER_CEILING,
     RENDER,
 )
-from pop_ref.conformance.cases import CASES, cotangent_like, error_bounds_of, rounded, tangential, transposed
-from pop_ref.conformance.corners import corners
+from pop_ref.conformance.cases import CASES, cotangent_like, error_bounds_of, tangential, transposed
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.law import law
-from pop_ref.conformance.reference import Reference
-from pop_ref.conformance.scenes import cotangents
-from pop_ref.conformance.strategies import plain_sizes, scenes, wide_scene
-from pop_ref.conformance.threshold_outcomes import assert_one_of_the_oracles_outcomes
+from pop_ref.conformance.scenes import cotangents, rounded
+from pop_ref.conformance.strategies import corners, plain_sizes, scenes, wide_scene
+from pop_ref.conformance.thresholds import assert_one_of_the_oracles_outcomes
 from pop_ref.constants import GSPLAT_1_6, INRIA, Profile
 
 ORACLE = Reference()

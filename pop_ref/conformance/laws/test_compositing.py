@@ -17,12 +17,12 @@ from pop_ref.conformance.assertions import (
     with_error_bounds,
 )
 from pop_ref.conformance.capabilities import PRINCIPAL_POINT, RENDER
-from pop_ref.conformance.corners import corners
 from pop_ref.conformance.law import law
 from pop_ref.conformance.scenes import SH_C0, Record, Scene, pack
 from pop_ref.conformance.strategies import (
     arrays_of,
     cameras,
+    corners,
     dyadic,
     faint_opacities,
     opacities,

@@ -9,11 +9,10 @@ from hypothesis import strategies as st
 
 from pop_ref.conformance.assertions import assert_close, assert_same_bits, assert_seen, with_error_bounds
 from pop_ref.conformance.capabilities import DOMINANCE, DOMINANT_COUNTS, DOMINANT_WEIGHTS, PROFILES, RENDER
-from pop_ref.conformance.corners import corners
 from pop_ref.conformance.law import law
 from pop_ref.conformance.laws.test_compositing import colored
 from pop_ref.conformance.scenes import Record, Scene, pack
-from pop_ref.conformance.strategies import arrays_of, dyadic, plain_sizes, scenes
+from pop_ref.conformance.strategies import arrays_of, corners, dyadic, plain_sizes, scenes
 from pop_ref.constants import PAPER
 from pop_ref.records import Camera
 

@@ -25,14 +25,12 @@ from pop_ref.conformance.capabilities import (
     INSTRUMENTS,
     RENDER,
 )
-from pop_ref.conformance.corners import corners
-from pop_ref.conformance.error_bounds import pixel_error_bounds
+from pop_ref.conformance.error_bounds import pixel_error_bounds, screen_error_bounds
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.law import law
 from pop_ref.conformance.laws.test_compositing import colored
 from pop_ref.conformance.scenes import SH_C0, cotangents
-from pop_ref.conformance.screen_error_bounds import screen_error_bounds
-from pop_ref.conformance.strategies import arrays_of, plain_sizes, scenes, wide_scene
+from pop_ref.conformance.strategies import arrays_of, corners, plain_sizes, scenes, wide_scene
 
 plain = scenes(anchored=True, size=plain_sizes(), max_gaussians=4)
 banded = scenes(anchored=True, size=plain_sizes(), max_gaussians=3, max_degree=3)

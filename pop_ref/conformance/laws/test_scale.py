@@ -6,12 +6,13 @@ import numpy as np
 
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.capabilities import DOMINANCE, EXTENTS, GRADIENTS, INRIAS, PRINCIPAL_POINT, RENDER, SCALE
-from pop_ref.conformance.corpus import PLANS, corpus_scene
-from pop_ref.conformance.corpus_answers import (
+from pop_ref.conformance.corpus import (
     GRADIENTS as ROWS,
 )
-from pop_ref.conformance.corpus_answers import (
+from pop_ref.conformance.corpus import (
+    PLANS,
     answers,
+    corpus_scene,
     picked_pixels,
     unambiguous_cotangents,
     weighted_blocks,

@@ -1,4 +1,7 @@
-"""Laws of gsplat's signature: colours, backgrounds, covariances, planes and radius_clip away from their defaults."""
+"""Laws of gsplat's signature: every frame of a call is what the oracle draws of it alone, with gradients.
+
+Arguments away from their defaults, several cameras, batches, packed rows, and modes of depth.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +11,13 @@ import numpy as np
 
 from pop_ref.conformance.calls import Call, Frame
 from pop_ref.conformance.capabilities import (
+    BATCHES,
+    CAMERA_COLORS,
     CAMERAS,
     CHANNELS,
     COLORS,
     COVARS,
+    DEPTH,
     EXTENTS,
     NO_BACKGROUND,
     PACKED,
@@ -21,10 +27,8 @@ from pop_ref.conformance.capabilities import (
     SPARSE_GRAD,
 )
 from pop_ref.conformance.law import law
-from pop_ref.conformance.signature import assert_call_is_the_oracles, expectations
+from pop_ref.conformance.signature import assert_call_is_the_oracles, assert_rows, expectations
 from pop_ref.conformance.views import clear_of_extents, frames
-
-JUDGED = (SIGNATURE,)
 
 
 def _assert_it_matters(backend, call, **default):
@@ -34,38 +38,38 @@ def _assert_it_matters(backend, call, **default):
     assert max(moved) > 2.0**-8, "the argument changes nothing in this scene"
 
 
-@law("signature", *JUDGED, COLORS)
+@law("signature", SIGNATURE, COLORS)
 def test_plain_colours_are_drawn_as_they_are(backend):
     for seed in (0, 1):
         assert_call_is_the_oracles(backend, Call((frames(backend, seed, channels=3),)))
 
 
-@law("signature", *JUDGED, CHANNELS)
+@law("signature", SIGNATURE, CHANNELS)
 def test_colours_of_any_number_of_channels_are_drawn_alike(backend):
     # more than a renderer blends at a time, too: gsplat's `channel_chunk` is 32
     for channels in (1, 2, 4, 8, 40):
         assert_call_is_the_oracles(backend, Call((frames(backend, channels, channels=channels),)))
 
 
-@law("signature", *JUDGED, NO_BACKGROUND, COLORS, CAMERAS)
+@law("signature", SIGNATURE, NO_BACKGROUND, COLORS, CAMERAS)
 def test_without_a_background_it_is_black(backend):
     for channels in (0, 3):
         row = frames(backend, 2, 2, channels=channels, black=True)
         assert_call_is_the_oracles(backend, Call((row,), no_background=True))
 
 
-@law("signature", *JUDGED, COVARS)
+@law("signature", SIGNATURE, COVARS)
 def test_covariances_draw_what_their_quaternions_and_scales_draw(backend):
     for seed in (3, 4):
         assert_call_is_the_oracles(backend, Call((frames(backend, seed),), covars=True))
 
 
-@law("signature", *JUDGED, COVARS)
+@law("signature", SIGNATURE, COVARS)
 def test_covariances_go_before_quaternions_and_scales(backend):
     assert_call_is_the_oracles(backend, Call((frames(backend, 3),), covars=True, overruled=True))
 
 
-@law("signature", *JUDGED, PLANES)
+@law("signature", SIGNATURE, PLANES)
 def test_the_near_and_the_far_plane_are_where_the_call_says(backend):
     for planes in ({"near_plane": 2.0}, {"far_plane": 4.0}, {"near_plane": 1.5, "far_plane": 4.5}):
         call = Call((frames(backend, 5),), planes=planes)
@@ -75,7 +79,7 @@ def test_the_near_and_the_far_plane_are_where_the_call_says(backend):
         assert_call_is_the_oracles(backend, call)
 
 
-@law("signature", *JUDGED, PLANES)
+@law("signature", SIGNATURE, PLANES)
 def test_the_far_plane_culls_by_depth_and_not_by_distance(backend):
     frame = frames(backend, 5)[0]
     camera, means = frame.scene.camera, frame.scene.gaussians.means
@@ -87,7 +91,7 @@ def test_the_far_plane_culls_by_depth_and_not_by_distance(backend):
     assert_call_is_the_oracles(backend, Call(((frame,),), planes={"far_plane": between}))
 
 
-@law("signature", *JUDGED, PLANES)
+@law("signature", SIGNATURE, PLANES)
 def test_a_centre_on_the_far_plane_is_drawn_and_one_on_the_near_plane_as_the_profile_says(backend):
     (frame,) = frames(backend, 5)
     one = {"means": [[0.0, 0.0, 3.0]], "scales": [[0.5, 0.5, 0.5]], "opacities": [0.75], "viewmat": np.eye(4)}
@@ -102,7 +106,7 @@ def test_a_centre_on_the_far_plane_is_drawn_and_one_on_the_near_plane_as_the_pro
     assert called.alphas.max() > 0.25, "depth 2^-10 at near_plane=0 is culled"
 
 
-@law("signature", *JUDGED, PLANES)
+@law("signature", SIGNATURE, PLANES)
 def test_the_low_pass_is_as_wide_as_the_call_says(backend):
     # 0 is a width like any other, and none that was left out
     for eps2d in (0.0625, 2.0, 0.0):
@@ -121,7 +125,7 @@ def _in_units(frame, unit):
     return dataclasses.replace(frame, scene=scene.with_overrides(**lengths, viewmat=viewmat))
 
 
-@law("signature", *JUDGED, PLANES)
+@law("signature", SIGNATURE, PLANES)
 def test_a_world_told_in_other_units_is_drawn_alike(backend):
     # where a coordinate is a millimetre or a light-year: no length may be compared with a constant of the renderer
     drawn = []
@@ -134,7 +138,7 @@ def test_a_world_told_in_other_units_is_drawn_alike(backend):
     assert all(np.array_equal(image, drawn[0]) for image in drawn[1:]), "the oracle knows a length"
 
 
-@law("signature", *JUDGED, EXTENTS, RADIUS_CLIP)
+@law("signature", SIGNATURE, EXTENTS, RADIUS_CLIP)
 def test_what_is_no_larger_than_radius_clip_is_culled(backend):
     for seed, clip in ((7, 6.0), (8, 5.5)):
         call = Call((frames(backend, seed),), radius_clip=clip)
@@ -143,6 +147,91 @@ def test_what_is_no_larger_than_radius_clip_is_culled(backend):
         assert_call_is_the_oracles(backend, call)
 
 
-@law("signature", *JUDGED, PACKED, SPARSE_GRAD)
+@law("signature", SIGNATURE, PACKED, SPARSE_GRAD)
 def test_sparse_gradients_are_the_dense_ones(backend):
     assert_call_is_the_oracles(backend, Call((frames(backend, 9, 1),), packed=True, sparse_grad=True))
+
+
+@law("signature", SIGNATURE, CAMERAS)
+def test_several_cameras_in_one_call_see_what_each_sees_alone(backend):
+    for seed, degree in ((0, 1), (1, 3), (2, 0)):
+        assert_call_is_the_oracles(backend, Call((frames(backend, seed, 3, degree),)))
+
+
+@law("signature", SIGNATURE, CAMERAS, CAMERA_COLORS)
+def test_every_camera_has_the_colours_and_harmonics_that_were_given_for_it(backend):
+    for channels in (0, 3):
+        row = frames(backend, 3, 3, channels=channels, camera_colors=True)
+        assert_call_is_the_oracles(backend, Call((row,), camera_colors=True))
+
+
+@law("signature", SIGNATURE, CAMERAS, COLORS)
+def test_where_there_are_as_many_gaussians_as_cameras_a_colour_is_a_gaussians(backend):
+    row = frames(backend, 0, 3, channels=3)
+    visible = [wanted.render.splats.visible for wanted in expectations(backend, Call((row,)))[0]]
+    seen = np.flatnonzero(np.all(visible, axis=0))[:3]
+    few = tuple(Frame(frame.scene.rows(seen), frame.colors[seen]) for frame in row)
+    assert_call_is_the_oracles(backend, Call((few,)))
+
+
+@law("signature", SIGNATURE, CAMERAS, CAMERA_COLORS)
+def test_where_there_are_as_many_gaussians_as_cameras_a_cameras_colours_are_its_own(backend):
+    for channels in (0, 3):
+        row = frames(backend, 3, 3, channels=channels, camera_colors=True)
+        call = Call((row,), camera_colors=True)
+        visible = [wanted.render.splats.visible for wanted in expectations(backend, call)[0]]
+        seen = np.flatnonzero(np.all(visible, axis=0))[:3]
+        assert len(seen) == 3, "no three Gaussians are seen by all cameras"
+        few = tuple(Frame(f.scene.rows(seen), None if f.colors is None else f.colors[seen]) for f in row)
+        assert_call_is_the_oracles(backend, Call((few,), camera_colors=True))
+
+
+@law("signature", SIGNATURE, CAMERAS, BATCHES)
+def test_batch_entries_do_not_know_of_each_other(backend):
+    rows = tuple(frames(backend, 4 + entry, 2, entry=entry) for entry in range(2))
+    assert_call_is_the_oracles(backend, Call(rows, batch=(2,)))
+    plain = tuple(frames(backend, 4 + entry, 2, channels=3, camera_colors=True, entry=entry) for entry in range(2))
+    assert_call_is_the_oracles(backend, Call(plain, batch=(2,), camera_colors=True))
+
+
+@law("signature", SIGNATURE, PACKED, CAMERAS)
+def test_packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same(backend):
+    for seed in (0, 6):
+        call = Call((frames(backend, seed, 3),), packed=True)
+        of = assert_call_is_the_oracles(backend, call)
+        assert any(not all(e.render.splats.visible) for _, _, e in of.each()), "no Gaussian is culled"
+        assert_rows(backend, of)
+
+
+@law("signature", SIGNATURE, PACKED, CAMERAS, BATCHES)
+def test_packed_rows_of_batch_entries_draw_the_same(backend):
+    rows = tuple(frames(backend, 7 + entry, 2, entry=entry) for entry in range(2))
+    assert_rows(backend, assert_call_is_the_oracles(backend, Call(rows, batch=(2,), packed=True)))
+
+
+@law("signature", SIGNATURE, DEPTH)
+def test_the_accumulated_depth_is_the_oracles_alone_and_behind_colours(backend):
+    for seed in (0, 1):
+        for mode in ("D", "RGB+D"):
+            assert_call_is_the_oracles(backend, Call((frames(backend, seed),), render_mode=mode))
+
+
+@law("signature", SIGNATURE, DEPTH)
+def test_the_expected_depth_is_the_accumulated_one_over_the_opacity(backend):
+    for seed in (0, 1):
+        for mode in ("ED", "RGB+ED"):
+            of = assert_call_is_the_oracles(backend, Call((frames(backend, seed),), render_mode=mode))
+            assert np.any(of.wanted[0][0].render.T_final > 0.125), "no pixel is transparent; both depths would be one"
+
+
+@law("signature", SIGNATURE, DEPTH, COLORS, CAMERAS)
+def test_depth_follows_plain_colours_of_several_cameras(backend):
+    # kernels pad channels to the next number that they are compiled for, and depth comes after those that there are
+    for channels, mode in ((3, "RGB+D"), (3, "RGB+ED"), (4, "RGB+D"), (2, "RGB+ED"), (6, "RGB+D")):
+        assert_call_is_the_oracles(backend, Call((frames(backend, 9, 2, channels=channels),), render_mode=mode))
+
+
+@law("signature", SIGNATURE, DEPTH, PACKED)
+def test_depth_is_the_same_of_packed_rows(backend):
+    for mode in ("ED", "RGB+D"):
+        assert_call_is_the_oracles(backend, Call((frames(backend, 10),), render_mode=mode, packed=True))

@@ -12,7 +12,7 @@ from pop_ref.conformance.calls import Call, Frame
 from pop_ref.conformance.capabilities import CAMERAS, EXTENTS, PACKED, PRINCIPAL_POINT, SCALE, SIGNATURE
 from pop_ref.conformance.corpus import corpus_scene
 from pop_ref.conformance.law import law
-from pop_ref.conformance.meta import (
+from pop_ref.conformance.signature import (
     ROWS,
     assert_dominance,
     assert_keys,
@@ -20,11 +20,10 @@ from pop_ref.conformance.meta import (
     assert_sizes,
     assert_tiles,
     lacks_for_tiles,
+    made,
 )
-from pop_ref.conformance.signature import made
 from pop_ref.conformance.views import call_for, frames
 
-JUDGED = (SIGNATURE,)
 SIZES = ("width", "height", "tile_size", "tile_width", "tile_height", "n_cameras", "n_batches")
 
 
@@ -47,23 +46,23 @@ def _listed(backend, *more, **options):
     return of
 
 
-@law("signature", *JUDGED, CAMERAS)
+@law("signature", SIGNATURE, CAMERAS)
 def test_meta_says_what_was_asked(backend):
     assert_sizes(_made(backend, SIZES))
 
 
-@law("signature", *JUDGED, CAMERAS)
+@law("signature", SIGNATURE, CAMERAS)
 def test_the_splats_that_meta_shows_are_the_oracles(backend):
     assert_rows(backend, _made(backend, (*ROWS, "radii")))
 
 
-@law("signature", *JUDGED, CAMERAS)
+@law("signature", SIGNATURE, CAMERAS)
 def test_the_splats_that_meta_shows_where_nothing_requires_a_gradient_are_the_oracles(backend):
     of = _made(backend, (*ROWS, "radii"))
     assert_rows(backend, dataclasses.replace(of, called=backend.call(of.call)))
 
 
-@law("signature", *JUDGED, EXTENTS)
+@law("signature", SIGNATURE, EXTENTS)
 def test_extents_that_sixteen_bits_do_not_hold_are_told_as_they_are(backend):
     (frame,) = frames(backend, 1)
     huge = frame.scene.with_overrides(scales=frame.scene.gaussians.scales * 2.0**13)
@@ -78,17 +77,17 @@ def test_extents_that_sixteen_bits_do_not_hold_are_told_as_they_are(backend):
     assert not np.any(off), f"meta radii are {found[off][0]:g}, expected {extents[off][0]:g}"
 
 
-@law("signature", *JUDGED, CAMERAS)
+@law("signature", SIGNATURE, CAMERAS)
 def test_the_tile_lists_that_meta_shows_run_front_to_back_and_hold_who_is_blended(backend):
     assert_tiles(backend, _listed(backend))
 
 
-@law("signature", *JUDGED, CAMERAS, PACKED)
+@law("signature", SIGNATURE, CAMERAS, PACKED)
 def test_the_tile_lists_of_packed_rows_run_front_to_back_and_hold_who_is_blended(backend):
     assert_tiles(backend, _listed(backend, packed=True))
 
 
-@law("signature", *JUDGED, SCALE, EXTENTS, PRINCIPAL_POINT)
+@law("signature", SIGNATURE, SCALE, EXTENTS, PRINCIPAL_POINT)
 def test_a_splat_over_hundreds_of_tiles_counts_all_of_them(backend):
     if not backend.takes("tile_size"):
         pytest.skip(f"{backend.name} has no tiles of another side than its own")
@@ -101,30 +100,30 @@ def test_a_splat_over_hundreds_of_tiles_counts_all_of_them(backend):
     assert_same_bits("meta tiles_per_gauss", meta["tiles_per_gauss"].reshape(-1), counts)
 
 
-@law("signature", *JUDGED, CAMERAS, PACKED)
+@law("signature", SIGNATURE, CAMERAS, PACKED)
 def test_dominant_ids_are_of_gaussians_and_not_of_packed_rows(backend):
     plain, packed = (_made(backend, ("dominant_ids",), packed=each).called for each in (False, True))
     assert_same_bits("dominant ids, packed or not", packed.meta["dominant_ids"], plain.meta["dominant_ids"])
 
 
-@law("signature", *JUDGED, CAMERAS)
+@law("signature", SIGNATURE, CAMERAS)
 def test_every_camera_has_dominant_gaussians_and_counts_of_its_own(backend):
     assert_dominance(backend, _made(backend, ("dominant_ids", "dominant_counts", "n_contrib", "final_T")))
 
 
-@law("signature", *JUDGED, CAMERAS)
+@law("signature", SIGNATURE, CAMERAS)
 def test_the_keys_of_intersections_hold_image_tile_and_depth(backend):
     of = _listed(backend, "isect_ids", "depths")
     assert_keys(of.called.meta, len(of.call.frames[0]), len(of.wanted[0][0].render.tile_lists))
 
 
-@law("signature", *JUDGED, CAMERAS, PACKED)
+@law("signature", SIGNATURE, CAMERAS, PACKED)
 def test_the_keys_of_packed_intersections_hold_image_tile_and_depth(backend):
     of = _listed(backend, "isect_ids", "depths", packed=True)
     assert_keys(of.called.meta, len(of.call.frames[0]), len(of.wanted[0][0].render.tile_lists))
 
 
-@law("signature", *JUDGED)
+@law("signature", SIGNATURE)
 def test_of_more_tiles_than_sixteen_bits_number_each_lists_who_overlaps_it(backend):
     # as many as a signed number of two bytes does not count, and as none does
     for width, height in ((256, 160), (320, 208)):

@@ -1,15 +1,21 @@
-"""Laws of tile rectangles, tile lists and depth order (D3, D4)."""
+"""Laws of tiles: rectangles, lists by depth, and exact ones that are shorter and draw the same (D3, D4, D5)."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from hypothesis import strategies as st
 
-from pop_ref.conformance.assertions import assert_same_bits
+from pop_ref.compositing import composite
+from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.capabilities import INRIAS
+from pop_ref.conformance.gradient_error_bounds import screened
 from pop_ref.conformance.law import law
-from pop_ref.conformance.strategies import dyadic
-from pop_ref.constants import INRIA
+from pop_ref.conformance.laws.test_contributions import plain
+from pop_ref.conformance.scenes import rounded
+from pop_ref.conformance.strategies import dyadic, scenes
+from pop_ref.constants import INRIA, PAPER, SPEEDY_SPLAT
 
 W, H = 11, 7
 placed = st.lists(
@@ -118,3 +124,135 @@ def test_permuting_splats_of_distinct_depths_permutes_ids_only(backend, placed, 
 def test_an_image_without_splats_has_empty_lists(backend):
     lists = _lists(backend, [], 4)
     assert [list(ids) for ids in lists] == [[] for _ in range(6)]
+
+
+SIZE, ACROSS, DOWN = 4, 6, 5
+quarters = st.tuples(*[st.integers(-16, 112).map(lambda k: k / 4.0)] * 2).map(np.array)
+variances = st.sampled_from([1.0, 0.5, 4.0, 9.0, 64.0])
+leanings = st.sampled_from([0.0, 0.5, -0.875, 0.96875, -0.984375])
+seen_opacities = st.sampled_from([1.0, 0.5, 0.125, 1.0 / 128.0, 0.0048828125])
+
+
+def _conic(a, c, leaning):
+    b = leaning * math.sqrt(a * c)
+    return np.array([c, -b, a]) / (a * c - b * b)
+
+
+def _least_exponent(mean2d, conic, x, y, size=SIZE):
+    """Return the least exponent over a closed tile: at the centre, or on an edge, along which it is a parabola."""
+    (A, B, C), (u, v) = conic, mean2d
+    left, right, top, bottom = x * size - u, (x + 1) * size - u, y * size - v, (y + 1) * size - v
+    if left <= 0.0 <= right and top <= 0.0 <= bottom:
+        return 0.0
+    ends = [(dx, min(max(-B * dx / C, top), bottom)) for dx in (left, right)]
+    ends += [(min(max(-B * dy / A, left), right), dy) for dy in (top, bottom)]
+    return min(0.5 * (A * dx * dx + C * dy * dy) + B * dx * dy for dx, dy in ends)
+
+
+@law("tight_tiles", "snug_box", at=quarters, a=variances, c=variances, leaning=leanings, opacity=seen_opacities)
+def test_the_box_touches_the_ellipse_of_what_can_be_seen_on_its_four_sides(backend, at, a, c, leaning, opacity):
+    conic = _conic(a, c, leaning)
+    at, conic = rounded((at, conic), backend.dtype)
+    left, top, right, bottom = backend.stage("snug_box")(at, conic, opacity)
+    A, B, C = conic
+    # on a vertical line sigma is least at dy = -B dx / C, where it is half of dx^2 (A - B^2 / C)
+    reach = math.log(opacity / PAPER.alpha_floor)
+    spread = 1.0 / (1.0 - leaning * leaning)
+    for side, centre, steep in ((left, at[0], A - B * B / C), (right, at[0], A - B * B / C),
+                                (top, at[1], C - B * B / A), (bottom, at[1], C - B * B / A)):  # fmt: skip
+        size = (reach + abs(centre) * math.sqrt(2.0 * reach * steep)) * spread
+        assert_close("tight_tiles.box", 0.5 * (side - centre) ** 2 * steep, reach, size + 1.0, backend.dtype)
+    assert left <= at[0] <= right
+    assert top <= at[1] <= bottom
+
+
+@law("tight_tiles", "snug_box", "accutile", at=quarters, a=variances, opacity=st.sampled_from([0.0, 0.001, 0.00390625]))
+def test_a_splat_that_cannot_be_seen_has_no_box_and_no_tiles_under_the_floor(backend, at, a, opacity):
+    conic = _conic(a, a, 0.0)
+    below = opacity < PAPER.alpha_floor
+    assert (backend.stage("snug_box")(at, conic, opacity) is None) == below
+    if below:
+        assert len(backend.stage("accutile")(at, conic, opacity, (0, 0, ACROSS, DOWN), SIZE)) == 0
+
+
+@law("tight_tiles", "accutile", at=quarters, opacity=seen_opacities, x=st.integers(0, 2), y=st.integers(0, 2))
+def test_a_conic_without_an_ellipse_keeps_its_whole_rectangle(backend, at, opacity, x, y):
+    # rounding leaves such conics of needles: a determinant of 0, and one under it
+    whole = {(column, row) for row in range(y, y + 2) for column in range(x, x + 3)}
+    for conic in ([1.0, 1.0, 1.0], [0.25, 0.5, 0.5]):
+        tiles = backend.stage("accutile")(at, np.array(conic), opacity, (x, y, x + 3, y + 2), SIZE)
+        assert sorted((int(column), int(row)) for column, row in tiles) == sorted(whole)
+
+
+@law("tight_tiles", "accutile", at=quarters, a=variances, c=variances, leaning=leanings, opacity=seen_opacities)
+def test_a_tile_is_kept_exactly_if_it_meets_the_ellipse_of_what_can_be_seen(backend, at, a, c, leaning, opacity):
+    conic = _conic(a, c, leaning)
+    at, conic = rounded((at, conic), backend.dtype)
+    # the smaller the tiles, the nearer an end of a row has to be
+    for size in (SIZE, 1):
+        _assert_kept(backend, at, conic, opacity, ACROSS * SIZE // size, DOWN * SIZE // size, size)
+
+
+def _assert_kept(backend, at, conic, opacity, across, down, size):
+    tiles = backend.stage("accutile")(at, conic, opacity, (0, 0, across, down), size)
+    kept = {(int(x), int(y)) for x, y in tiles}
+    assert len(kept) == len(tiles)
+    for x in range(across):
+        for y in range(down):
+            least = _least_exponent(at, conic, x, y, size)
+            slack = least - math.log(opacity / PAPER.alpha_floor)
+            # a tile that is met at a point is met or not by rounding
+            if abs(slack) > 2.0**14 * np.finfo(backend.dtype).eps * (1.0 + least):
+                assert ((x, y) in kept) == (slack < 0.0), (x, y)
+
+
+def _listed(backend, given):
+    """Return the tight lists of a view, and those of whole rectangles that they are part of."""
+    s, wide, width, height, size = given.view
+    args = (s.means2d, s.conics, s.opacities, s.radii, s.depths, width, height, size, given.scene.profile)
+    return [[int(i) for i in ids] for ids in backend.stage("tight_tile_lists")(*args)], wide
+
+
+def _same_image(backend, given):
+    tight, wide = _listed(backend, given)
+    at, sure = given.error_bounds.unambiguous, (*given.view[2:], given.scene.background, given.scene.profile)
+    one, other = (composite(given.splats, lists, *sure) for lists in (tight, wide))
+    # blended by the oracle both times: what is left out was blended nowhere
+    for name in ("image", "T_final", "dominant_ids", "n_blended"):
+        assert_same_bits(name, getattr(one, name)[at], getattr(other, name)[at])
+
+
+@law("tight_tiles", "tight_tile_lists", scene=scenes(anchored=True))
+def test_the_image_of_tight_lists_is_that_of_whole_rectangles(backend, scene):
+    _same_image(backend, screened(backend, scene))
+
+
+@law("tight_tiles", "tight_tile_lists", scene=scenes(anchored=True, profile=INRIA))
+def test_inside_squares_tight_lists_change_nothing_either(backend, scene):
+    _same_image(backend, screened(backend, scene))
+
+
+@law("tight_tiles", "tight_tile_lists", scene=scenes(anchored=True, profile=SPEEDY_SPLAT))
+def test_speedy_splats_lists_give_the_image_of_its_profile(backend, scene):
+    _same_image(backend, screened(backend, scene))
+
+
+@law("tight_tiles", "tight_tile_lists", scene=plain)
+def test_tight_lists_are_parts_of_the_rectangles_in_the_same_order(backend, scene):
+    tight, wide = _listed(backend, screened(backend, scene))
+    assert len(tight) == len(wide)
+    for few, many in zip(tight, wide, strict=True):
+        assert len(set(few)) == len(few)
+        assert few == [i for i in many if i in few]
+
+
+@law("tight_tiles", "tight_tile_lists", scene=plain)
+def test_no_tile_is_listed_that_lies_outside_the_ellipse(backend, scene):
+    given = screened(backend, scene.with_overrides(tile_size=SIZE))
+    tight, _ = _listed(backend, given)
+    s, across = given.splats, -(-given.view[2] // SIZE)
+    for tile, ids in enumerate(tight):
+        for i in ids:
+            least = _least_exponent(s.means2d[i], s.conics[i], tile % across, tile // across)
+            brightest = float(s.opacities[i]) * math.exp(-least)
+            assert brightest >= PAPER.alpha_floor * (1.0 - 2.0**14 * np.finfo(backend.dtype).eps * (1.0 + least))

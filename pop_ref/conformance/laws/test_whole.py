@@ -16,10 +16,9 @@ from pop_ref.conformance.assertions import (
     with_error_bounds,
 )
 from pop_ref.conformance.capabilities import DETERMINISTIC, EXTENTS, HOMOGENEOUS, PRINCIPAL_POINT, RENDER, ROWWISE
-from pop_ref.conformance.corners import corners
 from pop_ref.conformance.law import law
 from pop_ref.conformance.scenes import Record, Scene, pack
-from pop_ref.conformance.strategies import backgrounds, cameras, plain_sizes, quats, records, rigid, scenes
+from pop_ref.conformance.strategies import backgrounds, cameras, corners, plain_sizes, quats, records, rigid, scenes
 from pop_ref.records import Camera, Gaussians
 
 plain = scenes(anchored=True, size=plain_sizes())

@@ -6,7 +6,7 @@ import functools
 import importlib.abc
 import importlib.util
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.machinery import ModuleSpec
@@ -57,6 +57,16 @@ class Mutant:
         if text.count(self.old) != 1:
             raise ValueError(f"mutant {self.name}: {self.old!r} occurs {text.count(self.old)} times in {self.file}")
         return text.replace(self.old, self.new)
+
+
+# by file: of every mutant its name, its story, the line before and after, and the law that kills it
+Lines = Mapping[str, tuple[tuple[str, str, str, str, str], ...]]
+
+
+def mutants_of(lines: Lines, package: str = ORACLE) -> tuple[Mutant, ...]:
+    """Return the mutants of a table."""
+    of = ((file, line) for file, every in lines.items() for line in every)
+    return tuple(Mutant(name, story, file, old, new, law, package) for file, (name, story, old, new, law) in of)
 
 
 @functools.cache

@@ -9,13 +9,13 @@ import pytest
 
 from pop_fast.api.registry import get_backend
 from pop_ref.conformance.mutants.trial import every_law, law_named
-from pop_ref.conformance.torch_watched import Watcher
+from pop_ref.conformance.torch_short_training import Trainee
 from tests.cuda.conftest import emulated_engine
 
 LAWS = [path for path, law in every_law().items() if law.needs == ("collected_statistics",)]
 
 
-class FusedStep(Watcher):
+class FusedStep(Trainee):
     """Takes the steps of a `Watch` on the emulated GPU, as an adapter that offers nothing else."""
 
     name, dtype = "the fused step", np.float32

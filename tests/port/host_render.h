@@ -7,12 +7,51 @@
 #include <numeric>
 #include <vector>
 
-#include "../csrc/compositing.cuh"
-#include "mirror.h"
-#include "../csrc/splatting.cuh"
+#include "compositing.cuh"
+#include "splatting.cuh"
 
 namespace pop {
-namespace mirror {
+namespace host {
+
+constexpr int N_ARRAYS = 12;
+
+template <class Real>
+struct Arguments {
+    const Real* in[N_ARRAYS];
+    Real* out[N_ARRAYS];
+    long long* ids[N_ARRAYS];
+    long long n;
+    int integers[N_ARRAYS];
+    Profile<Real> profile;
+};
+
+template <class Real>
+Vec3<Real> vec3(const Real* p, long long i) {
+    return {p[3 * i], p[3 * i + 1], p[3 * i + 2]};
+}
+
+template <class Real>
+Vec4<Real> vec4(const Real* p, long long i) {
+    return {p[4 * i], p[4 * i + 1], p[4 * i + 2], p[4 * i + 3]};
+}
+
+// writes a struct of Reals as row i
+template <class Struct, class Real>
+void put(Real* p, long long i, const Struct& value) {
+    constexpr int n = int(sizeof(Struct) / sizeof(Real));
+    const Real* entries = reinterpret_cast<const Real*>(&value);
+    for (int k = 0; k < n; ++k) p[n * i + k] = entries[k];
+}
+
+template <class Real>
+void put_viewmat(Real* p, const ViewmatVjp<Real>& v) {
+    for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) p[4 * i + j] = v.v_R.m[i][j];
+    p[3] = v.v_t.x;
+    p[7] = v.v_t.y;
+    p[11] = v.v_t.z;
+    for (int j = 12; j < 16; ++j) p[j] = Real(0);
+}
 
 constexpr int CH = 3, ROWS = 4, BUCKET = 32;
 constexpr int N_SUMS = SumsOf<CH, true>::count;
@@ -240,7 +279,7 @@ void render_vjp(Arguments<Real>& a) {
             for (int c = 0; c < CH; ++c)
                 a.out[6][c] += column.T_final[k] * a.in[V_IMAGE][CH * ((long long)(y + k) * frame.grid.width + x) + c];
     });
-    ViewmatVjp<Real> v_viewmat = zero_viewmat<Real>();
+    ViewmatVjp<Real> v_viewmat = {};
     for (long long i = 0; i < a.n; ++i) {
         const SplatRow<Real>& s = frame.splats[i];
         if (!seen(s)) continue;
@@ -266,11 +305,5 @@ void render_vjp(Arguments<Real>& a) {
     put_viewmat(a.out[5], v_viewmat);
 }
 
-template <class Real>
-const Entry<Real>* render_table() {
-    static const Entry<Real> table[] = {{"render", render<Real>}, {"render_vjp", render_vjp<Real>}, {nullptr, nullptr}};
-    return table;
-}
-
-}  // namespace mirror
+}  // namespace host
 }  // namespace pop
