@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from pop_fast.api.registry import get_backend
+from pop_fast.api.backend import get_backend
 from pop_fast.blocks.plan import FOLDER, Job
 from pop_fast.children import SAFE_PATH, module_command
 from pop_fast.errors import PopError

@@ -200,7 +200,7 @@ def prepare(
     """Prepare the training of a block in a round.
 
     Args:
-        config: its settings, of `pop_fast.train.refining`, with a backend's name.
+        config: its settings, of `pop_fast.train.schedule`, with a backend's name.
         capture: the block's photographs.
         start: what it begins with.
         resume: continue from the latest checkpoint of `config.result_dir`, or start where there is none.
@@ -258,9 +258,6 @@ def write_round_block(
     drawn = draw.permutation(len(showing))[: len(had)]
     chosen = [shots[showing[index]] for index in sorted(drawn)] or had
     write_block(place, replace(own, shots=[*chosen, *(shot for shot in own.shots if shot.split == "test")]))
-
-
-__all__ = ["HoldingStepper", "hold_last"]
 
 
 def hold_last(engine: Engine, rows: Mapping[str, Tensor]) -> Engine:

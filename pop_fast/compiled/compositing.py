@@ -1,8 +1,11 @@
-"""Blend splats into an image by the compiled library, differentiably. Meaning: `pop_ref.compositing`.
+"""Views drawn by the compiled library, differentiably: covariances, projection, colours, lists, blend, and passes.
 
-Optimizations: in C++ (`forward.h`, `backward.h`), sixteen pixels at a time in float32, tiles shared out to threads;
-entries that lie under the alpha floor for all sixteen are passed over; what is kept for the transpose is the light of
-every pixel before every sixteenth entry.
+Meaning: `pop_ref.splatting`, `pop_ref.compositing`. The arithmetic of one Gaussian is the one that the CUDA kernels run
+(`cuda_ext/csrc/splatting.cuh`, `harmonics.cuh`). The blend (`forward.h`, `backward.h`) takes sixteen pixels at a time
+in float32, tiles shared out to threads; entries that lie under the alpha floor for all sixteen are passed over; what is
+kept for the transpose is the light of every pixel before every sixteenth entry. Sums over pixels (`scores.h`) have a
+row an entry of the tile lists, and the rows of a splat are added up in the order of the lists, so that no bit depends
+on the number of threads.
 """
 
 from __future__ import annotations
@@ -14,11 +17,43 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pop_fast.compiled.library import Blend, BlendBackward, Lists, call_library, this_library
-from pop_fast.stages.blend.blend import Stop, below
+from pop_fast.compiled.library import (
+    PROJECTION_CONSTANTS,
+    Blend,
+    BlendBackward,
+    Colors,
+    ColorsBackward,
+    Covariances,
+    CovariancesBackward,
+    Lists,
+    MomentScores,
+    PointScores,
+    Projection,
+    ProjectionBackward,
+    Scores,
+    SensitivityScores,
+    call_library,
+    this_library,
+)
+from pop_fast.stages.blend import Stop, below
 from pop_fast.stages.compositing import BlendOptions
 from pop_fast.stages.compositing import composite as composite_in_torch
+from pop_fast.stages.contributions import (
+    N_MOMENTS,
+    Contributions,
+    DominantPoints,
+    background_or_black,
+    check_grid,
+    checked_map,
+    points_on_rays,
+    three_channels,
+    towards_camera,
+)
+from pop_fast.stages.contributions import fisher_blocks as fisher_blocks_of_stages
+from pop_fast.stages.projection import intrinsics, view_dirs_vjp
+from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of
 from pop_fast.stages.tiles import TileLists, depth_order, grid_size, tile_rects
+from pop_fast.stages.types import Camera, Gaussians
 from pop_ref.constants import PAPER, Profile
 
 
@@ -160,3 +195,304 @@ def _lights(lists: TileLists, like: Tensor) -> dict[str, Tensor]:
 
 
 composite = partial(composite_in_torch, function=_Composite)
+
+
+def covariances(quats: Tensor, scales: Tensor) -> Tensor:
+    """See `pop_fast.stages.splatting.covariances`."""
+    return _Covariances.apply(quats, scales)
+
+
+def project(means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: ProjectionSettings) -> Splats:
+    """See `pop_fast.stages.splatting.project`; rows of culled Gaussians hold 0, but for depths and opacities.
+
+    Optimizations: one pass over the Gaussians forward and one backward, which compute everything in between anew.
+    """
+    return Splats(*_Projection.apply(means, covars, opacities, viewmat, view))
+
+
+def colors_of_view(sh: Tensor, means: Tensor, viewmat: Tensor, degree: int, visible: Tensor) -> Tensor:
+    """Evaluate harmonics for the visible Gaussians; zero for the others. [N, 3]
+
+    Optimizations: one pass over the coefficients forward and one backward (`colors.h`).
+
+    Args:
+        sh: coefficients. [N, n_sh, 3]
+        means: centres, world units. [N, 3]
+        viewmat: world -> camera. [4, 4]
+        degree: bands to use.
+        visible: rows to evaluate, ascending. [V] int64
+
+    Raises:
+        ValueError: `visible` is no list of rows.
+    """
+    if visible.dtype != torch.int64 or visible.dim() != 1:
+        shape = list(visible.shape)
+        raise ValueError(
+            f"visible is a tensor of {visible.dtype} and shape {shape}; it must hold the numbers of the rows to "
+            "evaluate, torch.int64 [V]; of a mask these are mask.nonzero().squeeze(1)"
+        )
+    if len(visible) and not (int(visible.min()) >= 0 and int(visible.max()) < len(sh)):
+        raise ValueError(f"visible names row {int(visible.min())} to {int(visible.max())}; there are {len(sh)}")
+    return _Colors.apply(sh, means, viewmat, degree, visible)
+
+
+class _Covariances(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, quats: Tensor, scales: Tensor) -> Tensor:
+        covars = quats.new_empty((len(quats), 3, 3))
+        given = {"quats": quats, "scales": scales, "covars": covars}
+        call_library(Covariances, quats.dtype, {"n": len(quats), "threads": torch.get_num_threads()}, given)
+        ctx.save_for_backward(quats, scales)
+        return covars
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_covars: Tensor) -> tuple[Tensor, Tensor]:
+        quats, scales = ctx.saved_tensors
+        v_quats, v_scales = quats.new_empty(quats.shape), scales.new_empty(scales.shape)
+        given = {"quats": quats, "scales": scales, "v_covars": v_covars, "v_quats": v_quats, "v_scales": v_scales}
+        call_library(CovariancesBackward, quats.dtype, {"n": len(quats), "threads": torch.get_num_threads()}, given)
+        return v_quats, v_scales
+
+
+class _Projection(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: ProjectionSettings
+    ) -> tuple[Tensor | None, ...]:
+        n = len(means)
+        results = {
+            "means2d": means.new_empty((n, 2)),
+            "depths": means.new_empty(n),
+            "conics": means.new_empty((n, 3)),
+            "effective_opacities": means.new_empty(n),
+            "radii": torch.empty((n, 2), dtype=torch.int32),
+            "factors": means.new_empty(n) if view.antialiased else None,
+        }
+        given = {"means": means, "covars": covars, "opacities": opacities, "viewmat": viewmat, "K": view.K}
+        call_library(Projection, means.dtype, _projection_numbers(n, view), {**given, **results})
+        ctx.view, ctx.radii = view, results["radii"]
+        ctx.save_for_backward(means, covars, opacities, viewmat)
+        ctx.mark_non_differentiable(results["radii"])
+        return tuple(results.values())
+
+    @staticmethod
+    @once_differentiable
+    def backward(
+        ctx: Any,
+        v_means2d: Tensor,
+        v_depths: Tensor,
+        v_conics: Tensor,
+        v_effective_opacities: Tensor,
+        _v_radii: None,
+        v_factors: Tensor | None,
+    ) -> tuple[Tensor | None, ...]:
+        means, covars, opacities, viewmat = ctx.saved_tensors
+        n_parts = -(-len(means) // this_library().rows_at_a_time)
+        found = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in (means, covars, opacities)]
+        v_viewmats = means.new_empty((n_parts, 3, 4)) if ctx.needs_input_grad[3] else None
+        given = {"means": means, "covars": covars, "opacities": opacities, "viewmat": viewmat, "K": ctx.view.K}
+        given |= {
+            "v_means2d": v_means2d.T,
+            "v_depths": v_depths,
+            "v_conics": v_conics.T,
+            "v_effective_opacities": v_effective_opacities,
+        }
+        given |= {"v_factors": v_factors, "radii": ctx.radii, "v_viewmats": v_viewmats}
+        given |= dict(zip(("v_means", "v_covars", "v_opacities"), found, strict=True))
+        call_library(ProjectionBackward, means.dtype, _projection_numbers(len(means), ctx.view), given)
+        if v_viewmats is None:
+            return (*found, None, None)
+        v_viewmat = torch.zeros_like(viewmat)
+        v_viewmat[:3] = v_viewmats.sum(0, dtype=torch.float64)
+        return (*found, v_viewmat, None)
+
+
+def _projection_numbers(n: int, view: ProjectionSettings) -> dict[str, float]:
+    constants = view.profile.as_numbers()
+    return {
+        **{name: constants[name] for name in (*PROJECTION_CONSTANTS, "tile_size")},
+        "antialiased": view.antialiased,
+        "radius_clip": view.radius_clip,
+        "width": view.width,
+        "height": view.height,
+        "n": n,
+        "threads": torch.get_num_threads(),
+    }
+
+
+class _Colors(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, sh: Tensor, means: Tensor, viewmat: Tensor, degree: int, visible: Tensor) -> Tensor:
+        colors = sh.new_empty((3, len(sh)))
+        given = {"sh": sh, "means": means, "viewmat": viewmat, "visible": visible, "colors": colors}
+        call_library(Colors, sh.dtype, _numbers(sh, degree, visible), given)
+        ctx.degree = degree
+        ctx.save_for_backward(sh, means, viewmat, visible)
+        return colors.T
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, v_colors: Tensor) -> tuple[Tensor | None, ...]:
+        sh, means, viewmat, visible = ctx.saved_tensors
+        v_sh, v_dirs = torch.empty_like(sh, memory_format=torch.contiguous_format), sh.new_empty((len(sh), 3))
+        given = {"sh": sh, "means": means, "viewmat": viewmat, "visible": visible}
+        given |= {"v_colors": v_colors, "v_sh": v_sh, "v_dirs": v_dirs}
+        call_library(ColorsBackward, sh.dtype, _numbers(sh, ctx.degree, visible), given)
+        if not ctx.needs_input_grad[2]:
+            return v_sh, v_dirs, None, None, None
+        _, v_viewmat = view_dirs_vjp(means.index_select(0, visible), viewmat, v_dirs.index_select(0, visible))
+        return v_sh, v_dirs, v_viewmat, None, None
+
+
+def _numbers(sh: Tensor, degree: int, visible: Tensor) -> dict[str, float]:
+    sizes = {"n": len(sh), "n_visible": len(visible), "n_sh": sh.shape[1]}
+    return {**sizes, "degree": degree, "threads": torch.get_num_threads()}
+
+
+def scored(
+    layout: type[Scores],
+    splats: Splats,
+    colors: Tensor,
+    lists: TileLists,
+    size: tuple[int, int],
+    profile: Profile,
+    numbers: dict[str, float],
+    **tensors: Tensor | None,
+) -> None:
+    """Call a function of `scores.h`.
+
+    Args:
+        layout: of its arguments, which tells the functions apart.
+        splats: what is blended.
+        colors: of any number of channels. [N, D]
+        lists: what each tile blends.
+        size: width and height, px.
+        profile: constants and strictness.
+        numbers: what else it takes of numbers.
+        tensors: what else it reads and, contiguous, writes.
+    """
+    inputs = tuple(t.contiguous() for t in (splats.means2d, splats.conics, splats.opacities, colors))
+    options = BlendOptions(lists, *size, profile, dominance=False, counts=False, keep=False, absgrad_sink=None)
+    names = ("means2d", "conics", "opacities", "colors")
+    given: dict[str, Tensor | None] = {
+        **dict(zip(names, inputs, strict=True)),
+        "ids": lists.ids,
+        "offsets": lists.offsets,
+        "n_reached": torch.empty_like(lists.lengths),
+        "splats": aligned_records(len(inputs[0]), this_library().splat_bytes),
+        **tensors,
+    }
+    call_library(layout, inputs[0].dtype, {**blend_numbers(inputs, options), **numbers}, given)
+
+
+def totals(
+    layout: type[Scores],
+    columns: int,
+    splats: Splats,
+    colors: Tensor,
+    lists: TileLists,
+    size: tuple[int, int],
+    profile: Profile,
+    **tensors: Tensor | None,
+) -> Tensor:
+    """Return what a function of `scores.h` sums up of every splat; see `scored`. [N, columns] float64"""
+    found = torch.empty((len(splats.means2d), columns), dtype=torch.float64)
+    rows = splats.means2d.new_empty((len(lists.ids), columns))
+    scored(layout, splats, colors, lists, size, profile, {}, rows=rows, totals=found, **tensors)
+    return found
+
+
+def dominant_points(
+    splats: Splats,
+    lists: TileLists,
+    gaussians: Gaussians,
+    camera: Camera,
+    tile_size: int,
+    profile: Profile = PAPER,
+) -> DominantPoints:
+    """See `pop_ref.chord.dominant_points`. A Gaussian with a scale of 0 does not compete.
+
+    Optimizations: those of `pop_fast.stages.contributions`; the walk through the lists is in C++ (`scores.h`).
+    """
+    width, height = camera.width, camera.height
+    check_grid(lists, width, height, tile_size)
+    like = splats.means2d
+    ids = torch.empty((height, width), dtype=torch.int64)
+    T_final = like.new_empty((height, width))
+    fx, fy, cx, cy = intrinsics(camera.K, width, height, profile)
+    rays = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+    facing = towards_camera(gaussians, camera).to(like.dtype)
+    results = {"dominant_ids": ids, "T_final": T_final}
+    colors = like.new_empty((len(like), 0))
+    scored(PointScores, splats, colors, lists, (width, height), profile, rays, facing=facing, **results)
+    return DominantPoints(points_on_rays(ids, gaussians, camera, profile).to(like.dtype), ids, T_final)
+
+
+def contributions(
+    splats: Splats,
+    lists: TileLists,
+    width: int,
+    height: int,
+    tile_size: int,
+    pixel_map: Tensor | None = None,
+    profile: Profile = PAPER,
+) -> Contributions:
+    """See `pop_ref.contributions.contributions`. Optimizations: one blend without colours, in C++ (`scores.h`)."""
+    check_grid(lists, width, height, tile_size)
+    colors = splats.means2d.new_empty((len(splats.means2d), 0))
+    pixel_map = checked_map(pixel_map, width, height, colors.dtype)
+    found = totals(Scores, 4, splats, colors, lists, (width, height), profile, pixel_map=pixel_map)
+    weight_sum, n_pixels, map_sum, distance_sum = found.T
+    return Contributions(weight_sum, n_pixels.to(torch.int64), map_sum, distance_sum)
+
+
+def sensitivities(
+    splats: Splats,
+    lists: TileLists,
+    width: int,
+    height: int,
+    tile_size: int,
+    background: Tensor | None = None,
+    profile: Profile = PAPER,
+) -> Tensor:
+    """See `pop_ref.sensitivity.sensitivities`. [N] float64
+
+    Optimizations: the sum of the channels is blended as one, in C++, there and back (`scores.h`).
+    """
+    check_grid(lists, width, height, tile_size)
+    colors = colors_of(splats)
+    behind = background_or_black(background, colors).sum(0, keepdim=True)
+    grey = colors.sum(1, keepdim=True)
+    found = totals(SensitivityScores, 1, splats, grey, lists, (width, height), profile, background=behind)
+    return found[:, 0] * splats.opacities.double().square()
+
+
+def screen_moments(
+    splats: Splats,
+    lists: TileLists,
+    width: int,
+    height: int,
+    tile_size: int,
+    background: Tensor | None = None,
+    profile: Profile = PAPER,
+) -> Tensor:
+    """See `pop_ref.fisher.screen_moments`. [N, 31] float64
+
+    Optimizations: those of `pop_fast.stages.contributions.screen_moments`, in C++, there and back (`scores.h`).
+
+    Raises:
+        ValueError: there are not three channels, or the lists are not of that grid.
+    """
+    check_grid(lists, width, height, tile_size)
+    colors = three_channels(splats)
+    behind = background_or_black(background, colors)
+    return totals(MomentScores, N_MOMENTS, splats, colors, lists, (width, height), profile, background=behind)
+
+
+def fisher_blocks(
+    gaussians: Gaussians, camera: Camera, moments: Tensor, sh_degree: int | None = None, profile: Profile = PAPER
+) -> Tensor:
+    """See `pop_ref.fisher.fisher_blocks`. [N, 6, 6] Optimizations: the compiled stages' transposes."""
+    chain = {"project": project, "colors_of_view": colors_of_view, "covariances": covariances}
+    return fisher_blocks_of_stages(gaussians, camera, moments, sh_degree, profile, **chain)

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.compiled.library import PROJECTION_CONSTANTS, Moments, call_library, stepper_functions, this_library
-from pop_fast.stages.blend.blend import Stop, below
+from pop_fast.stages.blend import Stop, below
 from pop_fast.stages.ssim import REACH, Padding, border_of, check_size, kept_windows
 from pop_fast.train.signals import Abandoned, StopRequest, heard
 from pop_fast.train.steps import Collected, Phase, StepSettings, StepStats

@@ -14,15 +14,14 @@ from cuda_ext.arrays import Settings, new_state
 from cuda_ext.render.autograd import Blend, Project, RenderStats
 from cuda_ext.render.lists import WARP_TILE, list_tile, make_lists, splat_struct
 from cuda_ext.render.scores import ScoredView
-from pop_fast.stages.chord import DominantPoints, points_on_rays, towards_camera
 from pop_fast.stages.compositing import Composite
-from pop_fast.stages.contributions import Contributions, fisher_blocks
+from pop_fast.stages.contributions import Contributions, DominantPoints, fisher_blocks, points_on_rays, towards_camera
 from pop_fast.stages.projection import intrinsics
 from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of
 from pop_fast.stages.stage_set import PassInput, Seen
 from pop_fast.stages.tiles import TileLists
 from pop_fast.stages.types import Camera, Gaussians
-from pop_fast.train.gpu_proxy import translate_oom
+from pop_fast.train.engines import translate_oom
 
 WIDEST = 4  # channels that one launch blends
 
@@ -52,7 +51,7 @@ class CudaStages:
     Optimizations: exact tile lists, two narrow stable sorts, one warp a 16 x 8 tile, moment-form gradients.
 
     Attributes:
-        backward, deterministic: as `pop_fast.cuda.backend.CudaBackend` says.
+        backward, deterministic: as `pop_fast.api.backends.CudaBackend` says.
     """
 
     backward: str
@@ -235,7 +234,7 @@ class CudaView:
         return blocks.to(moments.device)
 
     def dominant_points(self) -> DominantPoints:
-        """As `pop_fast.stages.chord.dominant_points`."""
+        """As `pop_fast.stages.contributions.dominant_points`."""
         pass_input = self._input
         c = pass_input.camera
         rays = intrinsics(c.K, c.width, c.height, pass_input.profile)

@@ -153,7 +153,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         """
         if not self.regularizes(step):
             return None
-        from pop_fast.stages.polarization import opacity_entropy
+        from pop_fast.stages.regularizers import opacity_entropy
 
         if isinstance(info, MutableMapping):
             info[_REGULARIZED] = True
@@ -163,7 +163,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         return sum(terms[1:], terms[0])
 
     def _prior(self, opacities: Tensor, state: State, info: Info) -> Tensor:
-        from pop_fast.stages.polarization import importance_mask, pop_loss
+        from pop_fast.stages.regularizers import importance_mask, pop_loss
 
         mask = importance_mask(dominant_counts(info).sum(0))
         if self.pop_views == "window" and state["dominant_sum"] is not None:

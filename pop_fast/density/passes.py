@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from pop_fast.api.registry import require_backend
+from pop_fast.api.backend import require_backend
 from pop_fast.errors import PopError
 from pop_fast.stages.compositing import dominant_counts
 from pop_fast.stages.contributions import Contributions

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.density.protocol import DensificationContext, Optimizers, Params, State
-from pop_fast.stages.density import Statistics, split_children
-from pop_fast.stages.selection import lowest_share
+from pop_fast.stages.density import Statistics, lowest_share, split_children
 from pop_ref.settings import SPLIT_CHILDREN
 
 

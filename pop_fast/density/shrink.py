@@ -11,7 +11,7 @@ from torch import Tensor
 from pop_fast.density.passes import Passes
 from pop_fast.errors import PopError
 from pop_fast.stages.covariance import opacities_from_logits
-from pop_fast.stages.selection import least_mass
+from pop_fast.stages.density import least_mass
 
 Score = Literal["contributions", "dominance", "sensitivity", "visibility"]
 # encodings that a search for a size makes, at most

@@ -1,4 +1,4 @@
-"""Blend splats into an image, differentiably, by `pop_fast.stages.blend.blend`, and count what each dominates (D8).
+"""Blend splats into an image, differentiably, by `pop_fast.stages.blend`, and count what each dominates (D8).
 
 Meaning: `pop_ref.compositing`, `pop_ref.dominance`.
 """
@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pop_fast.stages.blend.blend import Blender, GroupBlend
-from pop_fast.stages.blend.tile_groups import (
+from pop_fast.stages.blend import Blender, GroupBlend
+from pop_fast.stages.tile_groups import (
     BLOCK,
     Entries,
     PackedLists,
@@ -66,7 +66,7 @@ def composite(
 ) -> Composite:
     """Blend every tile's list front to back, over black. See `pop_ref.compositing.composite`.
 
-    Optimizations: see `pop_fast.stages.blend.blend`; what is kept for the transpose is the light of every pixel
+    Optimizations: see `pop_fast.stages.blend`; what is kept for the transpose is the light of every pixel
     before every eighth entry.
 
     Args:

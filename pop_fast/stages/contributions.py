@@ -1,20 +1,32 @@
-"""What every Gaussian counts for in a view: sums over the pixels where it is blended.
+"""What every Gaussian counts for in a view: sums over the pixels where it is blended, and which pixels are its own.
 
 `contributions` adds up weights, pixels and distances (`pop_ref.contributions`); `sensitivities`, Speedy-Splat's score,
 how much the pixels react to a Gaussian's value there (`pop_ref.sensitivity`); `fisher_blocks`, PUP-3DGS's score, how
-sharply the view determines its place and size (`pop_ref.fisher`).
+sharply the view determines its place and size (`pop_ref.fisher`); `dominant_points` are Mini-Splatting's, where a
+pixel's ray is closest to the Gaussian that it belongs to (`pop_ref.chord`).
+
+All go through the (splat, pixel) pairs of a blend, a step of `Blender` at a time (`PairWalk`). A tile-list entry holds
+one splat's pixels of one tile: a pass writes one row an entry, and the rows of a splat are added up in the order of the
+lists, in float64.
+
+Whether a Gaussian is densest ahead of the camera, t* >= 0, has the sign of -(a . b) with a = diag(1/s) R^T (o - mean)
+and b = diag(1/s) R^T d. So a pair needs g . d <= 0 only, with g = R diag(1/s) a made once a Gaussian; t* is computed
+for the winner of a pixel.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from pop_fast.stages.blend.pairs import EntryRows, Pairs, PairWalk, background_or_black, check_grid
+from pop_fast.stages.blend import Blender, acquired_buffers, release_buffer
+from pop_fast.stages.covariance import rotmats_from_quats
+from pop_fast.stages.projection import camera_center, intrinsics
 from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of, colors_of_view, covariances, project
+from pop_fast.stages.tile_groups import BLOCK, Entries, PackedLists, TileGroup, tile_groups
 from pop_fast.stages.tiles import TileLists
 from pop_fast.stages.types import Camera, Gaussians
 from pop_ref.constants import PAPER, Profile
@@ -246,3 +258,275 @@ def log_det_scores(blocks: Tensor) -> Tensor:
     full = values[:, -1] > 6.0 * torch.finfo(torch.float64).eps * values[:, 0]
     found = values[full].log().sum(1) + 2.0 * D[full].log().sum(1)
     return scores.index_copy_(0, rows[full], found)
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """One step: n tiles, K list entries of each, all P pixels of a tile. What it holds is gone with the next step.
+
+    Attributes:
+        tiles: [n]
+        rows: place of every entry in the packed lists. [n, K]
+        ids: splat of every entry, the number of splats for padding. [n, K]
+        coefficients: of the entries' exponents. [n K, 6]
+        colors: of the entries. [n, K, D]
+        alpha: 0 where an entry is not blended, and off the image. [n, K, P]
+        weight: T alpha. [n, K, P]
+        scratch: for whatever is computed from these. [n, K, P]
+    """
+
+    tiles: Tensor
+    rows: Tensor
+    ids: Tensor
+    coefficients: Tensor
+    colors: Tensor
+    alpha: Tensor
+    weight: Tensor
+    scratch: Tensor
+
+
+class PairWalk:
+    """Goes through the pairs of a view.
+
+    Args:
+        splats: with their colours.
+        lists: what each tile blends.
+        width: px.
+        height: px.
+        profile: constants and strictness.
+    """
+
+    def __init__(self, splats: Splats, lists: TileLists, width: int, height: int, profile: Profile) -> None:
+        colors = splats.means2d.new_empty((len(splats.means2d), 0)) if splats.colors is None else splats.colors
+        self.lists, self.size, self.n_splats = lists, (height, width), len(splats.means2d)
+        self.entries = Entries.of(splats.means2d, PackedLists.of(lists, self.n_splats))
+        self.blender = Blender.of(self.entries, splats.conics, splats.opacities, colors, profile)
+        self.groups = tile_groups(self.entries.lists)
+        self._inside = self.tiles_of(colors.new_ones((*self.size, 1)))[:, 0]
+
+    def front_to_back(self) -> Iterator[Pairs]:
+        """Yield the steps such that, in every tile, nearer entries come first."""
+        return self._walk(backwards=False)
+
+    def back_to_front(self) -> Iterator[Pairs]:
+        """Yield the steps such that, in every tile, farther entries come first; within a step the nearer do."""
+        return self._walk(backwards=True)
+
+    def color_dot_grads(self, background: Tensor) -> Iterator[tuple[Pairs, Tensor]]:
+        """Yield the steps back to front, with how far every splat's colour exceeds the light from behind it.
+
+        With B_m = background behind a pixel's last splat and B_{i-1} = alpha_i c_i + (1 - alpha_i) B_i, that is
+        c_i - B_i = dC/dalpha_i / T_i.
+
+        Args:
+            background: colour behind everything. [D]
+
+        Yields:
+            Pairs, and the differences. [D, n, K, P]
+        """
+        n_tiles, n_pixels = self._inside.shape
+        behind = background.to(self._inside.dtype)[:, None, None].expand(-1, n_tiles, n_pixels).clone()
+        for pairs in self.back_to_front():
+            passing = behind.index_select(1, pairs.tiles)
+            colors = pairs.colors.permute(2, 1, 0)[..., None]
+            color_dot_grad = behind.new_empty((len(behind), *pairs.alpha.shape))
+            for k in range(pairs.alpha.shape[1] - 1, -1, -1):
+                torch.sub(colors[:, k], passing, out=color_dot_grad[:, :, k])
+                passing.addcmul_(pairs.alpha[:, k], color_dot_grad[:, :, k])
+            behind.index_copy_(1, pairs.tiles, passing)
+            yield pairs, color_dot_grad
+
+    def _walk(self, backwards: bool) -> Iterator[Pairs]:
+        for group in self.groups:
+            blend = self.blender.blend(group)
+            with acquired_buffers(3, group.slab, self.blender.table.dtype) as scratch:
+                for step in reversed(blend.steps) if backwards else blend.steps:
+                    yield self._pairs(group, step.rows, step.blocks, self.blender.again(group, step, scratch))
+                    release_buffer(step.transmittance)
+
+    def _pairs(self, group: TileGroup, chosen: Tensor | None, blocks: Tensor, made: list[Tensor]) -> Pairs:
+        entries, alpha, weight, scratch = made
+        tiles = (group.tiles if chosen is None else group.tiles[chosen])[: len(blocks)]
+        inside = self._inside.index_select(0, tiles)[:, None]
+        rows = (BLOCK * blocks[:, :, None] + torch.arange(BLOCK)).view(len(blocks), -1)
+        coefficients = entries.view(-1, entries.shape[2])[:, :6]
+        ids = self.entries.lists.ids[rows]
+        return Pairs(
+            tiles, rows, ids, coefficients, entries[:, :, 6:-1], alpha.mul_(inside), weight.mul_(inside), scratch
+        )
+
+    def offsets(self, pairs: Pairs) -> tuple[Tensor, Tensor]:
+        """Return how far every splat's centre lies from every pixel's, along x and y, px. [n, K, P] each"""
+        basis = self.blender.basis
+        u, v = (t[pairs.rows].to(basis.dtype)[:, :, None] for t in (self.entries.u, self.entries.v))
+        return u - basis[1], v - basis[2]
+
+    def tiles_of(self, image: Tensor) -> Tensor:
+        """Cut an image [H, W, C] into tiles, zero off the image. [tiles, C, P]"""
+        (height, width), lists, channels = self.size, self.lists, image.shape[2]
+        size = lists.tile_size
+        whole = image.new_zeros((lists.tiles_y * size, lists.tiles_x * size, channels))
+        whole[:height, :width] = image
+        grid = whole.view(lists.tiles_y, size, lists.tiles_x, size, channels).permute(0, 2, 4, 1, 3)
+        return grid.reshape(lists.tiles_y * lists.tiles_x, channels, size * size)
+
+    def image_of(self, tiles: Tensor) -> Tensor:
+        """Put an image [H, W] together from its tiles [tiles, P]."""
+        (height, width), lists = self.size, self.lists
+        grid = tiles.view(lists.tiles_y, lists.tiles_x, lists.tile_size, lists.tile_size).transpose(1, 2)
+        return grid.reshape(lists.tiles_y * lists.tile_size, -1)[:height, :width]
+
+
+class EntryRows:
+    """One row of sums an entry, added up for every splat.
+
+    Args:
+        walk: whose entries they are.
+        columns: numbers in a row.
+    """
+
+    def __init__(self, walk: PairWalk, columns: int) -> None:
+        self._ids, self._n = walk.entries.lists.ids, walk.n_splats
+        self._columns = walk.blender.table.new_zeros((columns, len(self._ids)))
+
+    def put(self, pairs: Pairs, sums: list[Tensor]) -> None:
+        """Write down what a step's entries sum up, [n, K] each."""
+        rows = pairs.rows.reshape(-1)
+        for column, values in zip(self._columns, sums, strict=True):
+            column.index_copy_(0, rows, values.reshape(-1))
+
+    def totals(self) -> Tensor:
+        """Add up the rows of every splat. [N, columns] float64"""
+        totals = torch.zeros((len(self._columns), self._n + 1), dtype=torch.float64)
+        for total, column in zip(totals, self._columns, strict=True):
+            total.scatter_add_(0, self._ids, column.double())
+        return totals[:, :-1].T
+
+
+def background_or_black(background: Tensor | None, colors: Tensor) -> Tensor:
+    """Return the colour behind everything, black where none is given, in the precision of the colours. [D]
+
+    Raises:
+        ValueError: it has other channels than the colours.
+    """
+    behind = colors.new_zeros(colors.shape[1]) if background is None else background.to(colors.dtype)
+    if behind.shape != colors.shape[1:]:
+        raise ValueError(f"background has shape {list(behind.shape)}; it must be {list(colors.shape[1:])}, as a colour")
+    return behind
+
+
+def check_grid(lists: TileLists, width: int, height: int, tile_size: int) -> None:
+    """Make sure that lists are those of a grid.
+
+    Raises:
+        ValueError: they are not.
+    """
+    tiles = (-(-width // tile_size), -(-height // tile_size))
+    if (lists.tile_size, lists.tiles_x, lists.tiles_y) != (tile_size, *tiles):
+        raise ValueError(
+            f"the lists are of {lists.tiles_x} x {lists.tiles_y} tiles of {lists.tile_size} px; "
+            f"{width} x {height} px in tiles of {tile_size} px are {tiles[0]} x {tiles[1]}"
+        )
+
+
+@dataclass(frozen=True)
+class DominantPoints:
+    """See `pop_ref.chord.DominantPoints`.
+
+    Attributes:
+        points: on the rays, world units; 0 where no Gaussian competes. [H, W, 3]
+        ids: the Gaussian of each pixel, -1 where none competes. [H, W] int64
+        T_final: light that is left behind all that is blended. [H, W]
+    """
+
+    points: Tensor
+    ids: Tensor
+    T_final: Tensor
+
+
+def chord_midpoint(mean: Tensor, quat: Tensor, scale: Tensor, origin: Tensor, direction: Tensor) -> Tensor:
+    """See `pop_ref.chord.chord_midpoint`. Optimizations: any leading axes. [...]"""
+    a = _whitened(quat, scale, origin - mean)
+    b = _whitened(quat, scale, direction)
+    return -(a * b).sum(-1) / (b * b).sum(-1)
+
+
+def _whitened(quat: Tensor, scale: Tensor, vector: Tensor) -> Tensor:
+    """Return diag(1/s) R^T v. [..., 3]"""
+    R = rotmats_from_quats(quat.reshape(-1, 4)).reshape(*quat.shape[:-1], 3, 3)
+    return (R * vector[..., :, None]).sum(-2) / scale
+
+
+def dominant_points(
+    splats: Splats,
+    lists: TileLists,
+    gaussians: Gaussians,
+    camera: Camera,
+    tile_size: int,
+    profile: Profile = PAPER,
+) -> DominantPoints:
+    """See `pop_ref.chord.dominant_points`. A Gaussian with a scale of 0 does not compete.
+
+    Optimizations: see the module's text; a group of tiles and a block of list entries at a time (`pairs`).
+    """
+    check_grid(lists, camera.width, camera.height, tile_size)
+    walk = PairWalk(splats, lists, camera.width, camera.height, profile)
+    dtype = splats.means2d.dtype
+    facing = torch.cat((towards_camera(gaussians, camera), torch.zeros((1, 3), dtype=torch.float64))).to(dtype)
+    directions = walk.tiles_of(ray_directions(camera, profile).to(dtype))
+    best, T = directions.new_zeros(len(directions), directions.shape[2]), directions.new_ones(directions[:, 0].shape)
+    ids = torch.full(best.shape, -1)
+    for pairs in walk.front_to_back():
+        torch.bmm(facing[pairs.ids], directions.index_select(0, pairs.tiles), out=pairs.scratch)
+        competing = pairs.scratch.le_(0.0).mul_(pairs.weight)
+        largest, place = competing.max(1)
+        before = best.index_select(0, pairs.tiles)
+        # strictly larger: on equal weights the entry in front keeps the pixel (D8)
+        wins = largest > before
+        best.index_copy_(0, pairs.tiles, torch.where(wins, largest, before))
+        winners = pairs.ids.gather(1, place)
+        ids.index_copy_(0, pairs.tiles, torch.where(wins, winners, ids.index_select(0, pairs.tiles)))
+        T.index_copy_(0, pairs.tiles, T.index_select(0, pairs.tiles) * (1.0 - pairs.alpha).prod(1))
+    winner = walk.image_of(ids)
+    return DominantPoints(points_on_rays(winner, gaussians, camera, profile).to(dtype), winner, walk.image_of(T))
+
+
+def towards_camera(gaussians: Gaussians, camera: Camera) -> Tensor:
+    """Return g in the camera's axes: t* of a ray d has the sign of -(g . d), nan where a scale is 0. [N, 3] float64"""
+    means, quats, scales = (t.double() for t in (gaussians.means, gaussians.quats, gaussians.scales))
+    viewmat = camera.viewmat.double()
+    a = _whitened(quats, scales, camera_center(viewmat) - means)
+    g = (rotmats_from_quats(quats) * (a / scales)[:, None, :]).sum(2)
+    flat = (scales == 0.0).any(1, keepdim=True)
+    return (g @ viewmat[:3, :3].T).masked_fill(flat, torch.nan)
+
+
+def ray_directions(camera: Camera, profile: Profile) -> Tensor:
+    """Return where the rays through the pixels' centres point, in the camera's axes, z being 1. [H, W, 3] float64"""
+    fx, fy, cx, cy = intrinsics(camera.K, camera.width, camera.height, profile)
+    like = {"dtype": torch.float64, "device": camera.K.device}
+    x = (torch.arange(camera.width, **like) + (0.5 - cx)) / fx
+    y = (torch.arange(camera.height, **like) + (0.5 - cy)) / fy
+    across, down = torch.meshgrid(x, y, indexing="xy")
+    return torch.stack((across, down, torch.ones_like(down)), 2)
+
+
+def points_on_rays(ids: Tensor, gaussians: Gaussians, camera: Camera, profile: Profile) -> Tensor:
+    """Return the point at t* of each pixel's Gaussian, 0 where the pixel has none. [H, W, 3] float64
+
+    Args:
+        ids: -1 for none. [H, W]
+        gaussians: in the world.
+        camera: the view.
+        profile: which principal point is used.
+    """
+    viewmat = camera.viewmat.double()
+    found = ids >= 0
+    chosen = ids[found]
+    directions = torch.nn.functional.normalize(ray_directions(camera, profile)[found], dim=1) @ viewmat[:3, :3]
+    means, quats, scales = (t.double()[chosen] for t in (gaussians.means, gaussians.quats, gaussians.scales))
+    origin = camera_center(viewmat)
+    t = chord_midpoint(means, quats, scales, origin, directions)
+    points = viewmat.new_zeros((*ids.shape, 3))
+    points[found] = origin + t[:, None] * directions
+    return points

@@ -14,9 +14,16 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from pop_fast.stages.chord import DominantPoints, dominant_points
 from pop_fast.stages.compositing import Composite, composite
-from pop_fast.stages.contributions import Contributions, contributions, fisher_blocks, screen_moments, sensitivities
+from pop_fast.stages.contributions import (
+    Contributions,
+    DominantPoints,
+    contributions,
+    dominant_points,
+    fisher_blocks,
+    screen_moments,
+    sensitivities,
+)
 from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of, colors_of_view, covariances, project
 from pop_fast.stages.tiles import TileLists, tile_lists
 from pop_fast.stages.types import Camera, Gaussians
@@ -81,7 +88,7 @@ class ViewPass(Protocol):
         ...
 
     def dominant_points(self) -> DominantPoints:
-        """As `pop_fast.stages.chord.dominant_points`."""
+        """As `pop_fast.stages.contributions.dominant_points`."""
         ...
 
 
@@ -121,7 +128,7 @@ class Stages:
         contributions: as `pop_fast.stages.contributions.contributions`.
         sensitivities: as `pop_fast.stages.contributions.sensitivities`.
         screen_moments: as `pop_fast.stages.contributions.screen_moments`.
-        dominant_points: as `pop_fast.stages.chord.dominant_points`.
+        dominant_points: as `pop_fast.stages.contributions.dominant_points`.
     """
 
     covariances: Callable[..., Tensor] = covariances
@@ -254,7 +261,7 @@ class StagesView:
         return fisher_blocks(shot.gaussians, shot.camera, self._moments(), shot.sh_degree, shot.profile, **chain)
 
     def dominant_points(self) -> DominantPoints:
-        """As `pop_fast.stages.chord.dominant_points`."""
+        """As `pop_fast.stages.contributions.dominant_points`."""
         shot, size = self.shot, self.lists.tile_size
         return self.stages.dominant_points(self.splats, self.lists, shot.gaussians, shot.camera, size, shot.profile)
 

@@ -39,7 +39,7 @@ class Appearance:
         self._viewmats = torch.cat([view.viewmat for view in views])
 
     def _photo(self, index: int) -> int:
-        # the same photograph shrunk is as many places further on; see `pop_fast.train.coarse`
+        # the same photograph shrunk is as many places further on; see `pop_fast.train.views`
         return index % len(self._viewmats)
 
     def seen_from(self, view: ViewTensors, index: int) -> ViewTensors:

@@ -8,8 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pop_fast.api.backend import Backend
-from pop_fast.api.registry import by_speed, get_backend
+from pop_fast.api.backend import Backend, by_speed, get_backend
 from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.steps import why_not_trained

@@ -24,12 +24,11 @@ from torch import Tensor
 from pop_fast.density import shrink
 from pop_fast.density.passes import Passes
 from pop_fast.stages.harmonics import lower_degree
+from pop_fast.train.engines import renderer
 from pop_fast.train.environment import reproducible
 from pop_fast.train.evaluate import evaluate
-from pop_fast.train.gpu_proxy import renderer
 from pop_fast.train.presets import QUICK_RATES
-from pop_fast.train.refining import refining
-from pop_fast.train.schedule import segment_end
+from pop_fast.train.schedule import refining, segment_end
 from pop_fast.train.training_run import TrainingRun
 from pop_fast.train.views import ViewTensors, evenly, render_view
 from pop_ref.settings import LearningRates

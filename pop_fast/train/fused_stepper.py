@@ -66,7 +66,7 @@ MakeFused = Callable[[Rows, Rows, Rows, Sequence[ViewTensors], Sequence[int], St
 
 @dataclass
 class FusedStepper:
-    """Takes steps by `make`, of `batch_size` views where that knows them; see `Stepper` and `batch_stepper`.
+    """Takes steps by `make`, of `batch_size` views where that knows them; see `Stepper` and `BatchStepper`.
 
     Args:
         task: what is trained; its settings are known to the step.

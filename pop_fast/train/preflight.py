@@ -8,9 +8,9 @@ from typing import Any, Final
 
 from torch import Tensor
 
+from pop_fast.api.backends import FAST
 from pop_fast.api.checks import Checks
 from pop_fast.errors import PopError
-from pop_fast.stages.backend import FAST
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.evaluate import too_small
 from pop_fast.train.model import first_unusable

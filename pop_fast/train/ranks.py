@@ -20,8 +20,6 @@ from torch import Tensor
 
 from pop_fast.errors import PopError
 
-__all__ = ["ALONE", "Ranks", "TorchRanks", "join", "local_rank"]
-
 T = TypeVar("T")
 
 # what torchrun, and other launchers after it, tell a process of itself

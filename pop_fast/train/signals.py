@@ -15,8 +15,6 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any, TypeVar
 
-__all__ = ["Abandoned", "StopRequest", "heard", "stop_requests"]
-
 T = TypeVar("T")
 
 

@@ -12,8 +12,7 @@ from torch.optim import Adam
 
 from pop_fast.api.backend import Renderer
 from pop_fast.density.control import DensityControl
-from pop_fast.density.foreign import ForeignStrategy
-from pop_fast.density.protocol import State
+from pop_fast.density.protocol import ForeignStrategy, State
 from pop_fast.train.appearance import Appearance
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.ranks import ALONE, Ranks

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from pop_fast import compiled
 from pop_fast.compiled import losses as compiled_losses
 from pop_fast.stages import losses, ssim
-from pop_fast.stages.polarization import importance_mask, pop_loss, pop_loss_vjp
+from pop_fast.stages.regularizers import importance_mask, pop_loss, pop_loss_vjp
 from pop_ref import losses as oracle_losses
 from pop_ref import polarization as oracle
 from pop_ref import ssim as oracle_ssim

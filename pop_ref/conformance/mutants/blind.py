@@ -190,7 +190,7 @@ _PROGRAM: Final = (
     (
         "prunes_once_less",
         "the last of the steps that prune does not",
-        "density/taming.py",
+        "density/methods.py",
         "nth > self.sampled_prunes",
         "nth >= self.sampled_prunes",
         "test_strategies:a_training_by_taming_is_the_oracles_at_every_step",
@@ -198,7 +198,7 @@ _PROGRAM: Final = (
     (
         "nth_from_step_zero",
         "densification steps are numbered from step 0",
-        "density/taming.py",
+        "density/methods.py",
         "return (step - self.refine_start_iter) // self.refine_every",
         "return step // self.refine_every",
         "test_strategies:a_training_by_taming_is_the_oracles_at_every_step",

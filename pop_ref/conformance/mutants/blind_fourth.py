@@ -217,7 +217,7 @@ _PROGRAM: Final = (
     (
         "absolute_gradient_of_circles",
         "absolute gradients along y take a splat to be as wide as it is high",
-        "stages/blend/blend.py",
+        "stages/blend.py",
         "2.0 * rows[:, 5], zero",
         "2.0 * rows[:, 3], zero",
         "test_agreement:gradients_are_the_oracles",
@@ -225,7 +225,7 @@ _PROGRAM: Final = (
     (
         "ceiling_passes_the_clamped_alpha",
         "where the ceiling lets gradients through, they carry the clamped alpha in place of the raw one",
-        "stages/blend/blend.py",
+        "stages/blend.py",
         "(raw / ceiling).clamp_min_(1.0)",
         "(raw / ceiling).clamp_(1.0, 1.0)",
         "test_agreement:gradients_under_inrias_ceiling_pass_through_it_as_the_oracles_do",
@@ -281,7 +281,7 @@ _PROGRAM: Final = (
     (
         "every_view_has_the_whole_budget",
         "Mini-Splatting draws as many points from each view as all views together may give",
-        "density/mini_splatting.py",
+        "density/methods.py",
         "samples_per_view(views.n_views, width, height, self.reinit_points)",
         "samples_per_view(1, width, height, self.reinit_points)",
         "test_strategies:a_training_by_mini_splatting_is_the_oracles_at_every_step",
@@ -289,7 +289,7 @@ _PROGRAM: Final = (
     (
         "scored_by_the_first_views",
         "of more views than Taming scores by, it takes the first ones every time, not a draw",
-        "density/taming.py",
+        "density/methods.py",
         "torch.argsort(context.draws.uniforms(views.n_views))[: self.score_views]",
         "torch.argsort(context.draws.uniforms(views.n_views)).sort().values[: self.score_views]",
         "test_strategies:a_training_by_taming_is_the_oracles_at_every_step",
@@ -305,7 +305,7 @@ _PROGRAM: Final = (
     (
         "sizes_of_the_first_of_a_batch",
         "all views of a batch are collected with the size and the kept pixels of its first view",
-        "train/batch_stepper.py",
+        "train/torch_stepper.py",
         "view = self._task.views[index]\n",
         "view = self._task.views[indices[0]]\n",
         "test_collected:views_of_one_step_are_collected_at_their_own_sizes",
@@ -321,7 +321,7 @@ _PROGRAM: Final = (
     (
         "one_unit_deep_behind",
         "a background given beside a depth channel lies at depth 1",
-        "api/frame.py",
+        "api/rasterize.py",
         "flat.new_zeros((len(images), 1))",
         "flat.new_ones((len(images), 1))",
         "test_signature_depth:the_accumulated_depth_is_the_oracles_alone_and_behind_colours",
@@ -329,7 +329,7 @@ _PROGRAM: Final = (
     (
         "shrunk_sizes_rounded_down",
         "shrunk photographs have sizes rounded down, as seen where a size is no multiple of the factor",
-        "train/coarse.py",
+        "train/views.py",
         "round(view.height / factor), round(view.width / factor)",
         "view.height // factor, view.width // factor",
         "test_coarse:a_coarse_photograph_is_the_mean_over_areas_of_the_whole_one",

@@ -234,7 +234,7 @@ _PROGRAM: Final = (
     (
         "parabola_a_post_too_long",
         "the budget's parabola has as many steps as fence posts, one too many",
-        "density/taming.py",
+        "density/methods.py",
         "(self.refine_stop_iter - self.refine_start_iter) // self.refine_every",
         "(self.refine_stop_iter - self.refine_start_iter) // self.refine_every + 1",
         "test_strategies:a_training_by_taming_is_the_oracles_at_every_step",
@@ -242,7 +242,7 @@ _PROGRAM: Final = (
     (
         "pruning_takes_the_resets_place",
         "a step of Speedy-Splat that prunes by sensitivity does not reset opacities",
-        "density/speedy_splat.py",
+        "density/methods.py",
         "return self.reset(context, done)",
         "return done if share > 0.0 else self.reset(context, done)",
         "test_strategies:a_training_by_speedy_splat_is_the_oracles_at_every_step",
@@ -306,7 +306,7 @@ _PROGRAM: Final = (
     (
         "rows_counted_by_entries",
         "flatten_ids of later images begin after as many rows as there are entries before",
-        "api/meta.py",
+        "api/rasterize.py",
         "row += len(depth)",
         "row += len(found.ids)",
         "test_signature_meta:the_tile_lists_that_meta_shows_run_front_to_back_and_hold_who_is_blended",
@@ -314,7 +314,7 @@ _PROGRAM: Final = (
     (
         "written_and_computed_all_the_same",
         "what a caller writes into meta before it is computed is overwritten when it is read",
-        "api/meta.py",
+        "api/rasterize.py",
         "        self._pending.pop(key, None)\n        self._values[key] = value",
         "        self._values[key] = value",
         "test_collected:what_a_strategy_writes_into_meta_stays_whether_it_was_read_before_or_not",
@@ -322,9 +322,9 @@ _PROGRAM: Final = (
     (
         "pruned_importance_keeps_momentum",
         "Mini-Splatting's prune by importance goes on with Adam's moments",
-        "density/mini_splatting.py",
-        "        restart(context.params, context.optimizers)\n        return DensificationStep(pruned=pruned)",
-        "        return DensificationStep(pruned=pruned)",
+        "density/methods.py",
+        '"means"].device))\n        restart(context.params, context.optimizers)\n',
+        '"means"].device))\n',
         "test_strategies:a_training_by_mini_splatting_is_the_oracles_at_every_step",
     ),
 )

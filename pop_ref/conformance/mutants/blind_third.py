@@ -187,7 +187,7 @@ _PROGRAM: Final = (
     (
         "budget_of_the_present",
         "Taming's budget multiplies the number of Gaussians now, not that at the start",
-        "density/taming.py",
+        "density/methods.py",
         'self.target(context.state["first_count"])',
         "self.target(len(context))",
         "test_strategies:a_training_by_taming_is_the_oracles_at_every_step",
@@ -195,7 +195,7 @@ _PROGRAM: Final = (
     (
         "dominant_in_the_last_view",
         "Mini-Splatting's importance is 0 for what dominates no pixel of the last view",
-        "density/mini_splatting.py",
+        "density/methods.py",
         "dominant_sum += found.dominant_counts.cpu()",
         "dominant_sum = found.dominant_counts.cpu()",
         "test_strategies:a_training_by_mini_splatting_is_the_oracles_at_every_step",
@@ -203,7 +203,7 @@ _PROGRAM: Final = (
     (
         "pruned_in_place_of_grown",
         "Speedy-Splat does not densify at steps at which it prunes by sensitivity",
-        "density/speedy_splat.py",
+        "density/methods.py",
         "if self.is_refine_step(context.step) else DensificationStep()",
         "if self.is_refine_step(context.step) and not self.needs_passes(context.step) else DensificationStep()",
         "test_strategies:a_training_by_speedy_splat_is_the_oracles_at_every_step",
@@ -219,7 +219,7 @@ _PROGRAM: Final = (
     (
         "opacities_of_another_scene",
         "opacities go round by image, not by scene",
-        "api/frame.py",
+        "api/rasterize.py",
         "opacities[i // n]",
         "opacities[i % len(opacities)]",
         "test_signature_cameras:batch_entries_do_not_know_of_each_other",

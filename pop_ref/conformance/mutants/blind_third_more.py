@@ -67,7 +67,7 @@ _PROGRAM: Final = (
     (
         "first_share_again",
         "every round of PUP prunes the first round's share",
-        "density/pup.py",
+        "density/methods.py",
         "self.prune_shares[self.adam_restarts.index(context.step)]",
         "self.prune_shares[0]",
         "test_strategies:a_training_by_pup_is_the_oracles_at_every_step",
@@ -75,7 +75,7 @@ _PROGRAM: Final = (
     (
         "points_from_masked_pixels",
         "Mini-Splatting draws points from pixels that the mask leaves out",
-        "density/mini_splatting.py",
+        "density/methods.py",
         "shown = ids >= 0 if mask is None else (ids >= 0) & mask.to(ids.device)",
         "shown = ids >= 0",
         "test_strategies:a_training_by_mini_splatting_is_the_oracles_at_every_step",

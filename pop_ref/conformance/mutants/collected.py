@@ -56,7 +56,7 @@ _LINES: Final = (
     (
         "gradients_of_the_mean_over_views",
         "screen gradients are those of the mean over the views of a step, and thresholds depend on how many these are",
-        "train/batch_stepper.py",
+        "train/torch_stepper.py",
         "means2d.absgrad if strategy.absgrad else means2d.grad",
         "means2d.grad / self._task.config.batch_size",
         BATCH,
@@ -64,7 +64,7 @@ _LINES: Final = (
     (
         "last_view_of_the_step",
         "of the views of a step the last one alone is collected",
-        "train/batch_stepper.py",
+        "train/torch_stepper.py",
         "for place, index in enumerate(indices):",
         "for place, index in list(enumerate(indices))[-1:]:",
         BATCH,

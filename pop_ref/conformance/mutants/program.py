@@ -230,7 +230,7 @@ _LINES: Final = (
     (
         "sums_without_absolute_ones",
         "where no absolute gradients are asked for, as 3DGS trains, the exponent's moments change places",
-        "stages/blend/blend.py",
+        "stages/blend.py",
         "rows[:, :6] = torch.mm(self.basis, pairs.T)",
         "rows[:, :6] = torch.mm(self.basis if absolute else self.basis[[0, 2, 1, 3, 4, 5]], pairs.T)",
         ASKED,
@@ -238,7 +238,7 @@ _LINES: Final = (
     (
         "lists_of_thirty_two",
         "a tile blends the first 32 entries of its list",
-        "stages/blend/tile_groups.py",
+        "stages/tile_groups.py",
         "torch.arange(int(n_blocks[0]))",
         "torch.arange(min(int(n_blocks[0]), 4))",
         "test_scale:the_image_of_fifty_is_the_oracles",
@@ -246,7 +246,7 @@ _LINES: Final = (
     (
         "lists_of_256",
         "a tile blends the first 256 entries of its list: nobody sees it in small scenes",
-        "stages/blend/tile_groups.py",
+        "stages/tile_groups.py",
         "torch.arange(int(n_blocks[0]))",
         "torch.arange(min(int(n_blocks[0]), 32))",
         "test_scale:the_image_of_hundreds_in_a_tile_is_the_oracles",
@@ -254,7 +254,7 @@ _LINES: Final = (
     (
         "lists_of_1024",
         "a tile blends the first 1,024 entries of its list",
-        "stages/blend/tile_groups.py",
+        "stages/tile_groups.py",
         "torch.arange(int(n_blocks[0]))",
         "torch.arange(min(int(n_blocks[0]), 128))",
         "test_scale:the_image_of_a_thousand_in_a_tile_is_the_oracles",
@@ -422,7 +422,7 @@ _LINES: Final = (
     (
         "opacities_set_anew_as_logits",
         "Mini-Splatting's new points have the activated opacity as a logit",
-        "density/mini_splatting.py",
+        "density/methods.py",
         "torch.logit(points.new_full((n,), opacity))",
         "points.new_full((n,), opacity)",
         OF_MINI,
@@ -430,7 +430,7 @@ _LINES: Final = (
     (
         "all_candidates_of_taming_go",
         "Taming-3DGS prunes all that 3DGS would",
-        "density/taming.py",
+        "density/methods.py",
         "mask & _drawn_to_go(mask, weights, context)",
         "mask",
         OF_TAMING,
@@ -438,7 +438,7 @@ _LINES: Final = (
     (
         "pup_first_share_twice",
         "both rounds of PUP-3DGS remove the first share",
-        "density/pup.py",
+        "density/methods.py",
         "share = self.prune_shares[self.adam_restarts.index(context.step)]",
         "share = self.prune_shares[0]",
         OF_PUP,

@@ -166,7 +166,7 @@ _LINES: Final = (
     (
         "keys_with_as_few_bits_as_tiles",
         "a key's tile has a bit less where the number of tiles is a power of two (log2 rounded up in gsplat's ports)",
-        "api/meta.py",
+        "api/rasterize.py",
         "math.floor(math.log2(lists.tiles_x * lists.tiles_y)) + 1",
         "math.ceil(math.log2(lists.tiles_x * lists.tiles_y))",
         "test_signature_pairs:every_pair_of_arguments_lists_tiles_front_to_back",
@@ -174,7 +174,7 @@ _LINES: Final = (
     (
         "offsets_begin_anew",
         "every camera's tile offsets begin at 0 (as an index of another camera in gsplat#806)",
-        "api/meta.py",
+        "api/rasterize.py",
         "offsets.append((found.offsets[:-1] + before).to(torch.int32))",
         "offsets.append(found.offsets[:-1].to(torch.int32))",
         "test_signature_meta:the_tile_lists_that_meta_shows_run_front_to_back_and_hold_who_is_blended",

@@ -238,7 +238,7 @@ _LINES: Final = (
     (
         "budget_from_the_current_count",
         "Taming-3DGS's parabola begins at the present number of Gaussians",
-        "density/taming.py",
+        "density/methods.py",
         'self.n_densifications, context.state["first_count"], self',
         "self.n_densifications, len(context), self",
         "test_strategies:a_training_by_taming_is_the_oracles_at_every_step",
@@ -246,7 +246,7 @@ _LINES: Final = (
     (
         "colours_not_as_harmonics",
         "Mini-Splatting's new points have colours for coefficients",
-        "density/mini_splatting.py",
+        "density/methods.py",
         "(torch.cat(colors) - 0.5) / SH_C0",
         "torch.cat(colors)",
         "test_strategies:a_training_by_mini_splatting_is_the_oracles_at_every_step",
@@ -254,7 +254,7 @@ _LINES: Final = (
     (
         "fisher_at_full_size",
         "PUP-3DGS's scores are taken at full size",
-        "density/pup.py",
+        "density/methods.py",
         "context.sh_degree, divisor)",
         "context.sh_degree, 1)",
         "test_strategies:a_training_by_pup_is_the_oracles_at_every_step",
@@ -262,7 +262,7 @@ _LINES: Final = (
     (
         "hard_share_is_soft",
         "Speedy-Splat's hard pruning takes the soft share",
-        "density/speedy_splat.py",
+        "density/methods.py",
         "return self.hard_prune_share if",
         "return self.soft_prune_share if",
         "test_strategies:a_training_by_speedy_splat_is_the_oracles_at_every_step",
@@ -318,7 +318,7 @@ _LINES: Final = (
     (
         "absolute_gradients_are_zero",
         "absolute gradients are never written (FastGS#35)",
-        "api/frame.py",
+        "api/rasterize.py",
         "absgrad_sink=image.absgrad,",
         "absgrad_sink=None,",
         "test_agreement:gradients_are_the_oracles",

@@ -234,7 +234,7 @@ _PROGRAM: Final = (
     (
         "loss_of_the_first_view",
         "of several views of a step the loss of the first one is told",
-        "train/batch_stepper.py",
+        "train/torch_stepper.py",
         "StepStats(*(sum(column) / len(rows) for column in",
         "StepStats(*(column[0] for column in",
         BATCH,
@@ -242,7 +242,7 @@ _PROGRAM: Final = (
     (
         "sum_over_views",
         "the gradients of the views of a step are added up and not divided: rates depend on the batch",
-        "train/batch_stepper.py",
+        "train/torch_stepper.py",
         "ranks.total(gradients()).div_(size)",
         "ranks.total(gradients())",
         BATCH,
@@ -314,7 +314,7 @@ _PROGRAM: Final = (
     (
         "nearest_pixel",
         "a coarse photograph takes one pixel of each block",
-        "train/coarse.py",
+        "train/views.py",
         "interpolation=cv2.INTER_AREA",
         "interpolation=cv2.INTER_NEAREST",
         SMALL,
@@ -322,7 +322,7 @@ _PROGRAM: Final = (
     (
         "interpolated_pixels",
         "a coarse photograph is interpolated between four pixels, which leaves out the others of an area",
-        "train/coarse.py",
+        "train/views.py",
         "interpolation=cv2.INTER_AREA",
         "interpolation=cv2.INTER_LINEAR",
         SMALL,
@@ -330,7 +330,7 @@ _PROGRAM: Final = (
     (
         "camera_of_the_whole_photograph",
         "the intrinsics of a coarse view keep their rows of y (a size that is not that of the image: nerfstudio #2897)",
-        "train/coarse.py",
+        "train/views.py",
         "    K[:, 1] *= height / view.height\n",
         "",
         CAMERA,
@@ -338,7 +338,7 @@ _PROGRAM: Final = (
     (
         "intrinsics_by_the_factor",
         "intrinsics are divided by the factor, and sizes are rounded (sizes that disagree: nerfstudio #3232)",
-        "train/coarse.py",
+        "train/views.py",
         "K[:, 0] *= width / view.width",
         "K[:, 0] *= 1.0 / factor",
         CAMERA,
@@ -346,7 +346,7 @@ _PROGRAM: Final = (
     (
         "centre_of_half_a_pixel",
         "the principal point is scaled as if the centre of the first pixel were (0, 0)",
-        "train/coarse.py",
+        "train/views.py",
         "    mask = None if view.mask is None else small(view.mask.float()) >= 0.5",
         "    K[:, :2, 2] += 0.5 * (width / view.width - 1.0)\n"
         "    mask = None if view.mask is None else small(view.mask.float()) >= 0.5",
@@ -355,7 +355,7 @@ _PROGRAM: Final = (
     (
         "any_pixel_of_the_mask",
         "a coarse pixel counts where any pixel of its area does (masks and num_downscales: nerfstudio #2920)",
-        "train/coarse.py",
+        "train/views.py",
         "small(view.mask.float()) >= 0.5",
         "small(view.mask.float()) > 0.0",
         MASKS,
@@ -363,7 +363,7 @@ _PROGRAM: Final = (
     (
         "coarse_a_step_too_long",
         "a stop is the last step of its size, not the first of the next",
-        "train/coarse.py",
+        "train/views.py",
         "sum(step < stop for stop in stops)",
         "sum(step <= stop for stop in stops)",
         SIZES,
@@ -371,7 +371,7 @@ _PROGRAM: Final = (
     (
         "sizes_by_view",
         "shrunk views are listed view by view and looked up size by size",
-        "train/coarse.py",
+        "train/views.py",
         "[shrunk(view, 2**level) for level in range(len(stops) + 1) for view in views]",
         "[shrunk(view, 2**level) for view in views for level in range(len(stops) + 1)]",
         SIZES,
@@ -379,7 +379,7 @@ _PROGRAM: Final = (
     (
         "stops_count_views",
         "where a step has several views, stops count views (a schedule by epochs: stable-dreamfusion #29)",
-        "train/coarse.py",
+        "train/views.py",
         "index_at(place // size, index, len(views), stops)",
         "index_at(place, index, len(views), stops)",
         SIZES,
@@ -387,7 +387,7 @@ _PROGRAM: Final = (
     (
         "smallest_side_of_the_whole",
         "a photograph is shrunk as long as its own side is large enough: windows of SSIM leave the coarse one",
-        "train/coarse.py",
+        "train/views.py",
         "min(view.height, view.width) < SMALLEST_SIDE * factor",
         "min(view.height, view.width) < SMALLEST_SIDE",
         SIZES,

@@ -1,6 +1,7 @@
 """Front-to-back blending of a group of tiles with early ray termination, and its transpose.
 
 Meaning: `pop_ref.compositing`.
+
 One step of the blend takes a group of tiles, K list entries and all pixels of a tile, in this order:
 
     alpha = 2^(coefficients @ basis), 0 under the floor (D5), the ceiling at most (D6)
@@ -17,13 +18,14 @@ number per pixel, B, the light from behind dotted with the pixel's gradient:
     q[k] = colour[k] . v_image - B;  B += alpha[k] q[k];  G[k] = weight[k] q[k]
 
 G = alpha dL/dalpha; its six moments over a tile's pixels give every geometric gradient (`splat_gradients`).
-There is no division by 1 - alpha.
+There is no division by 1 - alpha. Buffers are used again: fresh pages cost more than the arithmetic that fills them.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Final
@@ -31,8 +33,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from pop_fast.stages.blend import buffers
-from pop_fast.stages.blend.tile_groups import BLOCK, Entries, TileGroup, exponent_coefficients, pixel_basis
+from pop_fast.stages.tile_groups import BLOCK, Entries, TileGroup, exponent_coefficients, pixel_basis
 from pop_ref.constants import Profile
 
 EIGHT: Final = 8  # entries whose comparisons of weights make one number
@@ -257,7 +258,7 @@ class Blender:
         dominant = Dominance(self.table.dtype)
         steps: list[Step] = []
         start, n_pairs = 0, 0
-        with buffers.acquired(2, group.slab, self.table.dtype) as scratch:
+        with buffers.acquired_buffers(2, group.slab, self.table.dtype) as scratch:
             while start < len(group.reached) and (n := active.count_below(group.reached[start])) > 0:
                 blocks = group.blocks(active.rows, n, start, group.step_blocks(start, n))
                 entries, transmittance = self._entries(blocks), active["transmittance"][:n]
@@ -265,7 +266,7 @@ class Blender:
                 self._alphas(entries, alpha)
                 if counted:
                     active["n_passed"][:n].add_(count_passed(alpha, transmittance, self.stop))
-                before = buffers.copy(transmittance)
+                before = buffers.copy_to_buffer(transmittance)
                 weight = self._weights(alpha, transmittances, before)
                 torch.ops.aten.threshold.out(transmittances[:, -1], self.stop.at, 0.0, out=transmittance)
                 active["image"][:n].baddbmm_(entries[:, :, 6:].transpose(1, 2), weight)
@@ -278,7 +279,7 @@ class Blender:
                 if keep:
                     steps.append(Step(blocks, active.rows, before))
                 else:
-                    buffers.release(before)
+                    buffers.release_buffer(before)
                 active.drop(n, transmittance, COMPACT_BELOW)
         return self._result(active.whole(), steps, n_pairs)
 
@@ -333,7 +334,7 @@ class Blender:
             colours and, when asked for, the sums of absolute gradients along x and y.
         """
         active = ActiveTiles({"behind": v_image.new_zeros((v_image.shape[0], v_image.shape[2])), "v": v_image})
-        with buffers.acquired(3, group.slab, self.table.dtype) as scratch:
+        with buffers.acquired_buffers(3, group.slab, self.table.dtype) as scratch:
             for step in reversed(blend.steps):
                 active.select(step.rows)
                 n = len(step.blocks)
@@ -345,7 +346,7 @@ class Blender:
                     behind.addcmul_(a, q_k)
                 # nothing lies behind a pixel that had stopped before this step
                 torch.ops.aten.threshold_backward.grad_input(behind, step.transmittance, 0.0, grad_input=behind)
-                buffers.release(step.transmittance)
+                buffers.release_buffer(step.transmittance)
                 yield step.blocks.view(-1), self._rows(entries, alpha, weight, q, v, absolute)
 
     def again(self, group: TileGroup, step: Step, scratch: list[Tensor]) -> list[Tensor]:
@@ -416,3 +417,64 @@ def _shaped(scratch: list[Tensor], entries: Tensor, n_pixels: int) -> list[Tenso
     n, length, _ = entries.shape
     lengths = (length, length + 1, length)
     return [slab[: n * k * n_pixels].view(n, k, n_pixels) for slab, k in zip(scratch, lengths, strict=False)]
+
+
+RETAINED_BYTES = 1 << 30
+
+
+class _Pool:
+    def __init__(self) -> None:
+        self.free: dict[tuple[torch.dtype, int], list[Tensor]] = {}
+        self.retained = 0
+
+
+_pool = _Pool()
+
+
+def acquire_buffer(numel: int, dtype: torch.dtype) -> Tensor:
+    """Return a flat buffer of at least `numel` uninitialised numbers, used before if one is free.
+
+    Lengths are powers of two, so that scenes whose sizes change from step to step share a few kinds of buffers.
+    """
+    length = 1 << max(numel - 1, 0).bit_length()
+    free = _pool.free.get((dtype, length))
+    if not free:
+        return torch.empty(length, dtype=dtype)
+    _pool.retained -= length * dtype.itemsize
+    return free.pop()
+
+
+def release_buffer(slab: Tensor) -> None:
+    """Return a buffer from `acquire_buffer`, or a view of one's beginning; nobody may use it afterwards."""
+    size = slab.untyped_storage().nbytes()
+    slab = slab.as_strided((size // slab.itemsize,), (1,), 0)
+    if _pool.retained + size <= RETAINED_BYTES:
+        _pool.retained += size
+        _pool.free.setdefault((slab.dtype, slab.numel()), []).append(slab)
+
+
+def copy_to_buffer(tensor: Tensor) -> Tensor:
+    """Return a copy in a buffer from `acquire_buffer`, which `release_buffer` takes back."""
+    return acquire_buffer(tensor.numel(), tensor.dtype)[: tensor.numel()].view(tensor.shape).copy_(tensor)
+
+
+@contextmanager
+def acquired_buffers(n: int, numel: int, dtype: torch.dtype) -> Iterator[list[Tensor]]:
+    """Lend `n` buffers of at least `numel` numbers for a block of code."""
+    taken = [acquire_buffer(numel, dtype) for _ in range(n)]
+    try:
+        yield taken
+    finally:
+        for slab in taken:
+            release_buffer(slab)
+
+
+def retained_bytes() -> int:
+    """Return how much memory waits to be used again."""
+    return _pool.retained
+
+
+def clear_buffers() -> None:
+    """Free every retained buffer."""
+    _pool.free.clear()
+    _pool.retained = 0
