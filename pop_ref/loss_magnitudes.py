@@ -9,7 +9,7 @@ rounding leaves of the variances is compared with that: no constant tells what i
 to write the same function are analysed:
 
     textbook      S as in `pop_ref.ssim`: variances are differences of squares of size 1;
-    difference    1 - S written in d = x - y (`pop_fast.stages.ssim` derives it): rounding shrinks with d.
+    difference    1 - S written in d = x - y (`pop_fast.stages.losses` derives it): rounding shrinks with d.
 """
 
 from __future__ import annotations

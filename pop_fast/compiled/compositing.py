@@ -10,8 +10,9 @@ on the number of threads.
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
@@ -35,26 +36,18 @@ from pop_fast.compiled.library import (
     call_library,
     this_library,
 )
+from pop_fast.stages import compositing
+from pop_fast.stages import contributions as passes
 from pop_fast.stages.blend import Stop, below
 from pop_fast.stages.compositing import BlendOptions
-from pop_fast.stages.compositing import composite as composite_in_torch
-from pop_fast.stages.contributions import (
-    N_MOMENTS,
-    Contributions,
-    DominantPoints,
-    background_or_black,
-    check_grid,
-    checked_map,
-    points_on_rays,
-    three_channels,
-    towards_camera,
-)
-from pop_fast.stages.contributions import fisher_blocks as fisher_blocks_of_stages
 from pop_fast.stages.projection import intrinsics, view_dirs_vjp
 from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of
 from pop_fast.stages.tiles import TileLists, depth_order, grid_size, tile_rects
-from pop_fast.stages.types import Camera, Gaussians
+from pop_fast.stages.types import Camera
 from pop_ref.constants import PAPER, Profile
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 def tile_lists(
@@ -194,9 +187,6 @@ def _lights(lists: TileLists, like: Tensor) -> dict[str, Tensor]:
     }
 
 
-composite = partial(composite_in_torch, function=_Composite)
-
-
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:
     """See `pop_fast.stages.splatting.covariances`."""
     return _Covariances.apply(quats, scales)
@@ -292,13 +282,9 @@ class _Projection(torch.autograd.Function):
         found = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in (means, covars, opacities)]
         v_viewmats = means.new_empty((n_parts, 3, 4)) if ctx.needs_input_grad[3] else None
         given = {"means": means, "covars": covars, "opacities": opacities, "viewmat": viewmat, "K": ctx.view.K}
-        given |= {
-            "v_means2d": v_means2d.T,
-            "v_depths": v_depths,
-            "v_conics": v_conics.T,
-            "v_effective_opacities": v_effective_opacities,
-        }
-        given |= {"v_factors": v_factors, "radii": ctx.radii, "v_viewmats": v_viewmats}
+        given |= {"v_means2d": v_means2d.T, "v_depths": v_depths, "v_conics": v_conics.T}
+        given |= {"v_effective_opacities": v_effective_opacities, "v_factors": v_factors}
+        given |= {"radii": ctx.radii, "v_viewmats": v_viewmats}
         given |= dict(zip(("v_means", "v_covars", "v_opacities"), found, strict=True))
         call_library(ProjectionBackward, means.dtype, _projection_numbers(len(means), ctx.view), given)
         if v_viewmats is None:
@@ -350,7 +336,7 @@ def _numbers(sh: Tensor, degree: int, visible: Tensor) -> dict[str, float]:
     return {**sizes, "degree": degree, "threads": torch.get_num_threads()}
 
 
-def scored(
+def _scored(
     layout: type[Scores],
     splats: Splats,
     colors: Tensor,
@@ -360,25 +346,11 @@ def scored(
     numbers: dict[str, float],
     **tensors: Tensor | None,
 ) -> None:
-    """Call a function of `scores.h`.
-
-    Args:
-        layout: of its arguments, which tells the functions apart.
-        splats: what is blended.
-        colors: of any number of channels. [N, D]
-        lists: what each tile blends.
-        size: width and height, px.
-        profile: constants and strictness.
-        numbers: what else it takes of numbers.
-        tensors: what else it reads and, contiguous, writes.
-    """
+    """Call a function of `scores.h`, which its layout tells apart; `tensors` it reads and, contiguous, writes."""
     inputs = tuple(t.contiguous() for t in (splats.means2d, splats.conics, splats.opacities, colors))
     options = BlendOptions(lists, *size, profile, dominance=False, counts=False, keep=False, absgrad_sink=None)
-    names = ("means2d", "conics", "opacities", "colors")
-    given: dict[str, Tensor | None] = {
-        **dict(zip(names, inputs, strict=True)),
-        "ids": lists.ids,
-        "offsets": lists.offsets,
+    given = {
+        **_arguments(inputs, options),
         "n_reached": torch.empty_like(lists.lengths),
         "splats": aligned_records(len(inputs[0]), this_library().splat_bytes),
         **tensors,
@@ -386,113 +358,47 @@ def scored(
     call_library(layout, inputs[0].dtype, {**blend_numbers(inputs, options), **numbers}, given)
 
 
-def totals(
-    layout: type[Scores],
-    columns: int,
-    splats: Splats,
-    colors: Tensor,
-    lists: TileLists,
-    size: tuple[int, int],
-    profile: Profile,
-    **tensors: Tensor | None,
-) -> Tensor:
-    """Return what a function of `scores.h` sums up of every splat; see `scored`. [N, columns] float64"""
-    found = torch.empty((len(splats.means2d), columns), dtype=torch.float64)
-    rows = splats.means2d.new_empty((len(lists.ids), columns))
-    scored(layout, splats, colors, lists, size, profile, {}, rows=rows, totals=found, **tensors)
-    return found
+def _sums(layout: type[Scores], columns: int, name: str) -> Callable[..., Tensor]:
+    """Make what sums up of every splat by a function of `scores.h`, which takes a map or a background by that name."""
+
+    def sums(splats: Splats, lists: TileLists, size: tuple[int, int], profile: Profile, value: Tensor | None) -> Tensor:
+        found = torch.empty((len(splats.means2d), columns), dtype=torch.float64)
+        rows = splats.means2d.new_empty((len(lists.ids), columns))
+        # a map takes no colours
+        colors = rows.new_empty((len(found), 0)) if name == "pixel_map" else colors_of(splats)
+        given: dict[str, Tensor | None] = {name: value, "rows": rows, "totals": found}
+        _scored(layout, splats, colors, lists, size, profile, {}, **given)
+        return found
+
+    return sums
 
 
-def dominant_points(
-    splats: Splats,
-    lists: TileLists,
-    gaussians: Gaussians,
-    camera: Camera,
-    tile_size: int,
-    profile: Profile = PAPER,
-) -> DominantPoints:
-    """See `pop_ref.chord.dominant_points`. A Gaussian with a scale of 0 does not compete.
-
-    Optimizations: those of `pop_fast.stages.contributions`; the walk through the lists is in C++ (`scores.h`).
-    """
-    width, height = camera.width, camera.height
-    check_grid(lists, width, height, tile_size)
-    like = splats.means2d
-    ids = torch.empty((height, width), dtype=torch.int64)
-    T_final = like.new_empty((height, width))
-    fx, fy, cx, cy = intrinsics(camera.K, width, height, profile)
-    rays = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
-    facing = towards_camera(gaussians, camera).to(like.dtype)
+def _dominant_ids(
+    splats: Splats, lists: TileLists, camera: Camera, profile: Profile, facing: Tensor
+) -> tuple[Tensor, Tensor]:
+    size, like = (camera.width, camera.height), splats.means2d
+    ids, T_final = torch.empty(size[::-1], dtype=torch.int64), like.new_empty(size[::-1])
+    rays = dict(zip(("fx", "fy", "cx", "cy"), intrinsics(camera.K, *size, profile), strict=True))
     results = {"dominant_ids": ids, "T_final": T_final}
-    colors = like.new_empty((len(like), 0))
-    scored(PointScores, splats, colors, lists, (width, height), profile, rays, facing=facing, **results)
-    return DominantPoints(points_on_rays(ids, gaussians, camera, profile).to(like.dtype), ids, T_final)
+    _scored(PointScores, splats, like.new_empty((len(like), 0)), lists, size, profile, rays, facing=facing, **results)
+    return ids, T_final
 
 
-def contributions(
-    splats: Splats,
-    lists: TileLists,
-    width: int,
-    height: int,
-    tile_size: int,
-    pixel_map: Tensor | None = None,
-    profile: Profile = PAPER,
-) -> Contributions:
-    """See `pop_ref.contributions.contributions`. Optimizations: one blend without colours, in C++ (`scores.h`)."""
-    check_grid(lists, width, height, tile_size)
-    colors = splats.means2d.new_empty((len(splats.means2d), 0))
-    pixel_map = checked_map(pixel_map, width, height, colors.dtype)
-    found = totals(Scores, 4, splats, colors, lists, (width, height), profile, pixel_map=pixel_map)
-    weight_sum, n_pixels, map_sum, distance_sum = found.T
-    return Contributions(weight_sum, n_pixels.to(torch.int64), map_sum, distance_sum)
+def _by_the_library(function: Callable[P, T], **own: Any) -> Callable[P, T]:
+    """Make a stage of torch's that leaves its work to the library's functions."""
+
+    @wraps(function)
+    def compiled(*args: P.args, **kwargs: P.kwargs) -> T:
+        return function(*args, **own, **kwargs)
+
+    return compiled
 
 
-def sensitivities(
-    splats: Splats,
-    lists: TileLists,
-    width: int,
-    height: int,
-    tile_size: int,
-    background: Tensor | None = None,
-    profile: Profile = PAPER,
-) -> Tensor:
-    """See `pop_ref.sensitivity.sensitivities`. [N] float64
-
-    Optimizations: the sum of the channels is blended as one, in C++, there and back (`scores.h`).
-    """
-    check_grid(lists, width, height, tile_size)
-    colors = colors_of(splats)
-    behind = background_or_black(background, colors).sum(0, keepdim=True)
-    grey = colors.sum(1, keepdim=True)
-    found = totals(SensitivityScores, 1, splats, grey, lists, (width, height), profile, background=behind)
-    return found[:, 0] * splats.opacities.double().square()
-
-
-def screen_moments(
-    splats: Splats,
-    lists: TileLists,
-    width: int,
-    height: int,
-    tile_size: int,
-    background: Tensor | None = None,
-    profile: Profile = PAPER,
-) -> Tensor:
-    """See `pop_ref.fisher.screen_moments`. [N, 31] float64
-
-    Optimizations: those of `pop_fast.stages.contributions.screen_moments`, in C++, there and back (`scores.h`).
-
-    Raises:
-        ValueError: there are not three channels, or the lists are not of that grid.
-    """
-    check_grid(lists, width, height, tile_size)
-    colors = three_channels(splats)
-    behind = background_or_black(background, colors)
-    return totals(MomentScores, N_MOMENTS, splats, colors, lists, (width, height), profile, background=behind)
-
-
-def fisher_blocks(
-    gaussians: Gaussians, camera: Camera, moments: Tensor, sh_degree: int | None = None, profile: Profile = PAPER
-) -> Tensor:
-    """See `pop_ref.fisher.fisher_blocks`. [N, 6, 6] Optimizations: the compiled stages' transposes."""
-    chain = {"project": project, "colors_of_view": colors_of_view, "covariances": covariances}
-    return fisher_blocks_of_stages(gaussians, camera, moments, sh_degree, profile, **chain)
+composite = _by_the_library(compositing.composite, function=_Composite)
+contributions = _by_the_library(passes.contributions, sums=_sums(Scores, 4, "pixel_map"))
+sensitivities = _by_the_library(passes.sensitivities, sums=_sums(SensitivityScores, 1, "background"))
+screen_moments = _by_the_library(passes.screen_moments, sums=_sums(MomentScores, passes.N_MOMENTS, "background"))
+dominant_points = _by_the_library(passes.dominant_points, find=_dominant_ids)
+fisher_blocks = _by_the_library(
+    passes.fisher_blocks, project=project, colors_of_view=colors_of_view, covariances=covariances
+)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _PRECISIONS: Final = ("float32", "float64")
-_POINTER, _WHOLE, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+POINTER, WHOLE, REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
 # what projecting and culling read of `pop_ref.constants.Profile.as_numbers`
 PROJECTION_CONSTANTS: Final = (
     *("near_inclusive", "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas", "alpha_floor"),
@@ -29,7 +29,8 @@ PROJECTION_CONSTANTS: Final = (
 )
 
 
-def _fields(kind: Any, *names: str) -> tuple[tuple[str, Any], ...]:
+def fields_of(kind: Any, *names: str) -> tuple[tuple[str, Any], ...]:
+    """Return fields of one kind, as `ctypes.Structure` takes them."""
     return tuple((name, kind) for name in names)
 
 
@@ -37,9 +38,9 @@ class Covariances(ctypes.Structure):
     """`pop::Covariances` of projection.h, where every field is explained, in its order."""
 
     _fields_ = (
-        *_fields(_POINTER, "quats", "scales"),
-        *_fields(_WHOLE, "n", "threads"),
-        *_fields(_POINTER, "covars", "v_covars", "v_quats", "v_scales"),
+        *fields_of(POINTER, "quats", "scales"),
+        *fields_of(WHOLE, "n", "threads"),
+        *fields_of(POINTER, "covars", "v_covars", "v_quats", "v_scales"),
     )
 
 
@@ -51,14 +52,14 @@ class Projection(ctypes.Structure):
     """`pop::Projection` of projection.h, where every field is explained, in its order."""
 
     _fields_ = (
-        *_fields(_POINTER, "means", "covars", "opacities", "viewmat", "K"),
-        *_fields(_WHOLE, "n", "threads", "width", "height", "tile_size"),
-        *_fields(_WHOLE, "near_inclusive", "centred", "inria_clamp", "square", "antialiased"),
-        *_fields(_REAL, "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas", "alpha_floor"),
-        *_fields(_REAL, "radius_clip"),
-        *_fields(_POINTER, "means2d", "depths", "conics", "effective_opacities", "factors", "radii"),
-        *_fields(_POINTER, "v_means2d", "v_depths", "v_conics", "v_effective_opacities", "v_factors"),
-        *_fields(_POINTER, "v_means", "v_covars", "v_opacities", "v_viewmats"),
+        *fields_of(POINTER, "means", "covars", "opacities", "viewmat", "K"),
+        *fields_of(WHOLE, "n", "threads", "width", "height", "tile_size"),
+        *fields_of(WHOLE, "near_inclusive", "centred", "inria_clamp", "square", "antialiased"),
+        *fields_of(REAL, "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas", "alpha_floor"),
+        *fields_of(REAL, "radius_clip"),
+        *fields_of(POINTER, "means2d", "depths", "conics", "effective_opacities", "factors", "radii"),
+        *fields_of(POINTER, "v_means2d", "v_depths", "v_conics", "v_effective_opacities", "v_factors"),
+        *fields_of(POINTER, "v_means", "v_covars", "v_opacities", "v_viewmats"),
     )
 
 
@@ -70,9 +71,9 @@ class Colors(ctypes.Structure):
     """`pop::Colors` of colors.h, where every field is explained, in its order."""
 
     _fields_ = (
-        *_fields(_POINTER, "sh", "means", "viewmat", "visible"),
-        *_fields(_WHOLE, "n", "n_visible", "n_sh", "degree", "threads"),
-        *_fields(_POINTER, "colors", "v_colors", "v_sh", "v_dirs"),
+        *fields_of(POINTER, "sh", "means", "viewmat", "visible"),
+        *fields_of(WHOLE, "n", "n_visible", "n_sh", "degree", "threads"),
+        *fields_of(POINTER, "colors", "v_colors", "v_sh", "v_dirs"),
     )
 
 
@@ -84,10 +85,10 @@ class Lists(ctypes.Structure):
     """`pop::Lists` of lists.h, where every field is explained, in its order."""
 
     _fields_ = (
-        *_fields(_POINTER, "means2d", "conics", "opacities", "rects", "order", "candidates"),
-        *_fields(_WHOLE, "n", "m", "tiles_x", "tiles_y", "tile_size", "threads"),
-        *_fields(_REAL, "alpha_floor"),
-        *_fields(_POINTER, "tiles", "ids", "offsets"),
+        *fields_of(POINTER, "means2d", "conics", "opacities", "rects", "order", "candidates"),
+        *fields_of(WHOLE, "n", "m", "tiles_x", "tiles_y", "tile_size", "threads"),
+        *fields_of(REAL, "alpha_floor"),
+        *fields_of(POINTER, "tiles", "ids", "offsets"),
     )
 
 
@@ -95,16 +96,16 @@ class Blend(ctypes.Structure):
     """`pop::Blend` of tile.h, where every field is explained, in its order."""
 
     _fields_ = (
-        *_fields(_POINTER, "means2d", "conics", "opacities", "colors", "ids", "offsets", "first_chunks"),
-        *_fields(_WHOLE, "n", "channels", "tiles_x", "tiles_y", "tile_size", "width", "height", "threads"),
-        *_fields(_WHOLE, "pixel_stride", "channel_stride"),
-        *_fields(_REAL, "alpha_floor", "alpha_ceiling", "stop"),
-        *_fields(_WHOLE, "ceiling_passes"),
-        *_fields(_POINTER, "splats", "transmittances", "reached", "n_reached", "n_pairs", "image", "alphas"),
-        *_fields(_POINTER, "dominant_ids", "dominant_weights", "n_blended", "n_traversed"),
-        *_fields(_POINTER, "v_image", "v_alphas", "rows"),
-        *_fields(_POINTER, "v_means2d", "v_conics", "v_opacities", "v_colors", "absgrad"),
-        *_fields(_POINTER, "slots", "dominant_counts", "kept"),
+        *fields_of(POINTER, "means2d", "conics", "opacities", "colors", "ids", "offsets", "first_chunks"),
+        *fields_of(WHOLE, "n", "channels", "tiles_x", "tiles_y", "tile_size", "width", "height", "threads"),
+        *fields_of(WHOLE, "pixel_stride", "channel_stride"),
+        *fields_of(REAL, "alpha_floor", "alpha_ceiling", "stop"),
+        *fields_of(WHOLE, "ceiling_passes"),
+        *fields_of(POINTER, "splats", "transmittances", "reached", "n_reached", "n_pairs", "image", "alphas"),
+        *fields_of(POINTER, "dominant_ids", "dominant_weights", "n_blended", "n_traversed"),
+        *fields_of(POINTER, "v_image", "v_alphas", "rows"),
+        *fields_of(POINTER, "v_means2d", "v_conics", "v_opacities", "v_colors", "absgrad"),
+        *fields_of(POINTER, "slots", "dominant_counts", "kept"),
     )
 
 
@@ -116,9 +117,9 @@ class Scores(Blend):
     """`pop::Scores` of scores.h, where every field is explained, in its order: sums over pixels for `contributions`."""
 
     _fields_ = (
-        *_fields(_POINTER, "background", "pixel_map", "facing"),
-        *_fields(_REAL, "fx", "fy", "cx", "cy"),
-        *_fields(_POINTER, "T_final", "totals"),
+        *fields_of(POINTER, "background", "pixel_map", "facing"),
+        *fields_of(REAL, "fx", "fy", "cx", "cy"),
+        *fields_of(POINTER, "T_final", "totals"),
     )
 
 
@@ -138,10 +139,10 @@ class Ssim(ctypes.Structure):
     """`pop::Ssim` of ssim.h, where every field is explained, in its order."""
 
     _fields_ = (
-        *_fields(_POINTER, "difference", "target", "mu_y", "s_yy", "kept"),
-        *_fields(_WHOLE, "height", "width", "channels", "border", "stride", "threads"),
-        *_fields(_REAL, "weight"),
-        *_fields(_POINTER, "totals", "partials", "gradient"),
+        *fields_of(POINTER, "difference", "target", "mu_y", "s_yy", "kept"),
+        *fields_of(WHOLE, "height", "width", "channels", "border", "stride", "threads"),
+        *fields_of(REAL, "weight"),
+        *fields_of(POINTER, "totals", "partials", "gradient"),
     )
 
 
@@ -149,9 +150,9 @@ class Moments(ctypes.Structure):
     """`pop::Moments` of moments.h, where every field is explained, in its order."""
 
     _fields_ = (
-        *_fields(_POINTER, "photograph"),
-        *_fields(_WHOLE, "height", "width", "border", "threads"),
-        *_fields(_POINTER, "target", "mu_y", "s_yy"),
+        *fields_of(POINTER, "photograph"),
+        *fields_of(WHOLE, "height", "width", "border", "threads"),
+        *fields_of(POINTER, "target", "mu_y", "s_yy"),
     )
 
 
@@ -227,17 +228,17 @@ def stepper_functions(given_bytes: int) -> StepperFunctions:
     path = str(library_path())
     this_library()
     loaded = ctypes.CDLL(path)
-    loaded.pop_step_given_bytes.restype = _WHOLE
+    loaded.pop_step_given_bytes.restype = WHOLE
     if loaded.pop_step_given_bytes() != given_bytes:
         raise OSError(f"{path} expects arguments of another layout")
-    loaded.pop_stepper_open.argtypes, loaded.pop_stepper_open.restype = (_WHOLE,), _POINTER
-    loaded.pop_stepper_close.argtypes, loaded.pop_stepper_close.restype = (_POINTER,), None
+    loaded.pop_stepper_open.argtypes, loaded.pop_stepper_open.restype = (WHOLE,), POINTER
+    loaded.pop_stepper_close.argtypes, loaded.pop_stepper_close.restype = (POINTER,), None
     steps = loaded.pop_stepper_steps
-    steps.argtypes, steps.restype = (_POINTER, _POINTER, _WHOLE, _POINTER), _WHOLE
-    loaded.pop_stepper_bytes.argtypes, loaded.pop_stepper_bytes.restype = (_POINTER,), _WHOLE
-    loaded.pop_stepper_counts.argtypes, loaded.pop_stepper_counts.restype = (_POINTER, _POINTER), None
+    steps.argtypes, steps.restype = (POINTER, POINTER, WHOLE, POINTER), WHOLE
+    loaded.pop_stepper_bytes.argtypes, loaded.pop_stepper_bytes.restype = (POINTER,), WHOLE
+    loaded.pop_stepper_counts.argtypes, loaded.pop_stepper_counts.restype = (POINTER, POINTER), None
     trace = loaded.pop_stepper_trace
-    trace.argtypes, trace.restype = (_POINTER, _POINTER, _WHOLE), _WHOLE
+    trace.argtypes, trace.restype = (POINTER, POINTER, WHOLE), WHOLE
     return StepperFunctions(
         loaded.pop_stepper_open,
         loaded.pop_stepper_close,
@@ -288,16 +289,16 @@ def open_library(path: str) -> Library:
     loaded = load_library(path)
     numbers = ("chunk", "padded_pixels", "splat_bytes", "lanes", "window_rows", "padded_line", "rows_at_a_time")
     for number in numbers:
-        getattr(loaded, f"pop_{number}").restype = _WHOLE
-    loaded.pop_lanes.argtypes = (_WHOLE,)
-    loaded.pop_padded_pixels.argtypes = loaded.pop_padded_line.argtypes = (_WHOLE, _WHOLE)
-    loaded.pop_adam.argtypes = (*(_POINTER,) * 4, *(_WHOLE,) * 2, *(_REAL,) * 4)
+        getattr(loaded, f"pop_{number}").restype = WHOLE
+    loaded.pop_lanes.argtypes = (WHOLE,)
+    loaded.pop_padded_pixels.argtypes = loaded.pop_padded_line.argtypes = (WHOLE, WHOLE)
+    loaded.pop_adam.argtypes = (*(POINTER,) * 4, *(WHOLE,) * 2, *(REAL,) * 4)
     loaded.pop_adam.restype = None
     functions: dict[tuple[type[ctypes.Structure], str], Callable[..., int]] = {}
     for layout, name in _NAMES.items():
         for precision in _PRECISIONS:
             function = getattr(loaded, f"pop_{name}_{precision}")
-            function.argtypes, function.restype = (_POINTER, _POINTER), ctypes.c_int
+            function.argtypes, function.restype = (POINTER, POINTER), ctypes.c_int
             functions[layout, precision] = function
     return Library(
         functions,
@@ -322,7 +323,7 @@ def load_library(path: str) -> ctypes.CDLL:
     loaded = ctypes.CDLL(path)
     for layout in (Covariances, Projection, Colors, Lists, Blend, Scores, Ssim, Moments):
         size = getattr(loaded, f"pop_{layout.__name__.lower()}_bytes")
-        size.restype = _WHOLE
+        size.restype = WHOLE
         if size() != ctypes.sizeof(layout):
             raise OSError(f"{path} expects arguments of another layout")
     return loaded
@@ -342,5 +343,5 @@ def _fork() -> Any:
     for file in sorted(files):
         function = getattr(ctypes.CDLL(file), "GOMP_parallel", None)
         if function is not None:
-            return ctypes.cast(function, _POINTER)
+            return ctypes.cast(function, POINTER)
     return None

@@ -13,13 +13,13 @@ from torch import Tensor
 
 from pop_fast.compiled.library import Ssim, call_library, this_library
 from pop_fast.stages import losses
-from pop_fast.stages.ssim import REACH, TargetMoments, border_of, kept_windows
+from pop_fast.stages.losses import REACH, TargetMoments, border_of, kept_windows
 
 
 def mean_dissimilarity(
     difference: Tensor, moments: TargetMoments, mask: Tensor | None, weight: float | None
 ) -> tuple[Tensor, Tensor | None]:
-    """See `pop_fast.stages.ssim.mean_dissimilarity`.
+    """See `pop_fast.stages.losses.mean_dissimilarity`.
 
     Optimizations: one pass from the difference to the derivatives by the windows' moments, and one from these to the
     gradient (`ssim.h`); what is blurred stays in the cache.

@@ -118,8 +118,8 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         return prior or self.collects_blur(step) or self.collects_window(step)
 
     def needs_passes(self, step: int) -> bool:
-        """Tell whether the change after this step looks at the training views."""
-        return False
+        """Tell whether the change after this step looks at the training views: where Adam begins anew, most do."""
+        return step in self.adam_restarts
 
     def regularizes(self, step: int) -> bool:
         """Tell whether `regularizer` adds a prior on opacities at this step."""
@@ -140,7 +140,8 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
 
     def changes_after(self, step: int) -> bool:
         """Tell whether the Gaussians are edited after this step."""
-        return self.is_refine_step(step) or self.is_reset_step(step) or step == self.final_prune_iter
+        due = self.is_refine_step(step) or self.is_reset_step(step) or self.needs_passes(step)
+        return due or step == self.final_prune_iter
 
     def regularizer(self, opacities: Tensor, state: State, step: int, info: Info) -> Tensor | None:
         """Return `lambda_pop L_pop` of this view, with `lambda_entropy` times the entropy, or None when both are off.

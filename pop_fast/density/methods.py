@@ -137,14 +137,6 @@ class MiniSplattingStrategy(InriaStrategy):
         """Tell whether Gaussians are cloned and split after this step: not where they are replaced."""
         return super().is_refine_step(step) and step not in self.reinit_iters
 
-    def needs_passes(self, step: int) -> bool:
-        """Tell whether the training views are looked at."""
-        return step in self.adam_restarts
-
-    def changes_after(self, step: int) -> bool:
-        """Tell whether the Gaussians are edited after this step."""
-        return super().changes_after(step) or self.needs_passes(step)
-
     def edit(self, context: DensificationContext) -> DensificationStep:
         """Do what is due after this step."""
         if context.step in self.adam_restarts:
@@ -280,14 +272,6 @@ class PupStrategy(InriaStrategy):
         """Return the first step of every round: it prunes, and moves nothing."""
         return tuple(self.rounds_start_iter + k * self.round_steps for k in range(len(self.prune_shares)))
 
-    def needs_passes(self, step: int) -> bool:
-        """Tell whether Fisher blocks are asked for."""
-        return step in self.adam_restarts
-
-    def changes_after(self, step: int) -> bool:
-        """Tell whether the Gaussians are edited after this step."""
-        return super().changes_after(step) or self.needs_passes(step)
-
     def edit(self, context: DensificationContext) -> DensificationStep:
         """Refine and reset as 3DGS; at the beginning of a round prune and start Adam anew."""
         if context.step not in self.adam_restarts:
@@ -336,10 +320,6 @@ class SpeedySplatStrategy(InriaStrategy):
     def needs_passes(self, step: int) -> bool:
         """Tell whether sensitivities are asked for."""
         return self.prune_share_at(step) > 0.0
-
-    def changes_after(self, step: int) -> bool:
-        """Tell whether the Gaussians are edited after this step."""
-        return super().changes_after(step) or self.needs_passes(step)
 
     def edit(self, context: DensificationContext) -> DensificationStep:
         """Refine, prune by sensitivity, reset: in this order."""
@@ -412,11 +392,13 @@ class TamingStrategy(InriaStrategy):
 
         scores, nth = self._scores(context), self.densification_at(context.step)
         clones, splits = self.planned_growth(context)
-        budget = budget_at(
-            nth, self.n_densifications, context.state["first_count"], self.target(context.state["first_count"])
-        )
+        target = self.target(context.state["first_count"])
+        budget = budget_at(nth, self.n_densifications, context.state["first_count"], target)
         n_clone, n_split = quotas(budget, len(context), int(clones.sum()), int(splits.sum()))
-        clones, splits = _drawn(clones, scores, n_clone, context), _drawn(splits, scores, n_split, context)
+        clones, splits = (
+            _drawn(torch.where(candidates.cpu(), scores, 0.0), wanted, context)
+            for candidates, wanted in ((clones, n_clone), (splits, n_split))
+        )
         # after the split its parents' rows are gone
         inverse = 1.0 / (1e-6 + scores)
         weights = inverse if self.misaligned_prune_weights else inverse[~splits.cpu()]
@@ -455,28 +437,20 @@ class TamingStrategy(InriaStrategy):
         return self.final_count or int(self.budget_multiplier * first_count)
 
 
-def _drawn(candidates: Tensor, scores: Tensor, wanted: int, context: DensificationContext) -> Tensor:
-    """Draw so many candidates by score. [N] bool"""
+def _drawn(weights: Tensor, wanted: int, context: DensificationContext) -> Tensor:
+    """Draw at most so many Gaussians by weight. [N] bool"""
     import torch
 
     from pop_fast.stages.density import sample_without_replacement
 
-    weights = torch.where(candidates.cpu(), scores, 0.0)
     wanted = min(wanted, int((weights > 0.0).sum()))
     mask = torch.zeros(len(weights), dtype=torch.bool)
     mask[sample_without_replacement(weights, wanted, context.draws.uniforms(len(weights)))] = True
-    return mask.to(candidates.device)
+    return mask.to(context.params["means"].device)
 
 
 def _drawn_to_go(mask: Tensor, weights: Tensor, context: DensificationContext) -> Tensor:
     """Draw half as many as may go, by the weights of the first rows; the others, which are new, stay. [N] bool"""
-    import torch
-
-    from pop_fast.stages.density import sample_without_replacement
-
     of_all = weights.new_zeros(len(mask))
     of_all[: len(weights)] = weights[: len(mask)]
-    wanted = min(int(mask.sum()) // 2, int((of_all > 0.0).sum()))
-    drawn = torch.zeros(len(mask), dtype=torch.bool)
-    drawn[sample_without_replacement(of_all, wanted, context.draws.uniforms(len(mask)))] = True
-    return drawn.to(mask.device)
+    return _drawn(of_all, int(mask.sum()) // 2, context)

@@ -258,7 +258,7 @@ class Blender:
         dominant = Dominance(self.table.dtype)
         steps: list[Step] = []
         start, n_pairs = 0, 0
-        with buffers.acquired_buffers(2, group.slab, self.table.dtype) as scratch:
+        with acquired_buffers(2, group.slab, self.table.dtype) as scratch:
             while start < len(group.reached) and (n := active.count_below(group.reached[start])) > 0:
                 blocks = group.blocks(active.rows, n, start, group.step_blocks(start, n))
                 entries, transmittance = self._entries(blocks), active["transmittance"][:n]
@@ -266,7 +266,7 @@ class Blender:
                 self._alphas(entries, alpha)
                 if counted:
                     active["n_passed"][:n].add_(count_passed(alpha, transmittance, self.stop))
-                before = buffers.copy_to_buffer(transmittance)
+                before = copy_to_buffer(transmittance)
                 weight = self._weights(alpha, transmittances, before)
                 torch.ops.aten.threshold.out(transmittances[:, -1], self.stop.at, 0.0, out=transmittance)
                 active["image"][:n].baddbmm_(entries[:, :, 6:].transpose(1, 2), weight)
@@ -279,7 +279,7 @@ class Blender:
                 if keep:
                     steps.append(Step(blocks, active.rows, before))
                 else:
-                    buffers.release_buffer(before)
+                    release_buffer(before)
                 active.drop(n, transmittance, COMPACT_BELOW)
         return self._result(active.whole(), steps, n_pairs)
 
@@ -334,7 +334,7 @@ class Blender:
             colours and, when asked for, the sums of absolute gradients along x and y.
         """
         active = ActiveTiles({"behind": v_image.new_zeros((v_image.shape[0], v_image.shape[2])), "v": v_image})
-        with buffers.acquired_buffers(3, group.slab, self.table.dtype) as scratch:
+        with acquired_buffers(3, group.slab, self.table.dtype) as scratch:
             for step in reversed(blend.steps):
                 active.select(step.rows)
                 n = len(step.blocks)
@@ -346,7 +346,7 @@ class Blender:
                     behind.addcmul_(a, q_k)
                 # nothing lies behind a pixel that had stopped before this step
                 torch.ops.aten.threshold_backward.grad_input(behind, step.transmittance, 0.0, grad_input=behind)
-                buffers.release_buffer(step.transmittance)
+                release_buffer(step.transmittance)
                 yield step.blocks.view(-1), self._rows(entries, alpha, weight, q, v, absolute)
 
     def again(self, group: TileGroup, step: Step, scratch: list[Tensor]) -> list[Tensor]:

@@ -31,6 +31,9 @@ from pop_fast.stages.tiles import TileLists
 from pop_fast.stages.types import Camera, Gaussians
 from pop_ref.constants import PAPER, Profile
 
+# of splats, their lists, the size of the view, a profile and what a pass needs else: its sums for every splat
+Sums = Callable[..., Tensor]
+
 
 @dataclass(frozen=True)
 class Contributions:
@@ -49,6 +52,23 @@ class Contributions:
     distance_sum: Tensor
 
 
+def _contribution_sums(
+    splats: Splats, lists: TileLists, size: tuple[int, int], profile: Profile, pixel_map: Tensor | None
+) -> Tensor:
+    """Return weights, pixels, the map's values and distances, summed up for every splat. [N, 4] float64"""
+    walk = PairWalk(splats, lists, *size, profile)
+    rows = EntryRows(walk, 4)
+    values = walk.tiles_of(splats.means2d.new_zeros((*size[::-1], 1)) if pixel_map is None else pixel_map[..., None])
+    for pairs in walk.front_to_back():
+        dx, dy = walk.offsets(pairs)
+        weight = pairs.weight.sum(2)
+        blended = torch.gt(pairs.alpha, 0.0, out=pairs.scratch)
+        of_map = torch.bmm(blended, values.index_select(0, pairs.tiles).transpose(1, 2))[:, :, 0]
+        distance = torch.hypot(dx, dy).mul_(blended).sum(2)
+        rows.put(pairs, [weight, blended.sum(2), of_map, distance])
+    return rows.totals()
+
+
 def contributions(
     splats: Splats,
     lists: TileLists,
@@ -57,36 +77,35 @@ def contributions(
     tile_size: int,
     pixel_map: Tensor | None = None,
     profile: Profile = PAPER,
+    *,
+    sums: Sums = _contribution_sums,
 ) -> Contributions:
     """See `pop_ref.contributions.contributions`.
 
-    Optimizations: a group of tiles and a block of list entries at a time (`pairs`).
+    Optimizations: a group of tiles and a block of list entries at a time.
+
+    Raises:
+        ValueError: the map is not of the view's size, or the lists are not of that grid.
     """
     check_grid(lists, width, height, tile_size)
-    walk = PairWalk(splats, lists, width, height, profile)
-    rows = EntryRows(walk, 4)
-    given = checked_map(pixel_map, width, height, splats.means2d.dtype)
-    values = walk.tiles_of(splats.means2d.new_zeros((height, width, 1)) if given is None else given[..., None])
-    for pairs in walk.front_to_back():
-        dx, dy = walk.offsets(pairs)
-        weight = pairs.weight.sum(2)
-        blended = torch.gt(pairs.alpha, 0.0, out=pairs.scratch)
-        of_map = torch.bmm(blended, values.index_select(0, pairs.tiles).transpose(1, 2))[:, :, 0]
-        distance = torch.hypot(dx, dy).mul_(blended).sum(2)
-        rows.put(pairs, [weight, blended.sum(2), of_map, distance])
-    weight_sum, n_pixels, map_sum, distance_sum = rows.totals().T
+    if pixel_map is not None and pixel_map.shape != (height, width):
+        raise ValueError(f"pixel_map has shape {list(pixel_map.shape)}; it must be [{height}, {width}]")
+    given = None if pixel_map is None else pixel_map.to(splats.means2d.dtype)
+    weight_sum, n_pixels, map_sum, distance_sum = sums(splats, lists, (width, height), profile, given).T
     return Contributions(weight_sum, n_pixels.to(torch.int64), map_sum, distance_sum)
 
 
-def checked_map(pixel_map: Tensor | None, width: int, height: int, dtype: torch.dtype) -> Tensor | None:
-    """Return a map in a precision.
-
-    Raises:
-        ValueError: it is not of the view's size.
-    """
-    if pixel_map is not None and pixel_map.shape != (height, width):
-        raise ValueError(f"pixel_map has shape {list(pixel_map.shape)}; it must be [{height}, {width}]")
-    return None if pixel_map is None else pixel_map.to(dtype)
+def _sensitivity_sums(
+    grey: Splats, lists: TileLists, size: tuple[int, int], profile: Profile, behind: Tensor
+) -> Tensor:
+    """Return the squares of T dC/dalpha of one channel, summed up for every splat. [N, 1] float64"""
+    walk = PairWalk(grey, lists, *size, profile)
+    rows = EntryRows(walk, 1)
+    for pairs, color_dot_grad in walk.color_dot_grads(behind):
+        # T = weight / alpha, and both are 0 where nothing is blended
+        T = torch.div(pairs.weight, pairs.alpha.clamp_min_(torch.finfo(color_dot_grad.dtype).tiny), out=pairs.scratch)
+        rows.put(pairs, [color_dot_grad[0].mul_(T).square_().sum(2)])
+    return rows.totals()
 
 
 def sensitivities(
@@ -97,49 +116,28 @@ def sensitivities(
     tile_size: int,
     background: Tensor | None = None,
     profile: Profile = PAPER,
+    *,
+    sums: Sums = _sensitivity_sums,
 ) -> Tensor:
     """See `pop_ref.sensitivity.sensitivities`. [N] float64
 
     Optimizations: as the channels are added up before the square, one channel is blended, their sum; a group of tiles
-    and a block of list entries at a time (`pairs`).
+    and a block of list entries at a time.
     """
     check_grid(lists, width, height, tile_size)
     grey = replace(splats, colors=colors_of(splats).sum(1, keepdim=True))
-    walk = PairWalk(grey, lists, width, height, profile)
-    rows = EntryRows(walk, 1)
     behind = background_or_black(background, colors_of(splats))
-    for pairs, color_dot_grad in walk.color_dot_grads(behind.sum(0, keepdim=True)):
-        # T = weight / alpha, and both are 0 where nothing is blended
-        T = torch.div(pairs.weight, pairs.alpha.clamp_min_(torch.finfo(color_dot_grad.dtype).tiny), out=pairs.scratch)
-        rows.put(pairs, [color_dot_grad[0].mul_(T).square_().sum(2)])
-    return rows.totals()[:, 0] * splats.opacities.double().square()
+    found = sums(grey, lists, (width, height), profile, behind.sum(0, keepdim=True))
+    return found[:, 0] * splats.opacities.double().square()
 
 
 N_MOMENTS = 31
 _UPPER = [(i, j) for i in range(5) for j in range(i, 5)]
 
 
-def screen_moments(
-    splats: Splats,
-    lists: TileLists,
-    width: int,
-    height: int,
-    tile_size: int,
-    background: Tensor | None = None,
-    profile: Profile = PAPER,
-) -> Tensor:
-    """See `pop_ref.fisher.screen_moments`. [N, 31] float64
-
-    Optimizations: with G_c = alpha dC_c/dalpha and s = dsigma/d(mean2d, conic), q_c = -G_c s for all three channels, so
-    that the fifteen second moments are those of s under one weight, sum_c G_c^2; they and the mixed ones are two matrix
-    products an entry. A group of tiles and a block of list entries at a time (`pairs`).
-
-    Raises:
-        ValueError: there are not three channels, or the lists are not of that grid.
-    """
-    check_grid(lists, width, height, tile_size)
-    behind = background_or_black(background, three_channels(splats))
-    walk = PairWalk(splats, lists, width, height, profile)
+def _moment_sums(splats: Splats, lists: TileLists, size: tuple[int, int], profile: Profile, behind: Tensor) -> Tensor:
+    """Return the moments, summed up for every splat. [N, 31] float64"""
+    walk = PairWalk(splats, lists, *size, profile)
     rows = EntryRows(walk, N_MOMENTS)
     for pairs, color_dot_grad in walk.color_dot_grads(behind):
         slopes = _slopes(walk, pairs, splats.conics)
@@ -154,16 +152,30 @@ def screen_moments(
     return rows.totals()
 
 
-def three_channels(splats: Splats) -> Tensor:
-    """Return the colours of splats. [N, 3]
+def screen_moments(
+    splats: Splats,
+    lists: TileLists,
+    width: int,
+    height: int,
+    tile_size: int,
+    background: Tensor | None = None,
+    profile: Profile = PAPER,
+    *,
+    sums: Sums = _moment_sums,
+) -> Tensor:
+    """See `pop_ref.fisher.screen_moments`. [N, 31] float64
+
+    Optimizations: with G_c = alpha dC_c/dalpha and s = dsigma/d(mean2d, conic), q_c = -G_c s for all three channels, so
+    that the fifteen second moments are those of s under one weight, sum_c G_c^2; they and the mixed ones are two matrix
+    products an entry. A group of tiles and a block of list entries at a time.
 
     Raises:
-        ValueError: there are not three channels.
+        ValueError: there are not three channels, or the lists are not of that grid.
     """
-    colors = colors_of(splats)
-    if colors.shape[1] != 3:
-        raise ValueError(f"the splats have {colors.shape[1]} colour channels; they must have 3")
-    return colors
+    check_grid(lists, width, height, tile_size)
+    if (channels := colors_of(splats).shape[1]) != 3:
+        raise ValueError(f"the splats have {channels} colour channels; they must have 3")
+    return sums(splats, lists, (width, height), profile, background_or_black(background, colors_of(splats)))
 
 
 def _slopes(walk: PairWalk, pairs: Pairs, conics: Tensor) -> Tensor:
@@ -457,23 +469,13 @@ def _whitened(quat: Tensor, scale: Tensor, vector: Tensor) -> Tensor:
     return (R * vector[..., :, None]).sum(-2) / scale
 
 
-def dominant_points(
-    splats: Splats,
-    lists: TileLists,
-    gaussians: Gaussians,
-    camera: Camera,
-    tile_size: int,
-    profile: Profile = PAPER,
-) -> DominantPoints:
-    """See `pop_ref.chord.dominant_points`. A Gaussian with a scale of 0 does not compete.
-
-    Optimizations: see the module's text; a group of tiles and a block of list entries at a time (`pairs`).
-    """
-    check_grid(lists, camera.width, camera.height, tile_size)
+def _dominant_ids(
+    splats: Splats, lists: TileLists, camera: Camera, profile: Profile, facing: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the splat with the largest weight of those that face each pixel's ray, -1 for none, and T_final. [H, W]"""
     walk = PairWalk(splats, lists, camera.width, camera.height, profile)
-    dtype = splats.means2d.dtype
-    facing = torch.cat((towards_camera(gaussians, camera), torch.zeros((1, 3), dtype=torch.float64))).to(dtype)
-    directions = walk.tiles_of(ray_directions(camera, profile).to(dtype))
+    facing = torch.cat((facing, facing.new_zeros((1, 3))))
+    directions = walk.tiles_of(ray_directions(camera, profile).to(facing.dtype))
     best, T = directions.new_zeros(len(directions), directions.shape[2]), directions.new_ones(directions[:, 0].shape)
     ids = torch.full(best.shape, -1)
     for pairs in walk.front_to_back():
@@ -487,8 +489,27 @@ def dominant_points(
         winners = pairs.ids.gather(1, place)
         ids.index_copy_(0, pairs.tiles, torch.where(wins, winners, ids.index_select(0, pairs.tiles)))
         T.index_copy_(0, pairs.tiles, T.index_select(0, pairs.tiles) * (1.0 - pairs.alpha).prod(1))
-    winner = walk.image_of(ids)
-    return DominantPoints(points_on_rays(winner, gaussians, camera, profile).to(dtype), winner, walk.image_of(T))
+    return walk.image_of(ids), walk.image_of(T)
+
+
+def dominant_points(
+    splats: Splats,
+    lists: TileLists,
+    gaussians: Gaussians,
+    camera: Camera,
+    tile_size: int,
+    profile: Profile = PAPER,
+    *,
+    find: Callable[..., tuple[Tensor, Tensor]] = _dominant_ids,
+) -> DominantPoints:
+    """See `pop_ref.chord.dominant_points`. A Gaussian with a scale of 0 does not compete.
+
+    Optimizations: see the module's text; a group of tiles and a block of list entries at a time.
+    """
+    check_grid(lists, camera.width, camera.height, tile_size)
+    dtype = splats.means2d.dtype
+    ids, T_final = find(splats, lists, camera, profile, towards_camera(gaussians, camera).to(dtype))
+    return DominantPoints(points_on_rays(ids, gaussians, camera, profile).to(dtype), ids, T_final)
 
 
 def towards_camera(gaussians: Gaussians, camera: Camera) -> Tensor:

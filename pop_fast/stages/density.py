@@ -171,14 +171,14 @@ _LEAST_SQUARED_DISTANCE = 1e-7
 
 
 def view_importance(found: Contributions, dominant_counts: Tensor, outdoor: bool) -> Tensor:
-    """See `pop_ref.mini_splatting.view_importance`. [N] float64 Optimizations: none."""
+    """See `pop_ref.mini_splatting.view_importance`. [N] float64"""
     if not outdoor:
         return found.weight_sum.clone()
     return torch.where(dominant_counts > 0, found.weight_sum / found.n_pixels.clamp_min(1), 0.0)
 
 
 def scene_importance(views: Sequence[tuple[Contributions, Tensor]], outdoor: bool) -> Tensor:
-    """See `pop_ref.mini_splatting.scene_importance`. [N] float64 Optimizations: none.
+    """See `pop_ref.mini_splatting.scene_importance`. [N] float64
 
     Raises:
         ValueError: there are no views.
@@ -191,7 +191,7 @@ def scene_importance(views: Sequence[tuple[Contributions, Tensor]], outdoor: boo
 
 
 def samples_per_view(n_views: int, width: int, height: int, max_points: int = 3_500_000) -> int:
-    """See `pop_ref.mini_splatting.samples_per_view`. Optimizations: none.
+    """See `pop_ref.mini_splatting.samples_per_view`.
 
     Raises:
         ValueError: there is no view.
@@ -218,7 +218,7 @@ _LUMA = (19595, 38470, 7471)
 
 
 def budget_at(nth: int, n: int, start: int, target: int) -> int:
-    """See `pop_ref.taming.budget_at`. Optimizations: none.
+    """See `pop_ref.taming.budget_at`.
 
     Raises:
         ValueError: nth lies outside 0 to n, or there are none.
@@ -247,7 +247,7 @@ def edge_map(photo: Tensor) -> Tensor:
 
 
 def pixel_weights(image: Tensor, photo: Tensor) -> Tensor:
-    """See `pop_ref.taming.pixel_weights`. [H, W] Optimizations: none.
+    """See `pop_ref.taming.pixel_weights`. [H, W]
 
     Raises:
         ValueError: the photograph is not uint8 [H, W, 3], or the shapes differ.
@@ -277,7 +277,7 @@ def view_score(
     radii: Tensor,
     found: Contributions,
 ) -> Tensor:
-    """See `pop_ref.taming.view_score`. [N] float64 Optimizations: none."""
+    """See `pop_ref.taming.view_score`. [N] float64"""
     visible = (radii > 0).all(1)
     terms = (
         scaled_to_median(GRAD, grads)
@@ -294,7 +294,7 @@ def view_score(
 
 
 def quotas(budget: int, n: int, n_clone: int, n_split: int) -> tuple[int, int]:
-    """See `pop_ref.taming.quotas`. Optimizations: none."""
+    """See `pop_ref.taming.quotas`."""
     n_candidates = n_clone + n_split
     more = max(min(budget, n + n_candidates) - n, 0)
     return more * n_clone // max(n_candidates, 1), more * n_split // max(n_candidates, 1)

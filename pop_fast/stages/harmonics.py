@@ -30,10 +30,7 @@ def sh_basis(dirs: Tensor, degree: int) -> Tensor:
 
 
 def sh_basis_vjp(dirs: Tensor, degree: int, v_basis: Tensor) -> Tensor:
-    """See `pop_ref.harmonics.sh_basis_vjp`.
-
-    Optimizations: component rows; only the active bands are touched.
-    """
+    """See `pop_ref.harmonics.sh_basis_vjp`. Optimizations: component rows; only the active bands are touched."""
     x, y, z = columns(dirs)
     v = columns(v_basis)
     _n_sh(degree)

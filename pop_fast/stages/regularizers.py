@@ -47,18 +47,12 @@ def sparse_depth_loss(depth: Tensor, places: Tensor, disparities: Tensor) -> Ten
 
 
 def mean_activation(values: Tensor) -> Tensor:
-    """See `pop_ref.regularizers.mean_activation`; differentiable in `values`.
-
-    Optimizations: none.
-    """
+    """See `pop_ref.regularizers.mean_activation`; differentiable in `values`."""
     return values.sum() / max(values.numel(), 1)
 
 
 def importance_mask(dominant_counts: Tensor) -> Tensor:
-    """See `pop_ref.polarization.importance_mask`. Works for [N] and, view by view, for [C, N].
-
-    Optimizations: none.
-    """
+    """See `pop_ref.polarization.importance_mask`. Works for [N] and, view by view, for [C, N]."""
     return dominant_counts > 0
 
 
@@ -74,26 +68,17 @@ def pop_loss(opacities: Tensor, mask: Tensor, visible: Tensor | None = None) -> 
 
 
 def pop_loss_vjp(opacities: Tensor, mask: Tensor, v_loss: Tensor | float, visible: Tensor | None = None) -> Tensor:
-    """See `pop_ref.polarization.pop_loss_vjp`.
-
-    Optimizations: none.
-    """
+    """See `pop_ref.polarization.pop_loss_vjp`."""
     return v_loss * _value_and_grad(opacities, mask, visible)[1]
 
 
 def opacity_entropy(logits: Tensor) -> Tensor:
-    """See `pop_ref.polarization.opacity_entropy`; differentiable in `logits`.
-
-    Optimizations: none.
-    """
+    """See `pop_ref.polarization.opacity_entropy`; differentiable in `logits`."""
     return _Entropy.apply(logits)
 
 
 def opacity_entropy_vjp(logits: Tensor, v_loss: Tensor | float) -> Tensor:
-    """See `pop_ref.polarization.opacity_entropy_vjp`.
-
-    Optimizations: none.
-    """
+    """See `pop_ref.polarization.opacity_entropy_vjp`."""
     o = torch.sigmoid(logits)
     return -v_loss * logits * o * torch.sigmoid(-logits) / max(len(logits), 1)
 

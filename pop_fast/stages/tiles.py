@@ -59,7 +59,7 @@ class TileLists:
 
 
 def grid_size(width: int, height: int, tile_size: int) -> tuple[int, int]:
-    """See `pop_ref.tiles.grid_size`. Optimizations: none."""
+    """See `pop_ref.tiles.grid_size`."""
     return -(-width // tile_size), -(-height // tile_size)
 
 
@@ -193,7 +193,7 @@ def _sigma_and_size(a: Tensor, b: Tensor, c: Tensor, dx: Tensor, dy: Tensor) -> 
 def snug_box(
     mean2d: Tensor, conic: Tensor, opacity: float, profile: Profile = PAPER
 ) -> tuple[float, float, float, float] | None:
-    """See `pop_ref.tight_tiles.snug_box`. Optimizations: none."""
+    """See `pop_ref.tight_tiles.snug_box`."""
     if opacity < profile.alpha_floor:
         return None
     t = 2.0 * math.log(opacity / profile.alpha_floor)

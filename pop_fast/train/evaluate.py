@@ -21,8 +21,7 @@ from pop_fast.io.formats import decoded, encoded, format_names
 from pop_fast.io.images import write_png
 from pop_fast.io.pictures import error_magnitude, error_picture, id_colors
 from pop_fast.stages.appearance import color_correct
-from pop_fast.stages.losses import ssim
-from pop_fast.stages.ssim import WINDOW_SIZE
+from pop_fast.stages.losses import WINDOW_SIZE, ssim
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.lpips import LPIPS, VARIANTS
 from pop_fast.train.results import ResultFolder

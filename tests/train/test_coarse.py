@@ -99,7 +99,7 @@ def test_stops_that_cannot_be_are_refused(stops):
 @pytest.fixture
 def tiny_may_shrink(monkeypatch: pytest.MonkeyPatch) -> None:
     """Views of 32 x 24 px may be halved."""
-    monkeypatch.setattr(coarse, "SMALLEST_SIDE", 12)
+    monkeypatch.setattr("pop_fast.train.views.SMALLEST_SIDE", 12)
 
 
 @pytest.mark.usefixtures("tiny_may_shrink")

@@ -257,7 +257,7 @@ _PROGRAM: Final = (
     (
         "dissimilarity_of_the_last_band",
         "of an image that is compared in several bands of rows the last band's SSIM is the image's",
-        "stages/ssim.py",
+        "stages/losses.py",
         "total += dissimilarity.sum(dtype=torch.float64)",
         "total = dissimilarity.sum(dtype=torch.float64)",
         "test_losses:a_large_picture_is_as_similar_as_its_halves_are",

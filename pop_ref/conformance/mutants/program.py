@@ -214,7 +214,7 @@ _LINES: Final = (
     (
         "windows_of_the_corner",
         "whether a window of SSIM counts is read from its corner, not from its centre",
-        "stages/ssim.py",
+        "stages/losses.py",
         "mask[margin:-margin, margin:-margin]",
         "mask[: -2 * margin, : -2 * margin]",
         "test_masked_losses:the_dissimilarity_of_what_a_mask_keeps_is_the_oracles",

@@ -190,7 +190,7 @@ _LINES: Final = (
     (
         "whole_windows_over_all_pixels",
         "the mean over whole windows is divided by the number of pixels (fused-ssim crops its map for 'valid')",
-        "stages/ssim.py",
+        "stages/losses.py",
         "n = moments.mu_y.numel() if kept is None",
         "n = d.numel() if kept is None",
         "test_masked_losses:the_dissimilarity_of_large_pictures_beyond_black_and_white_is_the_oracles",

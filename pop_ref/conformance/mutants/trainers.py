@@ -239,8 +239,8 @@ _LINES: Final = (
         "budget_from_the_current_count",
         "Taming-3DGS's parabola begins at the present number of Gaussians",
         "density/methods.py",
-        'self.n_densifications, context.state["first_count"], self',
-        "self.n_densifications, len(context), self",
+        'context.state["first_count"], target)',
+        "len(context), target)",
         "test_strategies:a_training_by_taming_is_the_oracles_at_every_step",
     ),
     (
@@ -279,8 +279,8 @@ _LINES: Final = (
         "halved_not_in_the_gradient",
         "half of D-SSIM halves the value and not the gradient",
         "stages/losses.py",
-        "return v_d_ssim * _gradient(image, target, _Terms(d_ssim_weight=0.5 if halved else 1.0), padding",
-        "return v_d_ssim * _gradient(image, target, _Terms(d_ssim_weight=1.0), padding",
+        "weight = terms.d_ssim_weight if want_grad",
+        "weight = (1.0 if terms.d_ssim_weight == 0.5 else terms.d_ssim_weight) if want_grad",
         "test_masked_losses:the_dissimilarity_of_what_a_mask_keeps_is_the_oracles",
     ),
     (
