@@ -30,7 +30,6 @@ def module_command(module: str, *words: str) -> list[str]:
 
     Args:
         module: of this project, installed or not, or of another one that is installed.
-        words: the module's arguments.
     """
     return python_command(str(Path(__file__).resolve()), module, *words)
 

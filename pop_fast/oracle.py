@@ -6,7 +6,7 @@ stage computes in float64.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from pop_fast.stages.compositing import Composite
 from pop_fast.stages.contributions import Contributions, DominantPoints
-from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of
+from pop_fast.stages.splatting import ProjectionSettings, Shapes, Splats, colors_of
 from pop_fast.stages.stage_set import PassInput, Seen
 from pop_fast.stages.tiles import TileLists
 from pop_ref import compositing, splatting
@@ -29,18 +29,11 @@ from pop_ref.sensitivity import sensitivities
 from pop_ref.tiles import tile_lists
 
 
-class Shapes(NamedTuple):
-    """Rotations and sizes as they are: the oracle makes covariances where it projects."""
-
-    quats: Tensor
-    scales: Tensor
-
-
 class OracleStages:
     """Draws views as `pop_fast.api.backend.ViewStages` says."""
 
     def covariances(self, quats: Tensor, scales: Tensor) -> Shapes:
-        """Return both as they are."""
+        """Return both as they are: the oracle makes covariances where it projects."""
         return Shapes(quats, scales)
 
     def splats(
@@ -174,11 +167,7 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 
 class OracleView:
-    """A shot that has been drawn.
-
-    Args:
-        shot: what is drawn.
-    """
+    """A shot that has been drawn."""
 
     def __init__(self, shot: PassInput) -> None:
         g, c = shot.gaussians, shot.camera

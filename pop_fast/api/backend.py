@@ -220,14 +220,14 @@ def fastest_backend(device: str) -> Backend:
     raise PopError(reasons or f"no backend renders tensors on {device!r}; move them to the CPU")
 
 
-def require_backend(name: str) -> Backend:
-    """Return a backend that can run here.
+def require_backend(backend: str | Backend) -> Backend:
+    """Return a backend, or that of a name, which can run here.
 
     Raises:
         PopError: it is unknown, or cannot; says why and what to do.
     """
-    backend = get_backend(name)
-    reason = backend.why_not()
+    found = get_backend(backend) if isinstance(backend, str) else backend
+    reason = found.why_not()
     if reason is not None:
-        raise PopError(f"backend {name!r} cannot run: {reason}")
-    return backend
+        raise PopError(f"backend {found.name!r} cannot run: {reason}")
+    return found

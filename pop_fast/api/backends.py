@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, cast
 
 import cuda_ext
 from pop_fast import compiled
-from pop_fast.errors import PopError
+from pop_fast.api.backend import require_backend
 from pop_fast.train.steps import WholeStep
 
 if TYPE_CHECKING:
@@ -66,9 +66,7 @@ class BaseBackend:
         Raises:
             PopError: it cannot run here; says why and what to do.
         """
-        reason = self.why_not()
-        if reason is not None:
-            raise PopError(f"backend {self.name!r} cannot run: {reason}")
+        require_backend(cast("Backend", self))
         from pop_fast.api.rasterize import rasterization
 
         return rasterization(*args, **kwargs, backend=cast("Backend", self))
@@ -104,21 +102,12 @@ class CompiledBackend(TorchBackend):
 
     def stages(self) -> Stages:
         """Return the compiled stages."""
-        from pop_fast.compiled.compositing import (
-            colors_of_view,
-            composite,
-            contributions,
-            covariances,
-            dominant_points,
-            project,
-            screen_moments,
-            sensitivities,
-            tile_lists,
-        )
+        from pop_fast.compiled import compositing as own
         from pop_fast.stages.stage_set import Stages, large_tile
 
-        passes = (contributions, sensitivities, screen_moments, dominant_points)
-        return Stages(covariances, project, colors_of_view, tile_lists, composite, large_tile, *passes)
+        drawn = (own.covariances, own.project, own.colors_of_view, own.tile_lists, own.composite)
+        passes = (own.contributions, own.sensitivities, own.screen_moments, own.dominant_points)
+        return Stages(*drawn, large_tile, *passes)
 
     def losses(self) -> Any:
         """Return the losses that hold SSIM in C++, and torch's others."""
@@ -188,7 +177,6 @@ class CudaBackend(BaseBackend):
 
 
 def _make_fused(task: Task) -> MakeFused:
-    """Return what makes the fused step, with the photographs on the GPU."""
     from pop_fast.cuda.training import make_fused
 
     return make_fused(task)

@@ -48,7 +48,6 @@ def check_supported(given: Mapping[str, Any], backend: Backend) -> None:
 
     Args:
         given: arguments by name, those of `UNSUPPORTED` and of `backend.lacks` among them.
-        backend: what is to draw.
 
     Raises:
         NotImplementedError: names the argument.

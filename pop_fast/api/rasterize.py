@@ -25,7 +25,6 @@ from pop_fast.api.checks import (
     check_supported,
     resolved_profile,
 )
-from pop_fast.errors import PopError
 from pop_fast.stages.compositing import Composite, dominant_counts
 from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of
 from pop_fast.stages.tiles import TileLists
@@ -131,7 +130,7 @@ def rasterization(
         PopError: the backend is unknown, cannot run here, or does not offer an argument; says why and what to do.
     """
     check_given(means=means, opacities=opacities, colors=colors, viewmats=viewmats, Ks=Ks)
-    drawing = _backend_for(backend, means)
+    drawing = fastest_backend(means.device.type) if backend == "auto" else require_backend(backend)
     given = {
         "sparse_grad": sparse_grad,
         "distributed": distributed,
@@ -186,22 +185,6 @@ def rasterization(
     options = (tile_size, sh_degree, render_mode, packed, absgrad)
     frame = RasterizationCall(scene, (*batch, n_cameras), settings, *options, drawing.stages())
     return frame.render(backgrounds, dominance, counts)
-
-
-def _backend_for(backend: str | Backend, means: Tensor) -> Backend:
-    """Return the backend that was asked for, which can run here.
-
-    Raises:
-        PopError: it is unknown, or cannot; says why and what to do.
-    """
-    if backend == "auto":
-        return fastest_backend(means.device.type)
-    if isinstance(backend, str):
-        return require_backend(backend)
-    reason = backend.why_not()
-    if reason is not None:
-        raise PopError(f"backend {backend.name!r} cannot run: {reason}")
-    return backend
 
 
 _GATHERED = ("means2d", "depths", "conics", "opacities", "radii")

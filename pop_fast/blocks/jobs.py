@@ -96,7 +96,6 @@ def marker_of(folder: Path, name: str | None, number: int | None = 0) -> Path:
     """Return the file that says that a block is trained in a round or, of no block, that all are merged.
 
     Args:
-        folder: the run's.
         name: of the block, or None.
         number: the round; None is the last one, of the merge.
     """
@@ -138,10 +137,7 @@ def run_in_turn(folder: Path, job: Job, quiet: bool = False, say: Callable[[str]
     """Do the parts that are not done yet, one after the other: train the blocks, merge them, and so in every round.
 
     Args:
-        folder: the run's, whose capture is divided.
-        job: what was asked for.
         quiet: what they print is not shown; warnings and errors are.
-        say: is called with a line on what begins.
 
     Returns:
         The exit status of the first part that failed, or 0; 130 after Ctrl-C or SIGTERM.
@@ -172,10 +168,6 @@ def gpus_for(backend: str) -> int:
 @contextmanager
 def own_gpu(folder: Path, backend: str) -> Iterator[None]:
     """Train on a GPU of this machine that no other block of a run is trained on.
-
-    Args:
-        folder: the run's.
-        backend: what trains.
 
     Raises:
         PopError: a block is trained on each of them.
@@ -211,10 +203,7 @@ def run_workflow(
     """Run the workflow by Snakemake.
 
     Args:
-        folder: the run's.
-        job: what was asked for.
         jobs: how many blocks are trained at a time on this machine; as many as it has GPUs where one trains.
-        threads: of a training.
         backend: what trains; one on a GPU asks for one each.
         profile: a profile's folder, by which it runs on a cluster; None stays here.
         quiet: what it prints is not shown; warnings and errors are.
@@ -232,7 +221,6 @@ def workflow_words(
     """Return the command that runs the workflow; see `run_workflow`.
 
     Args:
-        folder, job, jobs, threads, backend, profile: as `run_workflow`.
         more: further words for Snakemake.
     """
     place = folder.absolute()

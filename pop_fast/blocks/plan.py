@@ -154,7 +154,6 @@ def make_plan(capture: Capture, job: Job, test_every: int) -> Plan:
 
     Args:
         capture: its cameras and points; photographs need not have been read.
-        job: what is asked for.
         test_every: which views are held out; see `Capture.test_views`.
 
     Raises:
@@ -232,9 +231,6 @@ def write_plan(folder: Path, plan: Plan, listing: Listing, transform: np.ndarray
     """Write every block's list and points, and then the plan, which says that they are complete.
 
     Args:
-        folder: the result folder.
-        plan: of the capture.
-        listing: the capture's own, in its own frame.
         transform: the capture's training frame. float64 [4, 4]
     """
     cloud = listing.cloud
@@ -360,7 +356,6 @@ class Partition:
         """Return the borders of a block's core, moved out by a share of its size; infinite where it has none.
 
         Args:
-            block: its number.
             margin: the share, 0 for the core itself.
 
         Returns:

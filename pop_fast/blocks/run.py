@@ -36,7 +36,7 @@ from pop_fast.train.config import TrainConfig
 from pop_fast.train.engines import renderer
 from pop_fast.train.environment import peak_memory_bytes, reproducible, run_facts
 from pop_fast.train.evaluate import evaluate, population
-from pop_fast.train.load_result import CaptureRecord, load_splat
+from pop_fast.train.load_result import CaptureRecord, how_to_load, load_splat
 from pop_fast.train.lpips import load_nets
 from pop_fast.train.model import KEYS
 from pop_fast.train.results import ResultFolder
@@ -53,13 +53,7 @@ _FAR: Final = 0.02
 
 
 def write_map(path: Path, capture: Capture, plan: Plan) -> None:
-    """Draw cameras and points on the ground, each in its block's colour, cores as lines and margins as dashes.
-
-    Args:
-        path: the PNG.
-        capture: its cameras and points.
-        plan: how it is divided.
-    """
+    """Draw cameras and points on the ground, each in its block's colour, cores as lines and margins as dashes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -151,11 +145,7 @@ def divide_capture(
     """Read a capture's cameras and points, and divide it.
 
     Args:
-        config: the settings of the run.
-        record: how the capture is read.
-        job: what was asked for.
         sfm: how the cameras of bare photographs are found.
-        progress: is called with (stage, done, total).
 
     Raises:
         PopError: the capture cannot be read, or not be divided as asked for.
@@ -186,10 +176,7 @@ def round_config(folder: Path, config: TrainConfig, part: Part, steps: int) -> T
     """Return the settings of a block's training in a round from 1: they continue where those of the run have ended.
 
     Args:
-        folder: the run's.
-        config: its settings.
         part: which block, in which round; each round draws another order of views.
-        steps: of the round.
     """
     if part.block is None:
         raise ValueError("a merge is no training")
@@ -205,22 +192,8 @@ def _load(
     progress: Progress | None,
     listing: Listing | None = None,
 ) -> Capture:
-    return load_capture(
-        config.data,
-        factor=config.factor,
-        normalize=config.normalize,
-        masks=record.masks,
-        missing=record.missing,
-        background=config.background,
-        progress=progress,
-        source=record.source,
-        images=record.images,
-        resize=config.resize,
-        seed=config.seed,
-        photographs=photographs,
-        test_every=config.test_every,
-        listing=listing,
-    )
+    given = how_to_load(config, record)
+    return load_capture(config.data, **given, progress=progress, photographs=photographs, listing=listing)
 
 
 # of what a round has changed. On bonsai in 2x2, where all four cores stand in most views, a round of 300 steps that
@@ -235,23 +208,13 @@ def kept_of(partition: Partition, number: int, params: Mapping[str, Tensor]) -> 
     """Return the rows of a block's Gaussians whose centre lies in its core.
 
     Every centre lies in one core, so that what different blocks keep never overlaps.
-
-    Args:
-        partition: the cores.
-        number: the block's.
-        params: its raw parameters.
     """
     kept = torch.from_numpy(partition.block_of(params["means"].double().numpy()) == number)
     return {key: value[kept] for key, value in params.items()}
 
 
 def moved(before: Mapping[str, Tensor], after: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return Gaussians moved by the share `TAKEN` of the way on which a block has trained them in a round.
-
-    Args:
-        before: raw parameters that the round began with.
-        after: those that the block has come to, row by row.
-    """
+    """Return Gaussians moved by the share `TAKEN` of the way on which a block has trained them in a round."""
     return {key: before[key].lerp(after[key], TAKEN) for key in KEYS}
 
 
@@ -263,10 +226,7 @@ def merge(folder: Path, config: TrainConfig, capture: Capture, part: Part) -> di
     merged Gaussians, and of the capture the held-out photographs.
 
     Args:
-        folder: the run's.
-        config: its settings.
         capture: the whole, of which the held-out photographs have been read.
-        part: which merge.
 
     Returns:
         The statistics: of the last merge as in stats/val_step{step}.json, `blocks` with each block's own training and,
@@ -384,10 +344,6 @@ def _stats_path(folder: Path, number: int) -> Path:
 
 def read_round(folder: Path, number: int) -> dict[str, Any]:
     """Read what a round that another one follows came to.
-
-    Args:
-        folder: the run's.
-        number: of the round, from 0.
 
     Raises:
         PopError: it is absent or damaged.

@@ -141,9 +141,6 @@ def _tuning() -> tuple[tuple[str, ...], ...]:
 def build(verbose: bool = False) -> Path:
     """Compile the library for this processor, unless it is there and loads; older versions of it are removed.
 
-    Args:
-        verbose: print the compiler's command.
-
     Returns:
         The library's file.
 
@@ -178,9 +175,6 @@ def build(verbose: bool = False) -> Path:
 
 def build_levels(folder: Path) -> list[Path]:
     """Compile the libraries of a wheel for this kind of machine.
-
-    Args:
-        folder: where they go.
 
     Raises:
         BuildError: there are no levels for this kind of machine, no compiler was found, or it failed.

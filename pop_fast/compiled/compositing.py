@@ -384,12 +384,12 @@ def _dominant_ids(
     return ids, T_final
 
 
-def _by_the_library(function: Callable[P, T], **own: Any) -> Callable[P, T]:
+def _by_the_library(stage: Callable[P, T], /, **own: Any) -> Callable[P, T]:
     """Make a stage of torch's that leaves its work to the library's functions."""
 
-    @wraps(function)
+    @wraps(stage)
     def compiled(*args: P.args, **kwargs: P.kwargs) -> T:
-        return function(*args, **own, **kwargs)
+        return stage(*args, **own, **kwargs)
 
     return compiled
 

@@ -166,10 +166,6 @@ class NativeTrainer:
     Args:
         params: raw float32 tensors by gsplat's keys, updated in place.
         m, v: Adam's moments, likewise.
-        views: photographs and cameras.
-        order: the view of every step of the schedule.
-        settings: objective and update.
-        step: the step to begin at.
         threads: None takes torch's number.
         cache_mb: memory for what is made of photographs; the others' is made anew at every visit, to the same bits.
         stop: whether somebody has asked for an end; a step that is being taken is then left, and changes nothing.

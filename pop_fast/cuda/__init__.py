@@ -28,7 +28,6 @@ def rasterization(
     """Render; see `pop_fast.api.rasterize.rasterization`.
 
     Args:
-        args: as there.
         backward, deterministic: as `pop_fast.api.backends.CudaBackend` says.
         kwargs: as there, without `backend`.
     """

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,20 +16,13 @@ from cuda_ext.render.scores import ScoredView
 from pop_fast.stages.compositing import Composite
 from pop_fast.stages.contributions import Contributions, DominantPoints, fisher_blocks, points_on_rays, towards_camera
 from pop_fast.stages.projection import intrinsics
-from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of
+from pop_fast.stages.splatting import ProjectionSettings, Shapes, Splats, colors_of
 from pop_fast.stages.stage_set import PassInput, Seen
 from pop_fast.stages.tiles import TileLists
 from pop_fast.stages.types import Camera, Gaussians
 from pop_fast.train.engines import translate_oom
 
 WIDEST = 4  # channels that one launch blends
-
-
-class Shapes(NamedTuple):
-    """Rotations and sizes as they are: one kernel makes covariances and projects them."""
-
-    quats: Tensor
-    scales: Tensor
 
 
 @dataclass(frozen=True)
@@ -58,7 +50,7 @@ class CudaStages:
     deterministic: bool
 
     def covariances(self, quats: Tensor, scales: Tensor) -> Shapes:
-        """Return both as they are."""
+        """Return both as they are: one kernel makes covariances and projects them."""
         return Shapes(quats, scales)
 
     def splats(
@@ -181,9 +173,6 @@ def _empty_stats(rows: Splats, settings: ProjectionSettings) -> RenderStats:
 class CudaView:
     """A shot that has been drawn on the GPU where its Gaussians lie.
 
-    Args:
-        pass_input: what is drawn.
-
     Raises:
         PopError: the GPU has no room; says what to lower.
     """
@@ -193,17 +182,8 @@ class CudaView:
         g, c = pass_input.gaussians, pass_input.camera
         rows = (g.means, g.quats, g.scales, g.opacities, g.sh)
         with translate_oom():
-            self._view = ScoredView(
-                rows,
-                c.viewmat,
-                c.K,
-                c.width,
-                c.height,
-                pass_input.sh_degree,
-                pass_input.background,
-                pass_input.profile,
-                pass_input.antialiased,
-            )
+            how = (pass_input.sh_degree, pass_input.background, pass_input.profile, pass_input.antialiased)
+            self._view = ScoredView(rows, c.viewmat, c.K, c.width, c.height, *how)
 
     def seen(self) -> Seen:
         """Return the drawing."""

@@ -148,8 +148,6 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
 
         Args:
             opacities: activated opacities, in the graph. [N]
-            state: the strategy's state.
-            step: counts from 0.
             info: what `rasterization()` returned last; its `dominant_counts` decide which Gaussians are important.
         """
         if not self.regularizes(step):
@@ -220,8 +218,6 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
 
         Args:
             params: raw parameters, after the optimizers' step.
-            state: the strategy's state.
-            step: counts from 0.
             info: what `rasterization()` returned last, after the backward pass.
             packed: whether its rows are those of visible Gaussians alone.
         """
@@ -291,9 +287,6 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
 
         Args:
             params: raw parameters, replaced under their keys.
-            optimizers: one per key.
-            state: the strategy's state.
-            step: counts from 0.
             draws: random numbers; None takes them from the state's generator.
             passes: over the training views, which some methods look at.
             sh_degree: colour bands that those are drawn with.
@@ -327,7 +320,6 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         """Clone, split, prune, and start a new window.
 
         Args:
-            context: the Gaussians, and what a step may ask for.
             clones: which Gaussians are cloned. [N] bool
             splits: which are split. [N] bool
             prunes: given the grown set of Gaussians, tells which are pruned. -> bool

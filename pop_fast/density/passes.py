@@ -54,10 +54,6 @@ class Passes:
 
     Args:
         backend: which trains, or its name: "fast", "compiled", "cuda" or "ref".
-        views: to pass over.
-        profile: the rasterizer's constants.
-        background: colour behind everything.
-        antialiased: render with opacity compensation.
         device: where the parameters lie; the CPU by default.
 
     Raises:
@@ -110,9 +106,6 @@ class Passes:
         """Draw a view and sum what every Gaussian contributes to it.
 
         Args:
-            params: raw parameters.
-            index: of the view.
-            sh_degree: bands to use.
             pixel_map: what `map_sum` adds up, or a function that makes it of the image. [H, W]
         """
         view = self._open(self._shot(params, index, sh_degree))
@@ -140,9 +133,6 @@ class Passes:
         """Return PUP-3DGS's Fisher block of every Gaussian in a view by (mean, log-scale). [N, 6, 6] float64
 
         Args:
-            params: raw parameters.
-            index: of the view.
-            sh_degree: bands to use.
             divisor: of the view's width and height, rounded up; the field of view stays.
 
         Raises:

@@ -83,10 +83,6 @@ def split(
     then all first children, then all second children.
 
     Args:
-        params: raw parameters.
-        optimizers: one per key.
-        state: the strategy's state.
-        mask: the Gaussians to split. [N] bool
         normals: standard normal draws for the first and the second child of each, of any precision. [2, M, 3]
         revised_opacity: give the children `1 - sqrt(1 - o)`, so that two coincident ones equal the parent.
 
@@ -116,14 +112,7 @@ def reset_opacities(params: Params, optimizers: Optimizers, ceiling: float) -> N
 
 @torch.no_grad()
 def replace_rows(params: Params, optimizers: Optimizers, state: State, rows: Mapping[str, Tensor]) -> None:
-    """Let new Gaussians take the place of all there are, with Adam anew; per-Gaussian statistics are left with no rows.
-
-    Args:
-        params: raw parameters.
-        optimizers: one per key.
-        state: the strategy's state.
-        rows: every parameter of the new Gaussians.
-    """
+    """Let new Gaussians take the place of all there are, with Adam anew; statistics are left with no rows."""
     none = torch.zeros(len(params["means"]), dtype=torch.bool, device=params["means"].device)
     edit_rows(params, optimizers, state, keep=none, appended=rows)
     restart(params, optimizers)
@@ -147,12 +136,7 @@ def prune_marked(context: DensificationContext, mask: Tensor) -> int:
 
 
 def summed_over_views(context: DensificationContext, score: Callable[[int], Tensor]) -> Tensor:
-    """Add up what a score gives for every training view, in float64.
-
-    Args:
-        context: the Gaussians, and what a step may ask for.
-        score: of a view by its index, any shape.
-    """
+    """Add up what a score gives for every training view, in float64."""
     total = score(0).to(torch.float64)
     for index in range(1, context.views.n_views):
         total += score(index)

@@ -61,9 +61,6 @@ def view_scores(score: Score, passes: Passes, params: Mapping[str, Tensor], sh_d
     Args:
         score: "contributions" adds the blending weights over all pixels, "dominance" counts the pixels where it has the
             largest, "sensitivity" is Speedy-Splat's; "visibility" needs no view.
-        passes: over the views.
-        params: raw parameters.
-        sh_degree: bands to use.
 
     Returns:
         Not negative. [N] float64
@@ -108,7 +105,6 @@ def best_within(scores: Tensor, most: int, size_of: Callable[[Tensor], int]) -> 
 
     Args:
         scores: [N]
-        most: bytes.
         size_of: the bytes of a file with the Gaussians that are marked. [N] bool -> int
 
     Raises:

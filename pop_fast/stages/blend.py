@@ -149,7 +149,6 @@ def weights_of_alphas(alpha: Tensor, transmittances: Tensor, stop: Stop) -> Tens
         alpha: in and, where a pixel stops, out. [n, K, P]
         transmittances: T before the step in the first of K + 1 rows; out: T after it in the last, still to be
             compared with the stop, and in the others the weights. [n, K + 1, P]
-        stop: when pixels stop.
 
     Returns:
         The weights, a view of `transmittances`. [n, K, P]
@@ -353,7 +352,6 @@ class Blender:
         """Blend a step that was kept once more.
 
         Args:
-            group: whose step it is.
             step: of a `blend` that kept what the transpose needs; its light stays.
             scratch: two of `group.slab` numbers, or three.
 

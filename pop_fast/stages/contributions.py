@@ -301,7 +301,6 @@ class PairWalk:
     """Goes through the pairs of a view.
 
     Args:
-        splats: with their colours.
         lists: what each tile blends.
         width: px.
         height: px.
@@ -390,12 +389,7 @@ class PairWalk:
 
 
 class EntryRows:
-    """One row of sums an entry, added up for every splat.
-
-    Args:
-        walk: whose entries they are.
-        columns: numbers in a row.
-    """
+    """One row of sums an entry, added up for every splat."""
 
     def __init__(self, walk: PairWalk, columns: int) -> None:
         self._ids, self._n = walk.entries.lists.ids, walk.n_splats

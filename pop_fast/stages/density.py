@@ -310,7 +310,6 @@ def mean_squared_distances(points: np.ndarray, k: int = 3) -> np.ndarray:
 
     Args:
         points: any unit; those that coincide are each other's nearest. [N, 3]
-        k: how many.
 
     Returns:
         In the squared unit; 0 for a single point. [N] float64

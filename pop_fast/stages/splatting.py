@@ -7,7 +7,7 @@ recorded for the hundred elementwise operations in between.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -62,6 +62,13 @@ class Splats:
     radii: Tensor
     compensations: Tensor | None = None
     colors: Tensor | None = None
+
+
+class Shapes(NamedTuple):
+    """Rotations [N, 4] and sizes [N, 3] as they are, for backends that make covariances where they project."""
+
+    quats: Tensor
+    scales: Tensor
 
 
 def colors_of(splats: Splats) -> Tensor:

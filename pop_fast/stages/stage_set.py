@@ -195,9 +195,6 @@ class Stages:
         """List rows in tiles of that size, None for the cheapest.
 
         Args:
-            rows: of one view.
-            settings: of the view.
-            tile_size: px, or None.
             exact: leave out entries that reach no pixel.
         """
         shape = {"conics": rows.conics.detach(), "opacities": rows.opacities.detach()} if exact else {}

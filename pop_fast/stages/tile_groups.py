@@ -99,9 +99,7 @@ class TileGroup:
 
         Args:
             rows: tiles to choose from, as places in the group; all when None.
-            n: how many of them take part, from the first.
             start: block of the lists where the step begins.
-            count: blocks that it takes.
 
         Returns:
             [n, count]
@@ -161,7 +159,6 @@ def exponent_coefficients(entries: Entries, conics: Tensor, opacities: Tensor) -
     """Return the six coefficients of log2(alpha) of every entry, such that padding blends nothing. [6, 8 B] float64
 
     Args:
-        entries: of the tile lists.
         conics: inverse screen covariances, px^-2. [N, 3]
         opacities: [N]
     """

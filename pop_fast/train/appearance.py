@@ -20,12 +20,7 @@ from pop_fast.train.views import ViewTensors
 
 
 class Appearance:
-    """Exposures and corrections of the training views, each with its Adam.
-
-    Args:
-        config: says what is learned, and at which rates.
-        views: to train on.
-    """
+    """Exposures and corrections of the training views, each with its Adam."""
 
     def __init__(self, config: TrainConfig, views: Sequence[ViewTensors]) -> None:
         self._config = config

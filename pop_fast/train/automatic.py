@@ -110,8 +110,6 @@ def factor_for(sizes: Sequence[tuple[int, int]], gpu: bool, minutes: float) -> i
 
     Args:
         sizes: width and height of the photographs, px; of none it is 1.
-        gpu: a GPU trains.
-        minutes: that the run may take.
     """
     side = SIDES["gpu" if gpu else "cpu" if minutes >= SOON else "cpu, soon"]
     times = max([1.0, *(max(size) / side for size in sizes)])
@@ -126,10 +124,7 @@ def expected_gaussians(method: str, first: int, pixels: float, photographs: int,
 
     Args:
         method: of density control; those that prune at their end are foretold as they are before.
-        first: Gaussians at the start.
         pixels: of a photograph as it is trained on.
-        photographs: to train on.
-        scaler: of the paper's schedule.
     """
     if method == "pop":
         grown = _POP_GROWS * pixels * scaler**_POP_POWER
@@ -156,11 +151,8 @@ def choose_length(
 
     Args:
         config: the settings; the paper's steps are read.
-        speed: of this machine.
         minutes: that training, measuring and the report may take.
-        pixels: of a photograph.
         photographs: there are, with those held out.
-        held_out: views that are measured.
     """
     steps = TrainConfig.of(method=config.method).max_steps
 

@@ -42,17 +42,8 @@ FORMAT = 1
 _NAME = re.compile(r"ckpt_(\d+)_rank0\.pt")
 _DAMAGED = "remove the file to continue from the one before it"
 _NEEDED = (
-    "format",
-    "step",
-    "splats",
-    "optimizers",
-    "strategy",
-    "view_order",
-    "config",
-    "capture",
-    "metrics_bytes",
-    "seconds",
-    "threads",
+    *("format", "step", "splats", "optimizers", "strategy", "view_order", "config", "capture"),
+    *("metrics_bytes", "seconds", "threads"),
 )
 
 
@@ -162,10 +153,6 @@ def check_fits(
     """Check that a checkpoint belongs to a run.
 
     Args:
-        path: of the checkpoint.
-        content: what it holds, checked.
-        config: the run's settings.
-        fingerprint: of the run's capture.
         threads: of one operation; None where the bits of the steps do not depend on it.
         n_views: how many the run trains on.
         known: what the state of the run's strategy holds.
@@ -192,10 +179,8 @@ def check_fits(
     last, order = config.max_steps - 1, content["view_order"]["order"]
     odd = sorted(set(known) ^ content["strategy"].keys())
     learned = {name: len(found["value"]) for name, found in content["appearance"].items()}
-    expected = {
-        **({"exposures": n_views} if config.exposure else {}),
-        **({"cameras": n_views} if config.refine_cameras else {}),
-    }
+    asked = {"exposures": config.exposure, "cameras": config.refine_cameras}
+    expected = {name: n_views for name, is_learned in asked.items() if is_learned}
     if content["step"] > last:
         raise PopError(f"{path}: step is {content['step']}; it must be at most {last}, the run's last: {_DAMAGED}")
     if len(order) not in (0, n_views):
@@ -300,7 +285,6 @@ def check_splats(splats: Any, kind: torch.dtype | None = None) -> dict[str, Tens
     """Check the raw parameters of a checkpoint.
 
     Args:
-        splats: what stands under that key.
         kind: the type that every tensor must have; None takes any floats, and 0, 3 or 8 in place of 15 coefficients.
 
     Returns:

@@ -20,7 +20,6 @@ def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConf
     A resumed run keeps the backend that it was begun with.
 
     Args:
-        config: the settings as given.
         resume: continue with the run in `config.result_dir`, if there is one.
 
     Returns:

@@ -121,10 +121,7 @@ class Tuner:
         held_out: views that nothing here trains on or chooses by.
 
     Args:
-        params: raw parameters, whole.
         sh_degree: highest active colour band.
-        config: how it was trained.
-        capture: in the frame of the parameters.
         learned: what the run has learned of its photographs, as a checkpoint holds it.
         steps: that what is kept is trained for; 0 trains nothing.
         report: is called with the steps taken so far, those planned, and the seconds that all of them will take, None
@@ -241,9 +238,6 @@ def with_pictures(capture: Capture, params: Params, config: TrainConfig, sh_degr
     """Put pictures of a splat in the place of a capture's photographs, which show what it has lost.
 
     Args:
-        capture: in the frame of the parameters.
-        params: raw parameters.
-        config: how they are drawn.
         sh_degree: highest active colour band.
 
     Returns:
@@ -273,10 +267,7 @@ def within(tuner: Tuner, score: Callable[[Params], Tensor], most: int, coding: C
     """Fit a splat into so many bytes.
 
     Args:
-        tuner: has the splat and its photographs.
         score: gives the scores of Gaussians, of which those of the highest stay. -> [N]
-        most: bytes.
-        coding: of the file.
 
     Returns:
         What `coding.write` makes at most so many bytes of, no worse in training views than fewer Gaussians alone.

@@ -200,7 +200,6 @@ class TrainConfig:
 
         Args:
             words: `--name value`, `--group.name value ...`, `--flag` and `--no-flag`.
-            method, preset: as of `of`.
 
         Raises:
             PopError: an unknown option, or a value that it cannot have; names it.
@@ -278,14 +277,9 @@ class TrainConfig:
 
     def objective_at(self, step: int) -> Objective:
         """Return what the render of a step is compared with its photograph by."""
-        said = {
-            "pixelwise": self.photometric,
-            "pixel_scale": 1.0 / self.photometric_divisor,
-            "lambda_ssim": self.lambda_ssim,
-            "padding": self.ssim_padding,
-            "d_ssim_halved": self.d_ssim_halved,
-        }
-        return Objective(**said).at(step, self.l2_stop_iter)
+        scale, halved = 1.0 / self.photometric_divisor, self.d_ssim_halved
+        said = Objective(self.photometric, scale, self.lambda_ssim, padding=self.ssim_padding, d_ssim_halved=halved)
+        return said.at(step, self.l2_stop_iter)
 
     def to_json(self) -> str:
         """Write the settings as JSON, in reading order: as given (null where no preset was), and as they are run."""
@@ -309,11 +303,7 @@ class TrainConfig:
             raise PopError(f"config is not JSON: {error.msg} at line {error.lineno}, column {error.colno}") from error
         except (ValueError, RecursionError) as error:
             raise PopError(f"config is not JSON that can be read: {error}") from error
-        if (
-            not isinstance(plain, dict)
-            or not isinstance(plain.get(_RESOLVED), dict)
-            or set(plain) != {_GIVEN, _RESOLVED}
-        ):
+        if not isinstance(plain, dict) or plain.keys() != {_GIVEN, _RESOLVED} or type(plain[_RESOLVED]) is not dict:
             raise PopError(f"config is not {{{_GIVEN}, {_RESOLVED}}}, so it is of an older version of pop or damaged")
         values = dict(plain[_RESOLVED])
         method = values.pop("method", "pop")
@@ -390,20 +380,9 @@ def first_difference(ours: dict[str, Any], theirs: dict[str, Any]) -> tuple[str,
 
 
 _AT_LEAST: Final = {
-    "max_steps": 1,
-    "batch_size": 1,
-    "seed": 0,
-    "factor": 1,
-    "sh_degree": 0,
-    "sh_interval": 1,
-    "test_every": 0,
-    "threads": 0,
-    "checkpoint_every": 0,
-    "keep_checkpoints": 1,
-    "log_every": 1,
-    "max_renders": 0,
-    "target_cache_mb": 0,
-    "l2_stop_iter": 0,
+    **dict.fromkeys(("max_steps", "batch_size", "factor", "sh_interval", "keep_checkpoints", "log_every"), 1),
+    **dict.fromkeys(("seed", "sh_degree", "test_every", "threads", "checkpoint_every", "max_renders"), 0),
+    **dict.fromkeys(("target_cache_mb", "l2_stop_iter"), 0),
 }
 # photographs shrunk by 16 show little
 _MOST_COARSE_STOPS: Final = 4
@@ -411,12 +390,8 @@ _MOST_COARSE_STOPS: Final = 4
 _MOST_THREADS: Final = 512
 # numbers that are divided by, or of which a logarithm is taken
 _OVER_ZERO: Final = (
-    "init_scale",
-    "photometric_divisor",
-    "lr.means_decay",
-    "lr.others_decay",
-    "appearance_lr.exposures_decay",
-    "appearance_lr.cameras_decay",
+    *("init_scale", "photometric_divisor", "lr.means_decay", "lr.others_decay"),
+    *("appearance_lr.exposures_decay", "appearance_lr.cameras_decay"),
 )
 # of the strategy, whose settings errors call by the method's name as the command line does
 _AT_LEAST_OF_STRATEGY: Final = {

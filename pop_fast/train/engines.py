@@ -47,13 +47,10 @@ def engine_of(config: TrainConfig, own_strategy: bool = True) -> Engine:
 def torch_engine(backend: str | Backend) -> Engine:
     """Return autograd over the stages of a backend for CPU tensors.
 
-    Args:
-        backend: it, or its name.
-
     Raises:
         PopError: it is unknown or cannot run here.
     """
-    drawing = require_backend(backend if isinstance(backend, str) else backend.name)
+    drawing = require_backend(backend)
 
     def by_autograd(task: Task) -> Stepper:
         return (TorchStepper if task.config.batch_size == 1 else BatchStepper)(task, drawing)
@@ -64,13 +61,10 @@ def torch_engine(backend: str | Backend) -> Engine:
 def whole_engine(backend: str | Backend = "compiled") -> Engine:
     """Return the whole step that a backend offers.
 
-    Args:
-        backend: it, or its name.
-
     Raises:
         PopError: it is unknown, cannot run here, or offers none.
     """
-    drawing = require_backend(backend if isinstance(backend, str) else backend.name)
+    drawing = require_backend(backend)
     step = drawing.whole_step()
     if step is None:
         raise PopError(f"backend {drawing.name!r} has no step of its own; autograd over its stages takes them")
@@ -96,12 +90,7 @@ _LESS = "use smaller images (--factor 2 or more), fewer Gaussians, or a card wit
 
 
 class GpuProxy:
-    """Renders tensors of any device on one device, and hands images and `info` back on the CPU.
-
-    Args:
-        backend: what renders there.
-        device: where.
-    """
+    """Renders tensors of any device on one device, and hands images and `info` back on the CPU."""
 
     def __init__(self, backend: Renderer, device: torch.device) -> None:
         self._backend, self.device = backend, device

@@ -138,14 +138,9 @@ def evaluate(
     """Render and measure views.
 
     Args:
-        backend: what renders.
-        params: raw parameters.
-        views: held-out views.
         config: background, profile and the like; with `exposure` PSNR is also measured after fitting colours.
         sh_degree: highest active colour band.
-        nets: LPIPS networks.
         folder: where pictures of the first `config.max_renders` views go; None keeps none.
-        step: in the pictures' names.
 
     Returns:
         Averages over the views; Gaussians per pixel; seconds per rendered view; `per_view` metrics by name.
@@ -243,9 +238,7 @@ def measure_encodings(
     A format that cannot hold the splat is left out.
 
     Args:
-        backend: what renders.
         params: raw parameters, in the training frame.
-        views: held-out views.
         config: background, profile and antialiasing are read.
         sh_degree: highest active colour band.
         world_transform: the training frame from the capture's. [4, 4]

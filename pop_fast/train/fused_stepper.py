@@ -69,10 +69,7 @@ class FusedStepper:
     """Takes steps by `make`, of `batch_size` views where that knows them; see `Stepper` and `BatchStepper`.
 
     Args:
-        task: what is trained; its settings are known to the step.
-        name: of the engine.
         most: steps at a time, where they take less than a second.
-        make: makes what takes them.
     """
 
     task: Task
@@ -191,25 +188,16 @@ def step_settings(config: TrainConfig, updates: Updates, scene_scale: float = 1.
     """Return what stays the same over a run.
 
     Args:
-        config: step numbers as they are run.
         updates: which parameters Adam moves at which step.
         scene_scale: world units.
     """
-    pop = config.strategy
+    of_strategy = ("lambda_pop", "lambda_entropy", "pop_views", "pop_over")
+    of_strategy += ("blur_window", "theta_blur", "blur_min_pixels")
     return StepSettings(
         updates,
         padding=config.ssim_padding,
-        lambda_pop=pop.lambda_pop,
-        lambda_entropy=pop.lambda_entropy,
-        pop_views=pop.pop_views,
-        pop_over=pop.pop_over,
-        blur_window=pop.blur_window,
-        theta_blur=pop.theta_blur,
-        blur_min_pixels=pop.blur_min_pixels,
         depth_weight=config.depth_lambda * scene_scale,
-        opacity_reg=config.opacity_reg,
-        scale_reg=config.scale_reg,
-        background=config.background,
         profile=config.renderer,
-        antialiased=config.antialiased,
+        **{name: getattr(config.strategy, name) for name in of_strategy},
+        **{name: getattr(config, name) for name in ("opacity_reg", "scale_reg", "background", "antialiased")},
     )

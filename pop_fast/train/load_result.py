@@ -88,6 +88,13 @@ class CaptureRecord:
     chosen: list[str] = field(default_factory=list)
 
 
+def how_to_load(config: TrainConfig, record: CaptureRecord) -> dict[str, Any]:
+    """Return what `load_capture` is told of a run's capture, but for progress and which photographs are read."""
+    of_run = ("factor", "normalize", "background", "resize", "seed", "test_every")
+    own = {name: getattr(record, name) for name in ("masks", "missing", "source", "images")}
+    return {**own, **{name: getattr(config, name) for name in of_run}}
+
+
 def record_text(record: CaptureRecord) -> str:
     """Return what capture.json holds."""
     return json.dumps(asdict(record), indent=2) + "\n"
@@ -183,9 +190,6 @@ def open_capture(
     """Load the capture that a splat shows, and give the settings to look at it with.
 
     Args:
-        splat: what is looked at.
-        options: which photographs and cameras.
-        progress: is called with (stage, done, total).
         photographs: which are read; see `pop_fast.data.load_capture`.
 
     Raises:
@@ -199,32 +203,18 @@ def open_capture(
         raise PopError(f"{splat.path}: nothing says which capture it shows; give --capture DIR")
     if options.capture is None and not Path(data).is_dir():
         raise PopError(f"{splat.path}: was trained on {data}, which is not there; give --capture DIR")
-    changes: dict[str, Any] = {"data": data}
-    if options.factor is not None:
-        changes["factor"] = options.factor
-    if options.test_every is not None:
-        changes["test_every"] = options.test_every
-    said = frame_of_splat(splat, options)
-    changes["normalize"] = said == "training"
-    if said is None:
+    asked = {"factor": options.factor, "test_every": options.test_every}
+    changes: dict[str, Any] = {"data": data, **{name: value for name, value in asked.items() if value is not None}}
+    frame = frame_of_splat(splat, options)
+    changes["normalize"] = frame == "training"
+    if frame is None:
         taken = "says nothing of its world, and is taken to be in the capture's own"
         print(f"note: {splat.path}: {taken}; that of gsplat's trainer needs --training-frame", file=sys.stderr)
     config = _in_frame(replace(splat.config, **changes), splat)
-    capture = load_capture(
-        data,
-        factor=config.factor,
-        normalize=config.normalize,
-        masks=record.masks,
-        missing=options.missing or record.missing,
-        background=config.background,
-        progress=progress,
-        source=record.source if options.capture is None else "auto",
-        images=options.images or record.images,
-        resize=config.resize,
-        seed=config.seed,
-        photographs=photographs,
-        test_every=config.test_every,
-    )
+    source = record.source if options.capture is None else "auto"
+    said = {"missing": options.missing or record.missing, "images": options.images or record.images, "source": source}
+    given = how_to_load(config, replace(record, **said))
+    capture = load_capture(data, **given, progress=progress, photographs=photographs)
     if config.normalize:
         _check_same_frame(splat, capture)
     return capture, config
@@ -278,9 +268,7 @@ def paths_read(splat: Splat, root: Path, capture: Capture) -> list[Path]:
     """List what the rendering of a splat reads: it, its result folder, the capture and where its photographs lie.
 
     Args:
-        splat: what is rendered.
         root: the capture's folder.
-        capture: the capture.
 
     Returns:
         Files and folders; no output may take the place of one.

@@ -30,9 +30,6 @@ def check_views(config: TrainConfig, name: str, train: Sequence[ViewTensors], te
     """Check the cameras of all views, and that each photograph can be compared as the settings ask.
 
     Args:
-        config: `ssim_padding` is read.
-        name: the capture's.
-        train: views to train on.
         test: held-out views, which are always measured by whole windows.
 
     Raises:
@@ -55,10 +52,6 @@ def check_views(config: TrainConfig, name: str, train: Sequence[ViewTensors], te
 def check_start(name: str, initial: Mapping[str, Tensor]) -> None:
     """Check that the first Gaussians can be rendered.
 
-    Args:
-        name: the capture's.
-        initial: raw parameters.
-
     Raises:
         PopError: an entry is not finite, or a scale is too large for a float; names it and what to do.
     """
@@ -73,10 +66,6 @@ def check_start(name: str, initial: Mapping[str, Tensor]) -> None:
 
 def facts(config: TrainConfig, views: Sequence[ViewTensors]) -> dict[str, Any]:
     """Return what a run's statistics say of its settings.
-
-    Args:
-        config: the settings.
-        views: the training views.
 
     Returns:
         method, preset, seed, lambda_pop, theta_blur_pixels (share of the smallest and of the largest view, px),
@@ -96,12 +85,7 @@ def facts(config: TrainConfig, views: Sequence[ViewTensors]) -> dict[str, Any]:
 
 
 def find_warnings(config: TrainConfig, views: Sequence[ViewTensors]) -> Iterator[str]:
-    """Say, in one sentence each, what will not do as it is set, and which option fixes it.
-
-    Args:
-        config: the settings.
-        views: the training views.
-    """
+    """Say, in one sentence each, what will not do as it is set, and which option fixes it."""
     plan = config.strategy
     smallest = min(views, key=lambda view: view.kept_pixels)
     pixels = plan.theta_blur * smallest.kept_pixels

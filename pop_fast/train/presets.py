@@ -271,19 +271,15 @@ def _quick(strategy: DensityControl) -> DensityControl:
 def values_of(recipe: Recipe) -> dict[str, Any]:
     """Return what a recipe says besides density control and the POP term, in the names of `TrainConfig`."""
     return {
-        "max_steps": recipe.max_steps,
-        "sh_interval": recipe.sh_interval,
+        **{name: getattr(recipe, name) for name in ("max_steps", "sh_interval")},
         "photometric": recipe.pixelwise,
         "photometric_divisor": 1.0 / recipe.pixel_scale,
-        "lambda_ssim": recipe.lambda_ssim,
-        "l2_stop_iter": recipe.l2_stop_iter,
+        **{name: getattr(recipe, name) for name in ("lambda_ssim", "l2_stop_iter")},
         "ssim_padding": recipe.padding,
         "d_ssim_halved": recipe.d_ssim_halved,
         "profile": recipe.profile.name,
         "lr": recipe.lr,
-        "depth_lambda": recipe.depth_lambda,
-        "opacity_reg": recipe.opacity_reg,
-        "scale_reg": recipe.scale_reg,
+        **{name: getattr(recipe, name) for name in ("depth_lambda", "opacity_reg", "scale_reg")},
     }
 
 
@@ -362,8 +358,6 @@ def from_plain(kind: type[T], plain: Any, where: str, skipped: tuple[str, ...] =
     """Build a dataclass from what `to_plain` made of it; absent fields keep their default.
 
     Args:
-        kind: the dataclass.
-        plain: the values by name.
         where: what errors call it.
         skipped: fields that plain values cannot give.
 

@@ -95,7 +95,6 @@ class Ranks:
 
         Args:
             params: raw parameters, on the CPU.
-            step: steps taken.
 
         Raises:
             PopError: they differ, as machines of different kinds or libraries may round otherwise.

@@ -324,9 +324,6 @@ def record_of(
     What the engine has not measured is left out.
 
     Args:
-        segment: that the step belongs to.
-        step: its number.
-        config: step numbers as they are run.
         lr_means: learning rate of the means at that step, world units.
         seconds_before: of training, before the segment.
     """
@@ -433,7 +430,6 @@ def commands_text(earlier: Path | None, words: Sequence[str]) -> str:
 
     Args:
         earlier: the folder of the run that is resumed; None begins anew.
-        words: the command.
     """
     before = read_commands(earlier) if earlier is not None else []
     return json.dumps([*before, {"words": list(words), "folder": str(Path.cwd())}], indent=2) + "\n"

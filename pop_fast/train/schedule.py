@@ -34,7 +34,6 @@ def updates_of(
 
     Args:
         lr: the rates to begin with, and the decay of the second moments.
-        scene_scale: the unit of the means' rate, world units.
         max_steps: length of the run, over which the means' rate decays.
         rules: which parameters Adam moves at which step; None moves all at every step.
         edits: steps after which Gaussians are added or removed; those outside the run are left out.
@@ -63,12 +62,7 @@ def updates_of(
 
 
 def steady_updates(lr: Mapping[str, float], steps: int) -> Updates:
-    """Move every parameter at every step, at rates that stay the same.
-
-    Args:
-        lr: learning rate by parameter.
-        steps: length of the schedule.
-    """
+    """Move every parameter at every step, at rates that stay the same."""
     rates = torch.tensor([[lr[name] for name in PARAMETERS]], dtype=torch.float64).repeat(steps, 1)
     numbers = torch.arange(1, steps + 1, dtype=torch.int32)[:, None].repeat(1, len(PARAMETERS))
     return Updates(rates, numbers)
@@ -104,9 +98,7 @@ def phase_at(config: TrainConfig, strategy: DensityControl | ForeignStrategy, st
     """Return what a step does.
 
     Args:
-        config: step numbers as they are run.
         strategy: decides what is collected; of one that is not ours it is not known, and it sees to that itself.
-        step: counts from 0.
     """
     own = isinstance(strategy, DensityControl)
     return Phase(
@@ -124,10 +116,7 @@ def segment_end(config: TrainConfig, strategy: DensityControl | ForeignStrategy,
     """Return how far a stepper goes by itself: to a densification step, a milestone, another phase, or far enough.
 
     Args:
-        config: step numbers as they are run.
         strategy: as in `phase_at`.
-        first: the step to begin with.
-        longest: most steps at a time.
 
     Returns:
         One more than the last step of the segment.
@@ -157,9 +146,7 @@ def updates_of_strategy(config: TrainConfig, strategy: DensityControl | ForeignS
     """List the rates and the numbers of all of Adam's updates of a run.
 
     Args:
-        config: step numbers as they are run.
         strategy: at whose changes Adam may skip or restart; of one that is not ours it is not known.
-        scene_scale: the unit of the means' rate, world units.
     """
     if isinstance(strategy, ForeignStrategy):
         return updates_of(config.lr, scene_scale, config.max_steps)
@@ -233,12 +220,7 @@ def at_rest(strategy: DensityControl) -> DensityControl:
 
 
 def refining(config: TrainConfig, steps: int) -> TrainConfig:
-    """Return the settings of a training that continues after the last step of another one.
-
-    Args:
-        config: of that training.
-        steps: how many more are taken.
-    """
+    """Return the settings of a training that continues after the last step of another one."""
     last, plan, lr = config.max_steps - 1, config.strategy, config.lr
     degree = active_sh_degree(last, config.sh_interval, config.sh_degree, plan.sh_start_iter)
     begins = min(_MEANS_AGAIN * lr.means_decay, 1.0)

@@ -230,8 +230,6 @@ def why_not_trained(backend: Backend, config: TrainConfig, own_strategy: bool = 
     Where the tensors are the CPU's, autograd over the stages takes whatever steps a whole one does not know.
 
     Args:
-        backend: which can run here.
-        config: the settings.
         own_strategy: whether the density strategy is one of this package.
     """
     if backend.device == "cpu":

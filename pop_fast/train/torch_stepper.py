@@ -66,8 +66,6 @@ class PhotoLoss:
     `target_cache_mb` has room for; the others compute it anew at every visit, to the same bits.
 
     Args:
-        config: step numbers as they are run.
-        views: to train on.
         losses: of a backend; see `pop_fast.stages.losses`.
     """
 
@@ -115,10 +113,6 @@ class TorchStepper:
     """Takes steps on the CPU in the parameters' precision; see `Stepper`.
 
     The same parameters, statistics and number of threads give the same bits.
-
-    Args:
-        task: what is trained.
-        backend: its stages.
     """
 
     name = "torch"
@@ -326,7 +320,6 @@ def check_batch(config: TrainConfig, own_strategy: bool, ranks: Ranks) -> None:
     """Check that the views of a step can be shared out.
 
     Args:
-        config: `batch_size` is read.
         own_strategy: whether the density strategy is one of this package.
         ranks: the processes that draw them.
 

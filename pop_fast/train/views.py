@@ -57,8 +57,6 @@ class ViewTensors:
         """Take over a view of a capture, its camera in a precision.
 
         Args:
-            view: the view.
-            dtype: the precision.
             points: the capture's, of which those that the view sees are kept; None keeps none.
 
         Raises:
@@ -152,8 +150,6 @@ def render_view(
     Colour bands above `sh_degree` are left out of the graph, so that their gradient need not be made to be zero.
 
     Args:
-        backend: what renders.
-        params: raw parameters.
         view: the camera, and the mask that `dominant_counts` are restricted to.
         config: background, profile and antialiasing are read.
         sh_degree: highest active colour band.
@@ -161,7 +157,6 @@ def render_view(
         counts: Gaussians per pixel will be read from `info`.
         absgrad: so will the gradient of the screen centres summed of absolute values.
         background: colour behind everything in the place of the config's. [3]
-        depth: also render the expected depth.
     """
     given = rasterization_arguments(params, view, config, sh_degree, background)
     mode = {"render_mode": "RGB+ED"} if depth else {}
@@ -182,11 +177,7 @@ def rasterization_arguments(
     sh_degree: int,
     background: Tensor | None = None,
 ) -> dict[str, Any]:
-    """Return what `rasterization()` is given for a view of raw parameters.
-
-    Args:
-        params, view, config, sh_degree, background: as of `render_view`.
-    """
+    """Return what `rasterization()` is given for a view of raw parameters."""
     opacities = opacities_from_logits(params["opacities"])
     bands = (sh_degree + 1) ** 2
     sh = params["sh0"] if bands == 1 else torch.cat([params["sh0"], params["shN"][:, : bands - 1]], dim=1)
@@ -245,12 +236,9 @@ def render_layers(
     """Render colour and depth of a camera in one pass.
 
     Args:
-        backend: what renders.
-        params: raw parameters.
         view: the camera; its photograph gives the size alone.
         config: background, profile and antialiasing are read.
         sh_degree: highest active colour band.
-        dominance: also find the dominant Gaussians.
     """
     given = rasterization_arguments(params, view, config, sh_degree)
     drawn, alphas, info = backend.rasterization(**given, render_mode="RGB+ED", dominance=dominance)
@@ -269,10 +257,7 @@ def coarse_to_fine(
     """Return the views at every size that is seen, and which of them every step sees.
 
     Args:
-        views: to train on.
         order: the views of every step, `size` of them a step.
-        stops: `coarse_stop_iters`.
-        size: views of a step.
     """
     return with_shrunk(views, stops), [
         index_at(place // size, index, len(views), stops) for place, index in enumerate(order)
@@ -285,14 +270,7 @@ def with_shrunk(views: Sequence[ViewTensors], stops: Sequence[int]) -> list[View
 
 
 def index_at(step: int, index: int, n_views: int, stops: Sequence[int]) -> int:
-    """Return where the view that a step sees stands in `with_shrunk`.
-
-    Args:
-        step: counts from 0.
-        index: of the view.
-        n_views: how many there are.
-        stops: `coarse_stop_iters`.
-    """
+    """Return where the view that a step sees stands in `with_shrunk`."""
     return index + n_views * sum(step < stop for stop in stops)
 
 
@@ -300,7 +278,6 @@ def shrunk(view: ViewTensors, factor: int) -> ViewTensors:
     """Return a view with a smaller photograph, and the camera that takes it.
 
     Args:
-        view: any.
         factor: power of 2, of which as much is used as leaves a side of 32 px.
 
     Returns:
