@@ -153,13 +153,10 @@ class Backend(Renderer, Protocol):
         ...
 
     def open_view(self, pass_input: Any) -> Any:
-        """Project and list a view for passes over it.
-
-        Args:
-            pass_input: a `pop_fast.stages.stage_set.PassInput`.
+        """Project and list a `pop_fast.stages.stage_set.PassInput` for passes over it.
 
         Returns:
-            A `pop_fast.stages.stage_set.ViewPass`.
+            What has the methods of `pop_fast.stages.stage_set.StagesView`.
         """
         ...
 

@@ -168,8 +168,12 @@ class Checks:
     def finite(self, name: str, tensor: Tensor) -> Tensor:
         """Ask in `values` that a tensor is finite, and return it without its gradient."""
         t = tensor.detach()
+
+        def infinite(total: float) -> bool:
+            return not math.isfinite(total)
+
         # a sum is one fast pass
-        self._rule(name, t, lambda: (t.sum(),), _not_finite, lambda: ~torch.isfinite(t), "must be finite")
+        self._rule(name, t, lambda: (t.sum(),), infinite, lambda: ~torch.isfinite(t), "must be finite")
         return t
 
     def gaussians(
@@ -189,31 +193,29 @@ class Checks:
             raise ValueError(f"means has shape {list(means.shape)}; it must be [..., N, 3]")
         batch, n = tuple(means.shape[:-2]), means.shape[-2]
         self.finite("means", self.tensor("means", means, tuple(means.shape)))
-        self._opacities(self.finite("opacities", self.tensor("opacities", opacities, (*batch, n))))
-        if covars is not None:
-            self.finite("covars", self.tensor("covars", covars, (*batch, n, 3, 3)))
-        else:
-            self._quats(self.finite("quats", self.tensor("quats", quats, (*batch, n, 4))))
-            self._scales(self.finite("scales", self.tensor("scales", scales, (*batch, n, 3))))
-        return batch
+        o = self.finite("opacities", self.tensor("opacities", opacities, (*batch, n)))
 
-    def _opacities(self, o: Tensor) -> None:
         def outside(least: float, most: float) -> bool:
             return not (least >= 0.0 and most <= 1.0)
 
         bad = "must be in [0, 1]"
         self._rule("opacities", o, lambda: torch.aminmax(o), outside, lambda: ~((o >= 0.0) & (o <= 1.0)), bad)
+        if covars is not None:
+            self.finite("covars", self.tensor("covars", covars, (*batch, n, 3, 3)))
+            return batch
+        q = self.finite("quats", self.tensor("quats", quats, (*batch, n, 4)))
 
-    def _quats(self, q: Tensor) -> None:
         def shortest() -> tuple[Tensor]:
             # of a tiny quaternion it may be rounded to 0, which is looked at closely
             return (torch.linalg.vector_norm(q, dim=-1).amin(),)
 
-        self._rule("quats", q, shortest, _zero, lambda: q.abs().amax(-1) == 0.0, "must have a norm > 0")
-
-    def _scales(self, s: Tensor) -> None:
+        self._rule(
+            "quats", q, shortest, lambda least: least == 0.0, lambda: q.abs().amax(-1) == 0.0, "must have a norm > 0"
+        )
+        s = self.finite("scales", self.tensor("scales", scales, (*batch, n, 3)))
         words = "must be >= 0; give standard deviations, not logarithms"
-        self._rule("scales", s, lambda: (s.amin(),), _negative, lambda: s < 0.0, words)
+        self._rule("scales", s, lambda: (s.amin(),), lambda least: least < 0.0, lambda: s < 0.0, words)
+        return batch
 
     def cameras(
         self, viewmats: Tensor, Ks: Tensor, width: int, height: int, tile_size: int, batch: tuple[int, ...]
@@ -284,17 +286,9 @@ class Checks:
     def _each(self, name: str, array: Array, bad: Callable[[], Array], words: str) -> None:
         self._rule(name, array, lambda: (bad().any(),), bool, bad, words)
 
-    def _rule(
-        self,
-        name: str,
-        tensor: Tensor | Array,
-        probe: Callable[[], Sequence[Any]],
-        suspicious: Callable[..., bool],
-        bad: Callable[[], Tensor | Array],
-        words: str,
-    ) -> None:
+    def _rule(self, name: str, tensor: Tensor | Array, *rest: Any) -> None:
         if 0 not in tensor.shape:
-            self._rules.append(_Rule(name, tensor, probe, suspicious, bad, words))
+            self._rules.append(_Rule(name, tensor, *rest))
 
 
 def check_given(**tensors: Any) -> None:
@@ -320,18 +314,6 @@ def check_sizes(width: int, height: int, tile_size: int) -> None:
             raise ValueError(f"{name} is {value!r}; it must be a whole number >= 1")
     if tile_size > LARGEST_TILE:
         raise ValueError(f"tile_size is {tile_size}; it must be <= {LARGEST_TILE}")
-
-
-def _not_finite(total: float) -> bool:
-    return not math.isfinite(total)
-
-
-def _zero(least: float) -> bool:
-    return least == 0.0
-
-
-def _negative(least: float) -> bool:
-    return least < 0.0
 
 
 def _is_elsewhere(number: Any) -> bool:

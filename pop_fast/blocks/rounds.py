@@ -243,7 +243,6 @@ class HoldingStepper:
 
     @property
     def longest(self) -> int:
-        """See `Stepper.longest`."""
         return self._stepper.longest
 
     def rebind(self, params: dict[str, Parameter], optimizers: Mapping[str, Adam], state: State) -> None:
@@ -263,7 +262,6 @@ class HoldingStepper:
         self._stepper.rebind(params, optimizers, state)
 
     def steps(self, first: int, last: int, phase: Phase) -> list[StepStats]:
-        """See `Stepper.steps`."""
         found: list[StepStats] = []
         for step in range(first, last):
             try:
@@ -277,7 +275,6 @@ class HoldingStepper:
         return found
 
     def synchronize(self) -> None:
-        """See `Stepper.synchronize`."""
         self._stepper.synchronize()
 
     def facts(self) -> dict[str, Any]:

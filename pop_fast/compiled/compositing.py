@@ -18,24 +18,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pop_fast.compiled.library import (
-    PROJECTION_CONSTANTS,
-    Blend,
-    BlendBackward,
-    Colors,
-    ColorsBackward,
-    Covariances,
-    CovariancesBackward,
-    Lists,
-    MomentScores,
-    PointScores,
-    Projection,
-    ProjectionBackward,
-    Scores,
-    SensitivityScores,
-    call_library,
-    this_library,
-)
+from pop_fast.compiled.library import PROJECTION_CONSTANTS, call_library, this_library
 from pop_fast.stages import compositing
 from pop_fast.stages import contributions as passes
 from pop_fast.stages.blend import Stop, below
@@ -79,7 +62,7 @@ def tile_lists(
     offsets = torch.empty(tiles_x * tiles_y + 1, dtype=torch.int64)
     exact = {} if conics is None or opacities is None else {"conics": conics, "opacities": opacities}
     call_library(
-        Lists,
+        "lists",
         means2d.dtype,
         {"n": len(means2d), "m": len(order), "tiles_x": tiles_x, "tiles_y": tiles_y, "tile_size": tile_size}
         | {"threads": torch.get_num_threads(), "alpha_floor": profile.alpha_floor},
@@ -110,7 +93,7 @@ class _Composite(torch.autograd.Function):
         splats = aligned_records(len(means2d), this_library().splat_bytes)
         kept = {"n_reached": n_reached, "splats": splats, **(_lights(lists, colors) if options.keep else {})}
         given = {**_arguments(inputs, options), **results, **kept, "n_pairs": n_pairs}
-        call_library(Blend, means2d.dtype, blend_numbers(inputs, options), given)
+        call_library("forward", means2d.dtype, blend_numbers(inputs, options), given)
         # saved, not held: autograd lets go of them with the graph
         ctx.options, ctx.kept = options, tuple(kept)
         ctx.save_for_backward(*inputs, *kept.values())
@@ -130,7 +113,7 @@ class _Composite(torch.autograd.Function):
         rows = inputs[0].new_empty((len(options.lists.ids), columns))
         given = {"v_image": v_image, "v_alphas": v_alphas, "rows": rows, "absgrad": absolute}
         given = {**_arguments(inputs, options), **given, **found, **dict(zip(ctx.kept, kept, strict=True))}
-        call_library(BlendBackward, inputs[0].dtype, blend_numbers(inputs, options), given)
+        call_library("backward", inputs[0].dtype, blend_numbers(inputs, options), given)
         if sink is not None and absolute is not None:
             sink.add_(absolute.T)
         v_means2d, v_conics, v_opacities, v_colors = found.values()
@@ -231,7 +214,7 @@ class _Covariances(torch.autograd.Function):
     def forward(ctx: Any, quats: Tensor, scales: Tensor) -> Tensor:
         covars = quats.new_empty((len(quats), 3, 3))
         given = {"quats": quats, "scales": scales, "covars": covars}
-        call_library(Covariances, quats.dtype, {"n": len(quats), "threads": torch.get_num_threads()}, given)
+        call_library("covariances", quats.dtype, {"n": len(quats), "threads": torch.get_num_threads()}, given)
         ctx.save_for_backward(quats, scales)
         return covars
 
@@ -241,7 +224,7 @@ class _Covariances(torch.autograd.Function):
         quats, scales = ctx.saved_tensors
         v_quats, v_scales = quats.new_empty(quats.shape), scales.new_empty(scales.shape)
         given = {"quats": quats, "scales": scales, "v_covars": v_covars, "v_quats": v_quats, "v_scales": v_scales}
-        call_library(CovariancesBackward, quats.dtype, {"n": len(quats), "threads": torch.get_num_threads()}, given)
+        call_library("covariances_backward", quats.dtype, {"n": len(quats), "threads": torch.get_num_threads()}, given)
         return v_quats, v_scales
 
 
@@ -260,7 +243,7 @@ class _Projection(torch.autograd.Function):
             "factors": means.new_empty(n) if view.antialiased else None,
         }
         given = {"means": means, "covars": covars, "opacities": opacities, "viewmat": viewmat, "K": view.K}
-        call_library(Projection, means.dtype, _projection_numbers(n, view), {**given, **results})
+        call_library("projection", means.dtype, _projection_numbers(n, view), {**given, **results})
         ctx.view, ctx.radii = view, results["radii"]
         ctx.save_for_backward(means, covars, opacities, viewmat)
         ctx.mark_non_differentiable(results["radii"])
@@ -286,7 +269,7 @@ class _Projection(torch.autograd.Function):
         given |= {"v_effective_opacities": v_effective_opacities, "v_factors": v_factors}
         given |= {"radii": ctx.radii, "v_viewmats": v_viewmats}
         given |= dict(zip(("v_means", "v_covars", "v_opacities"), found, strict=True))
-        call_library(ProjectionBackward, means.dtype, _projection_numbers(len(means), ctx.view), given)
+        call_library("projection_backward", means.dtype, _projection_numbers(len(means), ctx.view), given)
         if v_viewmats is None:
             return (*found, None, None)
         v_viewmat = torch.zeros_like(viewmat)
@@ -312,7 +295,7 @@ class _Colors(torch.autograd.Function):
     def forward(ctx: Any, sh: Tensor, means: Tensor, viewmat: Tensor, degree: int, visible: Tensor) -> Tensor:
         colors = sh.new_empty((3, len(sh)))
         given = {"sh": sh, "means": means, "viewmat": viewmat, "visible": visible, "colors": colors}
-        call_library(Colors, sh.dtype, _numbers(sh, degree, visible), given)
+        call_library("colors", sh.dtype, _numbers(sh, degree, visible), given)
         ctx.degree = degree
         ctx.save_for_backward(sh, means, viewmat, visible)
         return colors.T
@@ -324,7 +307,7 @@ class _Colors(torch.autograd.Function):
         v_sh, v_dirs = torch.empty_like(sh, memory_format=torch.contiguous_format), sh.new_empty((len(sh), 3))
         given = {"sh": sh, "means": means, "viewmat": viewmat, "visible": visible}
         given |= {"v_colors": v_colors, "v_sh": v_sh, "v_dirs": v_dirs}
-        call_library(ColorsBackward, sh.dtype, _numbers(sh, ctx.degree, visible), given)
+        call_library("colors_backward", sh.dtype, _numbers(sh, ctx.degree, visible), given)
         if not ctx.needs_input_grad[2]:
             return v_sh, v_dirs, None, None, None
         _, v_viewmat = view_dirs_vjp(means.index_select(0, visible), viewmat, v_dirs.index_select(0, visible))
@@ -337,7 +320,7 @@ def _numbers(sh: Tensor, degree: int, visible: Tensor) -> dict[str, float]:
 
 
 def _scored(
-    layout: type[Scores],
+    name: str,
     splats: Splats,
     colors: Tensor,
     lists: TileLists,
@@ -346,7 +329,7 @@ def _scored(
     numbers: dict[str, float],
     **tensors: Tensor | None,
 ) -> None:
-    """Call a function of `scores.h`, which its layout tells apart; `tensors` it reads and, contiguous, writes."""
+    """Call a function of `scores.h`; `tensors` it reads and, contiguous, writes."""
     inputs = tuple(t.contiguous() for t in (splats.means2d, splats.conics, splats.opacities, colors))
     options = BlendOptions(lists, *size, profile, dominance=False, counts=False, keep=False, absgrad_sink=None)
     given = {
@@ -355,19 +338,19 @@ def _scored(
         "splats": aligned_records(len(inputs[0]), this_library().splat_bytes),
         **tensors,
     }
-    call_library(layout, inputs[0].dtype, {**blend_numbers(inputs, options), **numbers}, given)
+    call_library(name, inputs[0].dtype, {**blend_numbers(inputs, options), **numbers}, given)
 
 
-def _sums(layout: type[Scores], columns: int, name: str) -> Callable[..., Tensor]:
+def _sums(name: str, columns: int, given: str) -> Callable[..., Tensor]:
     """Make what sums up of every splat by a function of `scores.h`, which takes a map or a background by that name."""
 
     def sums(splats: Splats, lists: TileLists, size: tuple[int, int], profile: Profile, value: Tensor | None) -> Tensor:
         found = torch.empty((len(splats.means2d), columns), dtype=torch.float64)
         rows = splats.means2d.new_empty((len(lists.ids), columns))
         # a map takes no colours
-        colors = rows.new_empty((len(found), 0)) if name == "pixel_map" else colors_of(splats)
-        given: dict[str, Tensor | None] = {name: value, "rows": rows, "totals": found}
-        _scored(layout, splats, colors, lists, size, profile, {}, **given)
+        colors = rows.new_empty((len(found), 0)) if given == "pixel_map" else colors_of(splats)
+        tensors: dict[str, Tensor | None] = {given: value, "rows": rows, "totals": found}
+        _scored(name, splats, colors, lists, size, profile, {}, **tensors)
         return found
 
     return sums
@@ -380,7 +363,9 @@ def _dominant_ids(
     ids, T_final = torch.empty(size[::-1], dtype=torch.int64), like.new_empty(size[::-1])
     rays = dict(zip(("fx", "fy", "cx", "cy"), intrinsics(camera.K, *size, profile), strict=True))
     results = {"dominant_ids": ids, "T_final": T_final}
-    _scored(PointScores, splats, like.new_empty((len(like), 0)), lists, size, profile, rays, facing=facing, **results)
+    _scored(
+        "dominant_points", splats, like.new_empty((len(like), 0)), lists, size, profile, rays, facing=facing, **results
+    )
     return ids, T_final
 
 
@@ -395,9 +380,9 @@ def _by_the_library(stage: Callable[P, T], /, **own: Any) -> Callable[P, T]:
 
 
 composite = _by_the_library(compositing.composite, function=_Composite)
-contributions = _by_the_library(passes.contributions, sums=_sums(Scores, 4, "pixel_map"))
-sensitivities = _by_the_library(passes.sensitivities, sums=_sums(SensitivityScores, 1, "background"))
-screen_moments = _by_the_library(passes.screen_moments, sums=_sums(MomentScores, passes.N_MOMENTS, "background"))
+contributions = _by_the_library(passes.contributions, sums=_sums("contributions", 4, "pixel_map"))
+sensitivities = _by_the_library(passes.sensitivities, sums=_sums("sensitivities", 1, "background"))
+screen_moments = _by_the_library(passes.screen_moments, sums=_sums("screen_moments", passes.N_MOMENTS, "background"))
 dominant_points = _by_the_library(passes.dominant_points, find=_dominant_ids)
 fisher_blocks = _by_the_library(
     passes.fisher_blocks, project=project, colors_of_view=colors_of_view, covariances=covariances

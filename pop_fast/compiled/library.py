@@ -44,10 +44,6 @@ class Covariances(ctypes.Structure):
     )
 
 
-class CovariancesBackward(Covariances):
-    """The same, for the transpose."""
-
-
 class Projection(ctypes.Structure):
     """`pop::Projection` of projection.h, where every field is explained, in its order."""
 
@@ -63,10 +59,6 @@ class Projection(ctypes.Structure):
     )
 
 
-class ProjectionBackward(Projection):
-    """The same, for the transpose."""
-
-
 class Colors(ctypes.Structure):
     """`pop::Colors` of colors.h, where every field is explained, in its order."""
 
@@ -75,10 +67,6 @@ class Colors(ctypes.Structure):
         *fields_of(WHOLE, "n", "n_visible", "n_sh", "degree", "threads"),
         *fields_of(POINTER, "colors", "v_colors", "v_sh", "v_dirs"),
     )
-
-
-class ColorsBackward(Colors):
-    """The same, for the transpose."""
 
 
 class Lists(ctypes.Structure):
@@ -109,30 +97,14 @@ class Blend(ctypes.Structure):
     )
 
 
-class BlendBackward(Blend):
-    """The same, for the transpose."""
-
-
 class Scores(Blend):
-    """`pop::Scores` of scores.h, where every field is explained, in its order: sums over pixels for `contributions`."""
+    """`pop::Scores` of scores.h, where every field is explained, in its order: what all sums over pixels take."""
 
     _fields_ = (
         *fields_of(POINTER, "background", "pixel_map", "facing"),
         *fields_of(REAL, "fx", "fy", "cx", "cy"),
         *fields_of(POINTER, "T_final", "totals"),
     )
-
-
-class SensitivityScores(Scores):
-    """The same, for `sensitivities`."""
-
-
-class MomentScores(Scores):
-    """The same, for `screen_moments`."""
-
-
-class PointScores(Scores):
-    """The same, for `dominant_points`."""
 
 
 class Ssim(ctypes.Structure):
@@ -156,22 +128,16 @@ class Moments(ctypes.Structure):
     )
 
 
-_NAMES: dict[type[ctypes.Structure], str] = {
-    Covariances: "covariances",
-    CovariancesBackward: "covariances_backward",
-    Projection: "projection",
-    ProjectionBackward: "projection_backward",
-    Colors: "colors",
-    ColorsBackward: "colors_backward",
-    Lists: "lists",
-    Blend: "forward",
-    BlendBackward: "backward",
-    Scores: "contributions",
-    SensitivityScores: "sensitivities",
-    MomentScores: "screen_moments",
-    PointScores: "dominant_points",
-    Ssim: "ssim",
-    Moments: "moments",
+# the functions by name, each in both precisions, and the layout of what each is given
+_LAYOUTS: Final[dict[str, type[ctypes.Structure]]] = {
+    **dict.fromkeys(("covariances", "covariances_backward"), Covariances),
+    **dict.fromkeys(("projection", "projection_backward"), Projection),
+    **dict.fromkeys(("colors", "colors_backward"), Colors),
+    "lists": Lists,
+    **dict.fromkeys(("forward", "backward"), Blend),
+    **dict.fromkeys(("contributions", "sensitivities", "screen_moments", "dominant_points"), Scores),
+    "ssim": Ssim,
+    "moments": Moments,
 }
 
 
@@ -180,7 +146,7 @@ class Library:
     """What is in the library.
 
     Attributes:
-        functions: by layout and precision.
+        functions: by name and precision.
         chunk: list entries after which the blend writes down the light.
         padded_pixels: pixels of a tile of that size, padded to whole vectors of floats of so many bytes.
         splat_bytes: size of what blending keeps of a splat, and its alignment.
@@ -192,7 +158,7 @@ class Library:
         fork: starts the threads, or None.
     """
 
-    functions: dict[tuple[type[ctypes.Structure], str], Callable[..., int]]
+    functions: dict[tuple[str, str], Callable[..., int]]
     chunk: int
     padded_pixels: Callable[[int, int], int]
     splat_bytes: int
@@ -231,36 +197,29 @@ def stepper_functions(given_bytes: int) -> StepperFunctions:
     loaded.pop_step_given_bytes.restype = WHOLE
     if loaded.pop_step_given_bytes() != given_bytes:
         raise OSError(f"{path} expects arguments of another layout")
-    loaded.pop_stepper_open.argtypes, loaded.pop_stepper_open.restype = (WHOLE,), POINTER
-    loaded.pop_stepper_close.argtypes, loaded.pop_stepper_close.restype = (POINTER,), None
-    steps = loaded.pop_stepper_steps
-    steps.argtypes, steps.restype = (POINTER, POINTER, WHOLE, POINTER), WHOLE
-    loaded.pop_stepper_bytes.argtypes, loaded.pop_stepper_bytes.restype = (POINTER,), WHOLE
-    loaded.pop_stepper_counts.argtypes, loaded.pop_stepper_counts.restype = (POINTER, POINTER), None
-    trace = loaded.pop_stepper_trace
-    trace.argtypes, trace.restype = (POINTER, POINTER, WHOLE), WHOLE
-    return StepperFunctions(
-        loaded.pop_stepper_open,
-        loaded.pop_stepper_close,
-        loaded.pop_stepper_steps,
-        loaded.pop_stepper_bytes,
-        loaded.pop_stepper_counts,
-        trace,
-    )
+    signatures = {
+        "open": ((WHOLE,), POINTER),
+        "close": ((POINTER,), None),
+        "steps": ((POINTER, POINTER, WHOLE, POINTER), WHOLE),
+        "bytes": ((POINTER,), WHOLE),
+        "counts": ((POINTER, POINTER), None),
+        "trace": ((POINTER, POINTER, WHOLE), WHOLE),
+    }
+    found: dict[str, Any] = {name: getattr(loaded, f"pop_stepper_{name}") for name in signatures}
+    for name, signature in signatures.items():
+        found[name].argtypes, found[name].restype = signature
+    return StepperFunctions(**found)
 
 
 def call_library(
-    layout: type[ctypes.Structure],
-    dtype: torch.dtype,
-    numbers: Mapping[str, float],
-    tensors: Mapping[str, Tensor | None],
+    name: str, dtype: torch.dtype, numbers: Mapping[str, float], tensors: Mapping[str, Tensor | None]
 ) -> None:
-    """Call the function of a layout.
+    """Call a function of the library.
 
     Args:
-        layout: of its arguments; fields that are not given are 0 or null.
+        name: of `_LAYOUTS`.
         dtype: float32 or float64.
-        numbers: fields that are numbers.
+        numbers: fields of its arguments that are numbers; those that are not given are 0 or null.
         tensors: fields that are pointers; what is not contiguous is copied, and so must not be a result.
 
     Raises:
@@ -268,10 +227,10 @@ def call_library(
     """
     library = this_library()
     # the arguments only point: these are what they point into, and live until the function has returned
-    held = {name: tensor.contiguous() for name, tensor in tensors.items() if tensor is not None}
-    arguments = layout(**numbers, **{name: tensor.data_ptr() for name, tensor in held.items()})
-    if not library.functions[layout, str(dtype).removeprefix("torch.")](ctypes.byref(arguments), library.fork):
-        raise MemoryError(f"the compiled CPU kernels ran out of memory in stage {_NAMES[layout]}")
+    held = {field: tensor.contiguous() for field, tensor in tensors.items() if tensor is not None}
+    arguments = _LAYOUTS[name](**numbers, **{field: tensor.data_ptr() for field, tensor in held.items()})
+    if not library.functions[name, str(dtype).removeprefix("torch.")](ctypes.byref(arguments), library.fork):
+        raise MemoryError(f"the compiled CPU kernels ran out of memory in stage {name}")
 
 
 def this_library() -> Library:
@@ -287,30 +246,26 @@ def open_library(path: str) -> Library:
         OSError: it is missing, does not load, or was not made from the same source as this module.
     """
     loaded = load_library(path)
-    numbers = ("chunk", "padded_pixels", "splat_bytes", "lanes", "window_rows", "padded_line", "rows_at_a_time")
-    for number in numbers:
+    numbers = ("chunk", "splat_bytes", "window_rows", "rows_at_a_time")
+    sizes = ("padded_pixels", "lanes", "padded_line")
+    for number in (*numbers, *sizes):
         getattr(loaded, f"pop_{number}").restype = WHOLE
     loaded.pop_lanes.argtypes = (WHOLE,)
     loaded.pop_padded_pixels.argtypes = loaded.pop_padded_line.argtypes = (WHOLE, WHOLE)
     loaded.pop_adam.argtypes = (*(POINTER,) * 4, *(WHOLE,) * 2, *(REAL,) * 4)
     loaded.pop_adam.restype = None
-    functions: dict[tuple[type[ctypes.Structure], str], Callable[..., int]] = {}
-    for layout, name in _NAMES.items():
+    functions: dict[tuple[str, str], Callable[..., int]] = {}
+    for name in _LAYOUTS:
         for precision in _PRECISIONS:
             function = getattr(loaded, f"pop_{name}_{precision}")
             function.argtypes, function.restype = (POINTER, POINTER), ctypes.c_int
-            functions[layout, precision] = function
+            functions[name, precision] = function
     return Library(
         functions,
-        loaded.pop_chunk(),
-        loaded.pop_padded_pixels,
-        loaded.pop_splat_bytes(),
-        loaded.pop_lanes,
-        loaded.pop_window_rows(),
-        loaded.pop_padded_line,
-        loaded.pop_rows_at_a_time(),
-        loaded.pop_adam,
-        _fork(),
+        **{number: getattr(loaded, f"pop_{number}")() for number in numbers},
+        **{size: getattr(loaded, f"pop_{size}") for size in sizes},
+        adam=loaded.pop_adam,
+        fork=_fork(),
     )
 
 
@@ -321,7 +276,7 @@ def load_library(path: str) -> ctypes.CDLL:
         OSError: it is missing, does not load, or was not made from the same source as this module.
     """
     loaded = ctypes.CDLL(path)
-    for layout in (Covariances, Projection, Colors, Lists, Blend, Scores, Ssim, Moments):
+    for layout in dict.fromkeys(_LAYOUTS.values()):
         size = getattr(loaded, f"pop_{layout.__name__.lower()}_bytes")
         size.restype = WHOLE
         if size() != ctypes.sizeof(layout):

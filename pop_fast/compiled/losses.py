@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pop_fast.compiled.library import Ssim, call_library, this_library
+from pop_fast.compiled.library import call_library, this_library
 from pop_fast.stages import losses
 from pop_fast.stages.losses import REACH, TargetMoments, border_of, kept_windows
 
@@ -35,7 +35,7 @@ def mean_dissimilarity(
     totals = torch.empty(-(-len(moments.mu_y) // library.window_rows), dtype=torch.float64)
     partials = None if weight is None else difference.new_empty((3, height + REACH, stride))
     call_library(
-        Ssim,
+        "ssim",
         difference.dtype,
         {"height": height, "width": width, "channels": channels, "border": border_of(moments.padding)}
         | {"stride": stride, "threads": torch.get_num_threads(), "weight": (weight or 0.0) / n},

@@ -21,7 +21,6 @@ from pop_fast.compiled.library import (
     PROJECTION_CONSTANTS,
     REAL,
     WHOLE,
-    Moments,
     call_library,
     fields_of,
     stepper_functions,
@@ -136,7 +135,7 @@ class _Target:
         target = torch.empty((3, height, width))
         mu_y, s_yy = (torch.empty((3, height + 2 * border - REACH, width + 2 * border - REACH)) for _ in range(2))
         call_library(
-            Moments,
+            "moments",
             torch.float32,
             {"height": height, "width": width, "border": border, "threads": torch.get_num_threads()},
             {"photograph": view.photo, "target": target, "mu_y": mu_y, "s_yy": s_yy},

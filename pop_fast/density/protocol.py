@@ -215,7 +215,6 @@ class ForeignStrategy:
         return type(self.strategy).__name__
 
     def check_sanity(self, params: Params, optimizers: Optimizers) -> None:
-        """See `Strategy.check_sanity`."""
         self.strategy.check_sanity(params, optimizers)
 
     def initialize_state(self, scene_scale: float = 1.0, seed: int = 0, count: int = 0) -> State:
@@ -245,7 +244,6 @@ class ForeignStrategy:
         return None if term is None else term(opacities, state, step, info)
 
     def step_pre_backward(self, params: Params, optimizers: Optimizers, state: State, step: int, info: Info) -> None:
-        """See `Strategy.step_pre_backward`."""
         self.strategy.step_pre_backward(params, optimizers, state, step, info)
 
     def collect(self, params: Params, state: State, step: int, info: Info, packed: bool = False) -> None:

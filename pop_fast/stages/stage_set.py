@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -68,30 +68,6 @@ class PassInput:
     antialiased: bool
 
 
-class ViewPass(Protocol):
-    """A shot that has been projected and listed."""
-
-    def seen(self) -> Seen:
-        """Draw it."""
-        ...
-
-    def contributions(self, pixel_map: Tensor | None) -> Contributions:
-        """As `pop_fast.stages.contributions.contributions`."""
-        ...
-
-    def sensitivities(self) -> Tensor:
-        """As `pop_fast.stages.contributions.sensitivities`."""
-        ...
-
-    def fisher_blocks(self) -> Tensor:
-        """As `pop_fast.stages.contributions.fisher_blocks`, of its own screen moments."""
-        ...
-
-    def dominant_points(self) -> DominantPoints:
-        """As `pop_fast.stages.contributions.dominant_points`."""
-        ...
-
-
 SMALL_TILE, LARGE_TILE = 8, 16  # px
 SMALL_TILE_BELOW = 14.0  # px, root mean square extent of the visible splats; see benchmarks/NOTES.md
 
@@ -119,16 +95,7 @@ class Stages:
     It draws views as `pop_fast.api.backend.ViewStages` says.
 
     Attributes:
-        covariances: as `pop_fast.stages.splatting.covariances`.
-        project: as `pop_fast.stages.splatting.project`.
-        colors_of_view: as `pop_fast.stages.splatting.colors_of_view`.
-        list_tiles: as `pop_fast.stages.tiles.tile_lists`.
-        composite: as `pop_fast.stages.compositing.composite`.
         blend_tile: given the splats' extents, the tile to blend them in.
-        contributions: as `pop_fast.stages.contributions.contributions`.
-        sensitivities: as `pop_fast.stages.contributions.sensitivities`.
-        screen_moments: as `pop_fast.stages.contributions.screen_moments`.
-        dominant_points: as `pop_fast.stages.contributions.dominant_points`.
     """
 
     covariances: Callable[..., Tensor] = covariances
@@ -215,14 +182,7 @@ class Stages:
 
 @dataclass(frozen=True)
 class StagesView:
-    """A shot that has been projected and listed.
-
-    Attributes:
-        shot: what is drawn.
-        stages: of the backend.
-        splats: with colours.
-        lists: without the entries that reach no pixel.
-    """
+    """A shot that has been projected and listed: splats with colours, and lists without entries that reach no pixel."""
 
     shot: PassInput
     stages: Stages

@@ -89,7 +89,6 @@ class FusedStepper:
         self._collected: tuple[int, Phase] | None = None
 
     def rebind(self, params: dict[str, Parameter], optimizers: Mapping[str, Adam], state: State) -> None:
-        """See `Stepper.rebind`."""
         self._params, self._optimizers, self._state = params, optimizers, state
         rows = {key: params[key].detach() for key in KEYS}
         moments = {key: optimizers[key].state[params[key]] for key in KEYS}
@@ -120,7 +119,6 @@ class FusedStepper:
         return sum(view.height * view.width for view in views)
 
     def steps(self, first: int, last: int, phase: Phase) -> list[StepStats]:
-        """See `Stepper.steps`."""
         assert self.fused is not None
         if self._collected is not None and self._collected[1] != phase:
             self.synchronize()
@@ -147,14 +145,12 @@ class FusedStepper:
         return [StepStats(*row) for row in self.fused.step_stats(first, last)]
 
     def synchronize(self) -> None:
-        """See `Stepper.synchronize`."""
         if self.fused is not None and self._collected is not None:
             self.fused.synchronize()
             self._take_statistics(self.fused.statistics, *self._collected)
             self._collected = None
 
     def facts(self) -> dict[str, Any]:
-        """See `Stepper.facts`."""
         return {} if self.fused is None else dict(self.fused.facts())
 
     def _take_statistics(self, found: Collected, last: int, phase: Phase) -> None:

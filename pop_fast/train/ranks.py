@@ -117,7 +117,6 @@ class TorchRanks(Ranks):
         self.rank, self.size = self._group.get_rank(), self._group.get_world_size()
 
     def gather(self, mine: Sequence[Tensor]) -> list[Tensor]:
-        """See `Ranks.gather`."""
         sent = torch.stack(list(mine))
         received = [torch.empty_like(sent) for _ in range(self.size)]
         self._together(lambda: self._group.all_gather(received, sent))
@@ -137,7 +136,6 @@ class TorchRanks(Ranks):
         return torch.cat(whole)[:length]
 
     def exchange(self, sent: Sequence[Tensor], received: Sequence[int]) -> list[Tensor]:
-        """See `Ranks.exchange`."""
         mine = torch.cat(list(sent))
         theirs = torch.empty((sum(received), *mine.shape[1:]), dtype=mine.dtype, device=mine.device)
         lengths = [len(rows) for rows in sent]
@@ -145,17 +143,14 @@ class TorchRanks(Ranks):
         return list(theirs.split(list(received)))
 
     def share(self, whole: Tensor, bounds: Sequence[int]) -> None:
-        """See `Ranks.share`."""
         for rank, (first, last) in enumerate(itertools.pairwise(bounds)):
             if first < last:
                 self._together(lambda rank=rank, rows=whole[first:last]: self._group.broadcast(rows, rank))
 
     def any(self, flag: bool) -> bool:
-        """See `Ranks.any`."""
         return any(bool(said) for said in self.gather([torch.tensor(flag)]))
 
     def require_same(self, params: Mapping[str, Tensor], step: int) -> None:
-        """See `Ranks.require_same`."""
         digest = hashlib.sha256()
         for value in params.values():
             digest.update(value.contiguous().numpy().data)
@@ -167,11 +162,9 @@ class TorchRanks(Ranks):
             )
 
     def wait(self) -> None:
-        """See `Ranks.wait`."""
         self._together(self._group.barrier)
 
     def leave(self) -> None:
-        """See `Ranks.leave`."""
         self._group.destroy_process_group()
 
     def _together(self, call: Callable[[], T]) -> T:

@@ -130,11 +130,9 @@ class TorchStepper:
         """See `Stepper.synchronize`: every process takes whole steps, so that nothing is left to take over."""
 
     def rebind(self, params: dict[str, Parameter], optimizers: Mapping[str, Adam], state: State) -> None:
-        """See `Stepper.rebind`."""
         self._params, self._optimizers, self._state = params, optimizers, state
 
     def steps(self, first: int, last: int, phase: Phase) -> list[StepStats]:
-        """See `Stepper.steps`."""
         found: list[StepStats] = []
         for step in range(first, last):
             try:
@@ -145,7 +143,6 @@ class TorchStepper:
         return found
 
     def facts(self) -> dict[str, Any]:
-        """See `Stepper.facts`."""
         return {}
 
     def _take(self, step: int, phase: Phase) -> StepStats:
