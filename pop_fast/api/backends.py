@@ -138,15 +138,11 @@ COMPILED: Final = CompiledBackend("compiled", "cpu", ("float32", "float64"), spe
 
 @dataclass(frozen=True)
 class CudaBackend(BaseBackend):
-    """Draws on the GPU that holds the tensors.
+    """Draws on the GPU that holds the tensors."""
 
-    Attributes:
-        backward: which kernel goes back, a thread for some pixels or a thread for a Gaussian of a tile.
-        deterministic: sum gradients in one order; False adds atomically and saves 48 bytes an instance.
-    """
-
+    # which kernel goes back, a thread for some pixels or a thread for a Gaussian of a tile
     backward: Literal["pixel_parallel", "gaussian_parallel"] = "pixel_parallel"
-    deterministic: bool = True
+    deterministic: bool = True  # sum gradients in one order; False adds atomically and saves 48 bytes an instance
 
     def why_not(self) -> str | None:
         """Return one sentence on why it cannot run here and what to do, or None."""

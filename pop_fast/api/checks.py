@@ -111,23 +111,15 @@ def _check_profile(profile: Profile) -> None:
 
 @dataclass(frozen=True)
 class _Rule:
-    """A rule of a tensor's values.
+    """A rule of a tensor's values."""
 
-    Attributes:
-        name: of the tensor.
-        tensor: it, or an array of it that came from a GPU.
-        probe: a few numbers of it, each made in a pass or two: a tensor's or an array's.
-        suspicious: whether these numbers leave room for a bad entry; only then it is looked at closely.
-        bad: which entries or rows are.
-        words: what it must be.
-    """
-
-    name: str
-    tensor: Tensor | Array
-    probe: Callable[[], Sequence[Any]]
+    name: str  # of the tensor
+    tensor: Tensor | Array  # it, or an array of it that came from a GPU
+    probe: Callable[[], Sequence[Any]]  # a few numbers of it, each made in a pass or two: a tensor's or an array's
+    # whether these numbers leave room for a bad entry; only then it is looked at closely
     suspicious: Callable[..., bool]
-    bad: Callable[[], Tensor | Array]
-    words: str
+    bad: Callable[[], Tensor | Array]  # which entries or rows are
+    words: str  # what it must be
 
 
 class Checks:

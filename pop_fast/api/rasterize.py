@@ -84,10 +84,8 @@ def rasterization(
         colors: any number of channels [..., (C,) N, D], or harmonics [..., (C,) N, K, 3] when `sh_degree` is given.
         viewmats: world -> camera, OpenCV. [..., C, 4, 4]
         Ks: intrinsics, px. [..., C, 3, 3]
-        width: px.
-        height: px.
-        near_plane: world units; at gsplat's default the profile's own value is used.
-        far_plane: world units; likewise.
+        width, height: px.
+        near_plane, far_plane: world units; at gsplat's default the profile's own value is used.
         radius_clip: px; splats with both extents at most this are culled.
         eps2d: low-pass, px^2; at gsplat's default the profile's own value is used.
         sh_degree: bands to evaluate, or None when `colors` are colours.
@@ -95,22 +93,14 @@ def rasterization(
         tile_size: px, up to 4096, None for 16; the image does not depend on it, except in profile "inria".
         backgrounds: colours behind everything, without depth. [..., C, D]
         render_mode: colours, depth (D), expected depth (ED), or colours and then depth as the last channel.
-        sparse_grad: only False.
+        sparse_grad, distributed, segmented, with_ut, with_eval3d: only False.
         absgrad: also sum |dL/dmeans2d| over pixels into `meta["means2d"].absgrad`.
         rasterize_mode: "antialiased" scales opacities by the factor that keeps a blurred splat's energy.
         channel_chunk: accepted; all channels are blended in one go, whatever their number.
-        distributed: only False.
         camera_model: only "pinhole".
-        segmented: only False.
         covars: covariances instead of quats and scales. [..., N, 3, 3]
-        with_ut: only False.
-        with_eval3d: only False.
-        radial_coeffs: only None.
-        tangential_coeffs: only None.
-        thin_prism_coeffs: only None.
-        ftheta_coeffs: only None.
+        radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs, viewmats_rs: only None.
         rolling_shutter: only None, or gsplat's `RollingShutterType.GLOBAL`.
-        viewmats_rs: only None.
         profile: constants and strictness: "paper", "gsplat_1_5", "gsplat_1_6", "inria", or a `Profile`.
         dominance: compute the dominance keys of meta in the same pass; else they cost one more when first read.
         counts: likewise for n_contrib and n_traversed.
@@ -129,25 +119,12 @@ def rasterization(
         NotImplementedError: an argument is not supported.
         PopError: the backend is unknown, cannot run here, or does not offer an argument; says why and what to do.
     """
+    given = dict(locals())
     check_given(means=means, opacities=opacities, colors=colors, viewmats=viewmats, Ks=Ks)
     drawing = fastest_backend(means.device.type) if backend == "auto" else require_backend(backend)
-    given = {
-        "sparse_grad": sparse_grad,
-        "distributed": distributed,
-        "camera_model": camera_model,
-        "segmented": segmented,
-        "with_ut": with_ut,
-        "with_eval3d": with_eval3d,
-        "radial_coeffs": radial_coeffs,
-        "tangential_coeffs": tangential_coeffs,
-        "thin_prism_coeffs": thin_prism_coeffs,
-        "ftheta_coeffs": ftheta_coeffs,
-        # gsplat's default is a member of an enumeration of its own, which need not be imported to be recognized
-        "rolling_shutter": None if getattr(rolling_shutter, "name", None) == "GLOBAL" else rolling_shutter,
-        "viewmats_rs": viewmats_rs,
-        "covars": covars,
-        "radius_clip": radius_clip,
-    }
+    # gsplat's default is a member of an enumeration of its own, which need not be imported to be recognized
+    if getattr(rolling_shutter, "name", None) == "GLOBAL":
+        given["rolling_shutter"] = None
     check_supported(given, drawing)
     check_choice("render_mode", render_mode, RENDER_MODES)
     check_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
@@ -192,78 +169,46 @@ _GATHERED = ("means2d", "depths", "conics", "opacities", "radii")
 
 @dataclass(frozen=True)
 class BatchedScene:
-    """Gaussians and cameras, batch dimensions flattened: B scenes, I = B * cameras images.
+    """Gaussians and cameras, batch dimensions flattened: B scenes, I = B * cameras images."""
 
-    Attributes:
-        means: [B, N, 3]
-        quats: [B, N, 4], None where covariances were given.
-        scales: [B, N, 3], likewise.
-        covars: [B, N, 3, 3], None where quaternions and scales were given.
-        opacities: [B, N]
-        colors: [B or I, N, D] or [B or I, N, K, 3]
-        per_camera: whether `colors` holds one row per image.
-        viewmats: [I, 4, 4]
-        Ks: [I, 3, 3]
-        n_cameras: images per scene.
-    """
-
-    means: Tensor
-    quats: Tensor | None
-    scales: Tensor | None
-    covars: Tensor | None
-    opacities: Tensor
-    colors: Tensor
-    per_camera: bool
-    viewmats: Tensor
-    Ks: Tensor
-    n_cameras: int
+    means: Tensor  # [B, N, 3]
+    quats: Tensor | None  # [B, N, 4], None where covariances were given
+    scales: Tensor | None  # [B, N, 3], likewise
+    covars: Tensor | None  # [B, N, 3, 3], None where quaternions and scales were given
+    opacities: Tensor  # [B, N]
+    colors: Tensor  # [B or I, N, D] or [B or I, N, K, 3]
+    per_camera: bool  # whether `colors` holds one row per image
+    viewmats: Tensor  # [I, 4, 4]
+    Ks: Tensor  # [I, 3, 3]
+    n_cameras: int  # images per scene
 
 
 @dataclass(frozen=True)
 class Image:
-    """What one image blends.
+    """What one image blends."""
 
-    Attributes:
-        rows: of the tensors in meta, so that gradients pass through those; depth is the last channel of the colours
-            where the mode asks for it.
-        seen: all Gaussians as the camera sees them.
-        settings: of the view.
-        gaussians: the Gaussian of every row, None when row i is Gaussian i.
-        absgrad: where |dL/dmeans2d| goes, or None. [M, 2]
-    """
-
+    # of the tensors in meta, so that gradients pass through those; depth is the last channel of the colours where the
+    # mode asks for it
     rows: Splats
-    seen: Splats
-    settings: ProjectionSettings
-    gaussians: Tensor | None
-    absgrad: Tensor | None
+    seen: Splats  # all Gaussians as the camera sees them
+    settings: ProjectionSettings  # of the view
+    gaussians: Tensor | None  # the Gaussian of every row, None when row i is Gaussian i
+    absgrad: Tensor | None  # where |dL/dmeans2d| goes, or None. [M, 2]
 
 
 @dataclass(frozen=True)
 class RasterizationCall:
-    """One call of `rasterization`.
+    """One call of `rasterization`."""
 
-    Attributes:
-        scene: Gaussians and cameras.
-        image_shape: batch dimensions and cameras.
-        settings: size, profile and mode; its K is replaced per image.
-        tile_size: px.
-        sh_degree: bands, None for plain colours.
-        render_mode: as `rasterization` takes it.
-        packed: whether meta holds visible rows only.
-        absgrad: whether to sum absolute gradients.
-        stages: of the backend.
-    """
-
-    scene: BatchedScene
-    image_shape: tuple[int, ...]
-    settings: ProjectionSettings
-    tile_size: int
-    sh_degree: int | None
-    render_mode: str
-    packed: bool
-    absgrad: bool
-    stages: ViewStages
+    scene: BatchedScene  # Gaussians and cameras
+    image_shape: tuple[int, ...]  # batch dimensions and cameras
+    settings: ProjectionSettings  # size, profile and mode; its K is replaced per image
+    tile_size: int  # px
+    sh_degree: int | None  # bands, None for plain colours
+    render_mode: str  # as `rasterization` takes it
+    packed: bool  # whether meta holds visible rows only
+    absgrad: bool  # whether to sum absolute gradients
+    stages: ViewStages  # of the backend
 
     def render(self, backgrounds: Tensor | None, dominance: bool, counts: bool) -> tuple[Tensor, Tensor, RenderMeta]:
         """Return images, alphas and meta."""

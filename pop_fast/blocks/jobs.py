@@ -34,17 +34,11 @@ from pop_fast.train.signals import stop_requests
 
 @dataclass(frozen=True)
 class Part:
-    """A training of a block, or a merge.
+    """A training of a block, or a merge."""
 
-    Attributes:
-        round: which it belongs to, from 0.
-        block: which is trained; None merges all.
-        last: whether it is the last merge, which writes the run's result.
-    """
-
-    round: int
-    block: str | None
-    last: bool = False
+    round: int  # which it belongs to, from 0
+    block: str | None  # which is trained; None merges all
+    last: bool = False  # whether it is the last merge, which writes the run's result
 
     @property
     def name(self) -> str:

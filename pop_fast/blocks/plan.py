@@ -75,22 +75,15 @@ _MOST_ROUNDS: Final = 100
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """What was asked for.
+    """What was asked for."""
 
-    Attributes:
-        blocks: the grid, as "2x2".
-        margin: what a block is trained on beyond its core, as a share of the core's size on either axis.
-        share: of the sparse points in a view's picture, those in a core must be so many for the view to train it.
-        rounds: how often the merged Gaussians are trained on, every block those of its core.
-        round_steps: of a block in each round; 0 where there is none.
-        finish: what is written when the blocks are merged, as `FinishOptions` has it.
-    """
-
-    blocks: str
-    margin: float = 0.2
+    blocks: str  # the grid, as "2x2"
+    margin: float = 0.2  # what a block is trained on beyond its core, as a share of the core's size on either axis
+    # of the sparse points in a view's picture, those in a core must be so many for the view to train it
     share: float = 0.25
-    rounds: int = 0
-    round_steps: int = 0
+    rounds: int = 0  # how often the merged Gaussians are trained on, every block those of its core
+    round_steps: int = 0  # of a block in each round; 0 where there is none
+    # what is written when the blocks are merged, as `FinishOptions` has it
     finish: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -115,38 +108,23 @@ class Job:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """What one block is trained on.
+    """What one block is trained on."""
 
-    Attributes:
-        name: "i_j", of strip and core.
-        views: names of its training views.
-        own_views: how many of them stand in its core; those of all blocks are all training views.
-        held_out: names of the held-out views that stand in its core.
-        points: indices of the sparse points in its core and margin, then of those outside. int64 [P]
-        background: how many of the points are outside.
-    """
-
-    name: str
-    views: frozenset[str]
-    own_views: int
-    held_out: frozenset[str]
-    points: np.ndarray
-    background: int
+    name: str  # "i_j", of strip and core
+    views: frozenset[str]  # names of its training views
+    own_views: int  # how many of them stand in its core; those of all blocks are all training views
+    held_out: frozenset[str]  # names of the held-out views that stand in its core
+    points: np.ndarray  # indices of the sparse points in its core and margin, then of those outside. int64 [P]
+    background: int  # how many of the points are outside
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """How a capture is divided.
+    """How a capture is divided."""
 
-    Attributes:
-        job: what was asked for.
-        partition: the cores, in the frame that is trained in.
-        blocks: what each is trained on.
-    """
-
-    job: Job
-    partition: Partition
-    blocks: tuple[Block, ...]
+    job: Job  # what was asked for
+    partition: Partition  # the cores, in the frame that is trained in
+    blocks: tuple[Block, ...]  # what each is trained on
 
 
 def make_plan(capture: Capture, job: Job, test_every: int) -> Plan:
@@ -311,21 +289,15 @@ def grid_of(text: str) -> tuple[int, int]:
 
 @dataclass(frozen=True, eq=False)
 class Partition:
-    """K x L cores; block number i L + j is core j of strip i.
+    """K x L cores; block number i L + j is core j of strip i."""
 
-    Attributes:
-        origin: where the coordinates on the ground are (0, 0): the mean of the camera centres. float64 [3]
-        axes: the two directions of the ground, orthonormal. float64 [2, 3]
-        strips: borders between the strips, ascending. float64 [K - 1]
-        cores: of each strip, the borders between its cores, ascending. float64 [K, L - 1]
-        low, high: the cameras' range on either axis, which is where a core without an outer border is taken to end
-            when its size is asked for. float64 [2]
-    """
-
+    # where the coordinates on the ground are (0, 0): the mean of the camera centres. float64 [3]
     origin: np.ndarray
-    axes: np.ndarray
-    strips: np.ndarray
-    cores: np.ndarray
+    axes: np.ndarray  # the two directions of the ground, orthonormal. float64 [2, 3]
+    strips: np.ndarray  # borders between the strips, ascending. float64 [K - 1]
+    cores: np.ndarray  # of each strip, the borders between its cores, ascending. float64 [K, L - 1]
+    # low, high: the cameras' range on either axis, which is where a core without an outer border is taken to end when
+    # its size is asked for. float64 [2]
     low: np.ndarray
     high: np.ndarray
 

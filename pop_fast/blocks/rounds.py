@@ -57,17 +57,11 @@ _COUNTS = "start.json"
 
 @dataclass(frozen=True)
 class Start:
-    """What a block starts from.
+    """What a block starts from."""
 
-    Attributes:
-        params: raw parameters: first those that are trained, then those that are held fixed.
-        own: how many are trained.
-        merged: how many Gaussians there are in all cores.
-    """
-
-    params: dict[str, Tensor]
-    own: int
-    merged: int
+    params: dict[str, Tensor]  # raw parameters: first those that are trained, then those that are held fixed
+    own: int  # how many are trained
+    merged: int  # how many Gaussians there are in all cores
 
     @property
     def fixed(self) -> dict[str, Tensor]:

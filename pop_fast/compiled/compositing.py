@@ -25,7 +25,7 @@ from pop_fast.stages.blend import Stop, below
 from pop_fast.stages.compositing import BlendOptions
 from pop_fast.stages.projection import intrinsics, view_dirs_vjp
 from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of
-from pop_fast.stages.tiles import TileLists, depth_order, grid_size, tile_rects
+from pop_fast.stages.tiles import TileLists, grid_size, listed_rows, tile_rects
 from pop_fast.stages.types import Camera
 from pop_ref.constants import PAPER, Profile
 
@@ -53,8 +53,7 @@ def tile_lists(
     tiles_x, tiles_y = grid_size(width, height, tile_size)
     rects = tile_rects(means2d, radii, width, height, tile_size, profile).T.contiguous()
     x0, y0, x1, y1 = rects
-    rows = ((x1 > x0) & (y1 > y0)).nonzero().squeeze(1)
-    order = rows.index_select(0, depth_order(depths.index_select(0, rows)))
+    order = listed_rows(rects.T, depths)
     candidates = torch.zeros(len(order) + 1, dtype=torch.int64)
     torch.cumsum(((x1 - x0) * (y1 - y0)).index_select(0, order), 0, out=candidates[1:])
     n_candidates = int(candidates[-1])

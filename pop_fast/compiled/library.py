@@ -143,31 +143,20 @@ _LAYOUTS: Final[dict[str, type[ctypes.Structure]]] = {
 
 @dataclass(frozen=True)
 class Library:
-    """What is in the library.
+    """What is in the library."""
 
-    Attributes:
-        functions: by name and precision.
-        chunk: list entries after which the blend writes down the light.
-        padded_pixels: pixels of a tile of that size, padded to whole vectors of floats of so many bytes.
-        splat_bytes: size of what blending keeps of a splat, and its alignment.
-        lanes: numbers of so many bytes in a vector.
-        window_rows: rows of SSIM's windows whose total is one number.
-        padded_line: numbers from one row of maps to the next, for rows of that many numbers of so many bytes.
-        rows_at_a_time: Gaussians whose share of the camera's gradient is one sum.
-        adam: moves so many floats by one update of Adam.
-        fork: starts the threads, or None.
-    """
-
-    functions: dict[tuple[str, str], Callable[..., int]]
-    chunk: int
+    functions: dict[tuple[str, str], Callable[..., int]]  # by name and precision
+    chunk: int  # list entries after which the blend writes down the light
+    # pixels of a tile of that size, padded to whole vectors of floats of so many bytes
     padded_pixels: Callable[[int, int], int]
-    splat_bytes: int
-    lanes: Callable[[int], int]
-    window_rows: int
+    splat_bytes: int  # size of what blending keeps of a splat, and its alignment
+    lanes: Callable[[int], int]  # numbers of so many bytes in a vector
+    window_rows: int  # rows of SSIM's windows whose total is one number
+    # numbers from one row of maps to the next, for rows of that many numbers of so many bytes
     padded_line: Callable[[int, int], int]
-    rows_at_a_time: int
-    adam: Callable[..., None]
-    fork: Any
+    rows_at_a_time: int  # Gaussians whose share of the camera's gradient is one sum
+    adam: Callable[..., None]  # moves so many floats by one update of Adam
+    fork: Any  # starts the threads, or None
 
 
 @dataclass(frozen=True)

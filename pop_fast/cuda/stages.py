@@ -27,13 +27,9 @@ WIDEST = 4  # channels that one launch blends
 
 @dataclass(frozen=True)
 class SplatsOnGpu(Splats):
-    """Splats, and the flags that the kernels have raised while they were made.
+    """Splats, and the flags that the kernels have raised while they were made."""
 
-    Attributes:
-        state: int32, on the device.
-    """
-
-    state: Tensor | None = None
+    state: Tensor | None = None  # int32, on the device
 
 
 @dataclass(frozen=True)
@@ -41,11 +37,9 @@ class CudaStages:
     """Draws views as `pop_fast.api.backend.ViewStages` says.
 
     Optimizations: exact tile lists, two narrow stable sorts, one warp a 16 x 8 tile, moment-form gradients.
-
-    Attributes:
-        backward, deterministic: as `pop_fast.api.backends.CudaBackend` says.
     """
 
+    # backward, deterministic: as `pop_fast.api.backends.CudaBackend` says
     backward: str
     deterministic: bool
 

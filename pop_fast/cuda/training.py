@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 
@@ -22,23 +23,22 @@ _BYTES_OF_MOMENTS = 24  # a pixel
 
 def make_fused(task: Task) -> MakeFused:
     """Return what makes the fused step, with the photographs on the GPU."""
+    return partial(_fused, task)
 
-    def make(
-        params: Rows,
-        m: Rows,
-        v: Rows,
-        views: Sequence[ViewTensors],
-        order: Sequence[int],
-        settings: StepSettings,
-        step: int,
-    ) -> Fused:
-        resident = _resident(views, settings, params["means"].device)
-        size = task.config.batch_size
-        if size == 1:
-            return FusedTrainer(params, m, v, resident, order, settings, step)
-        return BatchTrainer(params, m, v, resident, order, settings, step, size, task.ranks)
 
-    return make
+def _fused(
+    task: Task,
+    params: Rows,
+    m: Rows,
+    v: Rows,
+    views: Sequence[ViewTensors],
+    order: Sequence[int],
+    settings: StepSettings,
+    step: int,
+) -> Fused:
+    given = (params, m, v, _resident(views, settings, params["means"].device), order, settings, step)
+    size = task.config.batch_size
+    return FusedTrainer(*given) if size == 1 else BatchTrainer(*given, size, task.ranks)
 
 
 def _resident(views: Sequence[ViewTensors], settings: StepSettings, device: torch.device) -> ResidentViews:

@@ -29,19 +29,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ViewContributions(Contributions):
-    """What every Gaussian contributes to a view, and the view.
+    """What every Gaussian contributes to a view, and the view."""
 
-    Attributes:
-        dominant_counts: pixels that it dominates, of those that the view's mask keeps. [N] int64
-        image: not clamped. [H, W, 3]
-        radii: extents, px; 0 where culled. [N, 2] int32
-        depths: camera z, world units. [N]
-    """
-
-    dominant_counts: Tensor
-    image: Tensor
-    radii: Tensor
-    depths: Tensor
+    dominant_counts: Tensor  # pixels that it dominates, of those that the view's mask keeps. [N] int64
+    image: Tensor  # not clamped. [H, W, 3]
+    radii: Tensor  # extents, px; 0 where culled. [N, 2] int32
+    depths: Tensor  # camera z, world units. [N]
 
     @property
     def visible(self) -> Tensor:

@@ -37,15 +37,11 @@ Info: TypeAlias = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Draws:
-    """Where a change of the Gaussians takes its random numbers from.
+    """Where a change of the Gaussians takes its random numbers from."""
 
-    Attributes:
-        normals: given n, standard normal draws for the children of n split parents, on the CPU. -> [2, n, 3]
-        uniforms: given n, draws from [0, 1), on the CPU. -> [n] float64
-    """
-
+    # given n, standard normal draws for the children of n split parents, on the CPU. -> [2, n, 3]
     normals: Callable[[int], Tensor]
-    uniforms: Callable[[int], Tensor]
+    uniforms: Callable[[int], Tensor]  # given n, draws from [0, 1), on the CPU. -> [n] float64
 
     @classmethod
     def of(cls, generator: torch.Generator) -> Draws:
@@ -60,25 +56,15 @@ class Draws:
 
 @dataclass(frozen=True)
 class DensificationContext:
-    """The Gaussians at a step after which they may change, and what a change may ask for.
+    """The Gaussians at a step after which they may change, and what a change may ask for."""
 
-    Attributes:
-        params: raw parameters, replaced under their keys.
-        optimizers: one per key.
-        state: the strategy's.
-        step: just taken, from 0.
-        draws: random numbers.
-        passes: over the training views; None in a trainer that has none.
-        sh_degree: colour bands that are drawn.
-    """
-
-    params: Params
-    optimizers: Optimizers
-    state: State
-    step: int
-    draws: Draws
-    passes: Passes | None = None
-    sh_degree: int = MAX_SH_DEGREE
+    params: Params  # raw parameters, replaced under their keys
+    optimizers: Optimizers  # one per key
+    state: State  # the strategy's
+    step: int  # just taken, from 0
+    draws: Draws  # random numbers
+    passes: Passes | None = None  # over the training views; None in a trainer that has none
+    sh_degree: int = MAX_SH_DEGREE  # colour bands that are drawn
 
     def __len__(self) -> int:
         return len(self.params["means"])
@@ -97,21 +83,13 @@ class DensificationContext:
 
 @dataclass(frozen=True)
 class DensificationStep:
-    """What density control did to the Gaussians after a step.
+    """What density control did to the Gaussians after a step."""
 
-    Attributes:
-        cloned: Gaussians that were copied.
-        split: Gaussians that two smaller ones replaced.
-        pruned: Gaussians that were removed.
-        reset: whether all opacities were lowered.
-        replaced: Gaussians that took the place of all there were.
-    """
-
-    cloned: int = 0
-    split: int = 0
-    pruned: int = 0
-    reset: bool = False
-    replaced: int = 0
+    cloned: int = 0  # Gaussians that were copied
+    split: int = 0  # Gaussians that two smaller ones replaced
+    pruned: int = 0  # Gaussians that were removed
+    reset: bool = False  # whether all opacities were lowered
+    replaced: int = 0  # Gaussians that took the place of all there were
 
     def record(self) -> dict[str, Any]:
         """Return what a record of metrics.jsonl says about it; what is rare is mentioned only where it happened."""

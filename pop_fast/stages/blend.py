@@ -125,13 +125,9 @@ class Dominance:
 
 @dataclass(frozen=True)
 class Stop:
-    """The transmittance that a pixel must stay above.
+    """The transmittance that a pixel must stay above."""
 
-    Attributes:
-        at: a pixel stops where T <= at.
-    """
-
-    at: float
+    at: float  # a pixel stops where T <= at
 
     @classmethod
     def of(cls, profile: Profile, dtype: torch.dtype) -> Stop:
@@ -182,57 +178,36 @@ COMPACT_BELOW = 0.8  # share of live tiles under which the group is compacted
 
 @dataclass(frozen=True)
 class Step:
-    """One blended step, as the transpose needs it.
+    """One blended step, as the transpose needs it."""
 
-    Attributes:
-        blocks: of eight entries each, the null block where a list has ended. [n, K / 8]
-        rows: which of the group's tiles took part: the first `n` of these, or of all when None.
-        transmittance: T before the step; belongs to the buffers. [n, P]
-    """
-
-    blocks: Tensor
-    rows: Tensor | None
-    transmittance: Tensor
+    blocks: Tensor  # of eight entries each, the null block where a list has ended. [n, K / 8]
+    rows: Tensor | None  # which of the group's tiles took part: the first `n` of these, or of all when None
+    transmittance: Tensor  # T before the step; belongs to the buffers. [n, P]
 
 
 @dataclass
 class GroupBlend:
-    """What blending a group gives.
+    """What blending a group gives."""
 
-    Attributes:
-        image: weighted colours and, last, the sum of weights. [G, D + 1, P]
-        steps: front to back.
-        n_blended: [G, P], when counted.
-        n_passed: list entries that the pixel went past without stopping. [G, P], when counted.
-        dominant_weights: the largest weights, when asked for. [G, P]
-        dominant_places: and their places in the tile's list, -1 where nothing was blended. [G, P]
-        n_pairs: (entry, pixel) pairs evaluated.
-    """
-
-    image: Tensor
-    steps: list[Step] = field(default_factory=list)
-    n_blended: Tensor | None = None
-    n_passed: Tensor | None = None
-    dominant_weights: Tensor | None = None
+    image: Tensor  # weighted colours and, last, the sum of weights. [G, D + 1, P]
+    steps: list[Step] = field(default_factory=list)  # front to back
+    n_blended: Tensor | None = None  # [G, P], when counted
+    n_passed: Tensor | None = None  # list entries that the pixel went past without stopping. [G, P], when counted.
+    dominant_weights: Tensor | None = None  # the largest weights, when asked for. [G, P]
+    # and their places in the tile's list, -1 where nothing was blended. [G, P]
     dominant_places: Tensor | None = None
-    n_pairs: int = 0
+    n_pairs: int = 0  # (entry, pixel) pairs evaluated
 
 
 @dataclass(frozen=True)
 class Blender:
-    """The fixed numbers of a blend.
+    """The fixed numbers of a blend."""
 
-    Attributes:
-        table: per entry, the exponent's coefficients, the colours and a 1, in blocks of eight. [B, 8, 6 + D + 1]
-        basis: pixel basis. [6, P]
-        profile: constants and strictness.
-        clamps: whether any alpha can pass the ceiling.
-    """
-
+    # per entry, the exponent's coefficients, the colours and a 1, in blocks of eight. [B, 8, 6 + D + 1]
     table: Tensor
-    basis: Tensor
-    profile: Profile
-    clamps: bool
+    basis: Tensor  # pixel basis. [6, P]
+    profile: Profile  # constants and strictness
+    clamps: bool  # whether any alpha can pass the ceiling
 
     @classmethod
     def of(cls, entries: Entries, conics: Tensor, opacities: Tensor, colors: Tensor, profile: Profile) -> Blender:
@@ -465,11 +440,6 @@ def acquired_buffers(n: int, numel: int, dtype: torch.dtype) -> Iterator[list[Te
     finally:
         for slab in taken:
             release_buffer(slab)
-
-
-def retained_bytes() -> int:
-    """Return how much memory waits to be used again."""
-    return _pool.retained
 
 
 def clear_buffers() -> None:

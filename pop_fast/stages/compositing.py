@@ -28,25 +28,16 @@ from pop_ref.constants import PAPER, Profile
 
 @dataclass(frozen=True)
 class Composite:
-    """A blended view, over black.
+    """A blended view, over black."""
 
-    Attributes:
-        image: weighted colours. [H, W, D]
-        alphas: sum of weights, 1 - T_final. [H, W]
-        dominant_ids: -1 where none was blended. [H, W] int64, or None when not asked for
-        dominant_weights: [H, W], or None when not asked for
-        n_blended: [H, W] int32, or None when not asked for
-        n_traversed: list entries visited, the terminating one included. [H, W] int32, or None when not asked for
-        n_pairs: (entry, pixel) pairs evaluated, None where nobody counts them.
-    """
-
-    image: Tensor
-    alphas: Tensor
-    dominant_ids: Tensor | None
-    dominant_weights: Tensor | None
-    n_blended: Tensor | None
+    image: Tensor  # weighted colours. [H, W, D]
+    alphas: Tensor  # sum of weights, 1 - T_final. [H, W]
+    dominant_ids: Tensor | None  # -1 where none was blended. [H, W] int64, or None when not asked for
+    dominant_weights: Tensor | None  # [H, W], or None when not asked for
+    n_blended: Tensor | None  # [H, W] int32, or None when not asked for
+    # list entries visited, the terminating one included. [H, W] int32, or None when not asked for
     n_traversed: Tensor | None
-    n_pairs: int | None
+    n_pairs: int | None  # (entry, pixel) pairs evaluated, None where nobody counts them
 
 
 def composite(

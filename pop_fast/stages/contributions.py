@@ -37,19 +37,12 @@ Sums = Callable[..., Tensor]
 
 @dataclass(frozen=True)
 class Contributions:
-    """Sums over the pixels where a Gaussian is blended; see `pop_ref.contributions.Contributions`.
+    """Sums over the pixels where a Gaussian is blended; see `pop_ref.contributions.Contributions`."""
 
-    Attributes:
-        weight_sum: of T alpha. [N] float64
-        n_pixels: how many these are. [N] int64
-        map_sum: of a map's values, 0 without a map. [N] float64
-        distance_sum: of the distances of the pixels' centres to the splat's, px. [N] float64
-    """
-
-    weight_sum: Tensor
-    n_pixels: Tensor
-    map_sum: Tensor
-    distance_sum: Tensor
+    weight_sum: Tensor  # of T alpha. [N] float64
+    n_pixels: Tensor  # how many these are. [N] int64
+    map_sum: Tensor  # of a map's values, 0 without a map. [N] float64
+    distance_sum: Tensor  # of the distances of the pixels' centres to the splat's, px. [N] float64
 
 
 def _contribution_sums(
@@ -274,27 +267,16 @@ def log_det_scores(blocks: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Pairs:
-    """One step: n tiles, K list entries of each, all P pixels of a tile. What it holds is gone with the next step.
+    """One step: n tiles, K list entries of each, all P pixels of a tile. What it holds is gone with the next step."""
 
-    Attributes:
-        tiles: [n]
-        rows: place of every entry in the packed lists. [n, K]
-        ids: splat of every entry, the number of splats for padding. [n, K]
-        coefficients: of the entries' exponents. [n K, 6]
-        colors: of the entries. [n, K, D]
-        alpha: 0 where an entry is not blended, and off the image. [n, K, P]
-        weight: T alpha. [n, K, P]
-        scratch: for whatever is computed from these. [n, K, P]
-    """
-
-    tiles: Tensor
-    rows: Tensor
-    ids: Tensor
-    coefficients: Tensor
-    colors: Tensor
-    alpha: Tensor
-    weight: Tensor
-    scratch: Tensor
+    tiles: Tensor  # [n]
+    rows: Tensor  # place of every entry in the packed lists. [n, K]
+    ids: Tensor  # splat of every entry, the number of splats for padding. [n, K]
+    coefficients: Tensor  # of the entries' exponents. [n K, 6]
+    colors: Tensor  # of the entries. [n, K, D]
+    alpha: Tensor  # 0 where an entry is not blended, and off the image. [n, K, P]
+    weight: Tensor  # T alpha. [n, K, P]
+    scratch: Tensor  # for whatever is computed from these. [n, K, P]
 
 
 class PairWalk:
@@ -437,17 +419,11 @@ def check_grid(lists: TileLists, width: int, height: int, tile_size: int) -> Non
 
 @dataclass(frozen=True)
 class DominantPoints:
-    """See `pop_ref.chord.DominantPoints`.
+    """See `pop_ref.chord.DominantPoints`."""
 
-    Attributes:
-        points: on the rays, world units; 0 where no Gaussian competes. [H, W, 3]
-        ids: the Gaussian of each pixel, -1 where none competes. [H, W] int64
-        T_final: light that is left behind all that is blended. [H, W]
-    """
-
-    points: Tensor
-    ids: Tensor
-    T_final: Tensor
+    points: Tensor  # on the rays, world units; 0 where no Gaussian competes. [H, W, 3]
+    ids: Tensor  # the Gaussian of each pixel, -1 where none competes. [H, W] int64
+    T_final: Tensor  # light that is left behind all that is blended. [H, W]
 
 
 def chord_midpoint(mean: Tensor, quat: Tensor, scale: Tensor, origin: Tensor, direction: Tensor) -> Tensor:

@@ -305,8 +305,8 @@ def _minmax(x: Tensor) -> Tensor:
     return (x - least) / (greatest - least) if bool(greatest > least) else torch.zeros_like(x)
 
 
-def mean_squared_distances(points: np.ndarray, k: int = 3) -> np.ndarray:
-    """Return each point's mean squared distance to its k nearest others, or to all where there are fewer.
+def mean_squared_distances(points: np.ndarray) -> np.ndarray:
+    """Return each point's mean squared distance to its three nearest others, or to all where there are fewer.
 
     Args:
         points: any unit; those that coincide are each other's nearest. [N, 3]
@@ -318,5 +318,5 @@ def mean_squared_distances(points: np.ndarray, k: int = 3) -> np.ndarray:
     if n < 2:
         return np.zeros(n)
     # a point is its own nearest neighbour
-    nearest = np.asarray(KDTree(points).query(points, k=min(k + 1, n))[0])[:, 1:]
+    nearest = np.asarray(KDTree(points).query(points, k=min(4, n))[0])[:, 1:]
     return np.mean(nearest**2, axis=1)

@@ -56,11 +56,6 @@ _BAND_VALUES = 1 << 18
 REACH = WINDOW_SIZE - 1
 
 
-def gaussian_window() -> Tensor:
-    """See `pop_ref.ssim.gaussian_window`. [11, 11] float64"""
-    return torch.outer(*[torch.tensor(_TAPS, dtype=torch.float64)] * 2)
-
-
 def _taps() -> list[float]:
     offsets = torch.arange(WINDOW_SIZE, dtype=torch.float64) - WINDOW_SIZE // 2
     falloff = torch.exp(-(offsets**2) / (2.0 * WINDOW_SIGMA**2))
@@ -72,19 +67,12 @@ _TAPS = _taps()
 
 @dataclass(frozen=True)
 class TargetMoments:
-    """A photograph and what SSIM needs to know about it; make it once per view with `target_moments`.
+    """A photograph and what SSIM needs to know about it; make it once per view with `target_moments`."""
 
-    Attributes:
-        target: the photograph. [H, W, D]
-        padding: "valid" or "same".
-        mu_y: Σ w y. [h, w D]
-        s_yy: Σ w y² - mu_y². [h, w D]
-    """
-
-    target: Tensor
-    padding: Padding
-    mu_y: Tensor
-    s_yy: Tensor
+    target: Tensor  # the photograph. [H, W, D]
+    padding: Padding  # "valid" or "same"
+    mu_y: Tensor  # Σ w y. [h, w D]
+    s_yy: Tensor  # Σ w y² - mu_y². [h, w D]
 
 
 def target_moments(target: Tensor, padding: Padding = "valid") -> TargetMoments:
@@ -234,18 +222,13 @@ Dissimilarity = Callable[..., tuple[Tensor, Tensor | None]]
 
 @dataclass(frozen=True)
 class Loss:
-    """What the pixels of a render are compared with their photograph by, as `pop_fast.train.presets.LOSSES` names it.
+    """What pixels of a render are compared with their photograph by, as `pop_fast.train.presets.LOSSES` names it."""
 
-    Attributes:
-        name: in the settings of a run, and in its records.
-        pixelwise: given render and photograph [H, W, 3] and a mask [H, W] or None, a differentiable mean over the
-            values that the mask keeps.
-        whole: the name, in a backend's losses, of what weighs it against D-SSIM in one pass; None where the two are
-            added up.
-    """
-
-    name: str
+    name: str  # in the settings of a run, and in its records
+    # given render and photograph [H, W, 3] and a mask [H, W] or None, a differentiable mean over the values that the
+    # mask keeps
     pixelwise: Callable[[Tensor, Tensor, Tensor | None], Tensor]
+    # the name, in a backend's losses, of what weighs it against D-SSIM in one pass; None where the two are added up
     whole: str | None = None
 
 

@@ -43,25 +43,15 @@ from pop_ref.constants import PAPER, Profile
 
 @dataclass(frozen=True)
 class Splats:
-    """Gaussians as one camera sees them, one row each; see `pop_ref.records.Splats`.
+    """Gaussians as one camera sees them, one row each; see `pop_ref.records.Splats`."""
 
-    Attributes:
-        means2d: screen centres, px. [N, 2]
-        depths: camera z, world units. [N]
-        conics: inverse screen covariances (xx, xy, yy), px^-2. [N, 3]
-        opacities: what blends, after the antialiasing factor if any. [N]
-        radii: extents in px; both 0 where culled. [N, 2] int32
-        compensations: the antialiasing factor, None in classic mode. [N]
-        colors: any number of channels, where what takes the splats reads them. [N, D]
-    """
-
-    means2d: Tensor
-    depths: Tensor
-    conics: Tensor
-    opacities: Tensor
-    radii: Tensor
-    compensations: Tensor | None = None
-    colors: Tensor | None = None
+    means2d: Tensor  # screen centres, px. [N, 2]
+    depths: Tensor  # camera z, world units. [N]
+    conics: Tensor  # inverse screen covariances (xx, xy, yy), px^-2. [N, 3]
+    opacities: Tensor  # what blends, after the antialiasing factor if any. [N]
+    radii: Tensor  # extents in px; both 0 where culled. [N, 2] int32
+    compensations: Tensor | None = None  # the antialiasing factor, None in classic mode. [N]
+    colors: Tensor | None = None  # any number of channels, where what takes the splats reads them. [N, D]
 
 
 class Shapes(NamedTuple):
@@ -84,23 +74,14 @@ def colors_of(splats: Splats) -> Tensor:
 
 @dataclass(frozen=True)
 class ProjectionSettings:
-    """What a projection needs of a camera.
+    """What a projection needs of a camera."""
 
-    Attributes:
-        K: intrinsics, px. [3, 3]
-        width: px.
-        height: px.
-        profile: near and far plane, clamp, low-pass, extents.
-        antialiased: scale opacities by the antialiasing factor.
-        radius_clip: px; splats whose two extents are both at most this are culled.
-    """
-
-    K: Tensor
-    width: int
-    height: int
-    profile: Profile = PAPER
-    antialiased: bool = False
-    radius_clip: float = 0.0
+    K: Tensor  # intrinsics, px. [3, 3]
+    width: int  # px
+    height: int  # px
+    profile: Profile = PAPER  # near and far plane, clamp, low-pass, extents
+    antialiased: bool = False  # scale opacities by the antialiasing factor
+    radius_clip: float = 0.0  # px; splats whose two extents are both at most this are culled
 
 
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:

@@ -32,40 +32,24 @@ from pop_ref.constants import Profile
 
 @dataclass(frozen=True)
 class Seen:
-    """A view before its sums.
+    """A view before its sums."""
 
-    Attributes:
-        image: [H, W, 3]
-        dominant_ids: -1 where none. [H, W]
-        radii: [N, 2]
-        depths: [N]
-    """
-
-    image: Tensor
-    dominant_ids: Tensor
-    radii: Tensor
-    depths: Tensor
+    image: Tensor  # [H, W, 3]
+    dominant_ids: Tensor  # -1 where none. [H, W]
+    radii: Tensor  # [N, 2]
+    depths: Tensor  # [N]
 
 
 @dataclass(frozen=True)
 class PassInput:
-    """What a pass draws: Gaussians, a camera, the bands of their colours in use, and how.
+    """What a pass draws: Gaussians, a camera, the bands of their colours in use, and how."""
 
-    Attributes:
-        gaussians: activated.
-        camera: the view.
-        sh_degree: bands to use.
-        background: colour behind everything. [3]
-        profile: constants and strictness.
-        antialiased: scale opacities by the antialiasing factor.
-    """
-
-    gaussians: Gaussians
-    camera: Camera
-    sh_degree: int
-    background: Tensor
-    profile: Profile
-    antialiased: bool
+    gaussians: Gaussians  # activated
+    camera: Camera  # the view
+    sh_degree: int  # bands to use
+    background: Tensor  # colour behind everything. [3]
+    profile: Profile  # constants and strictness
+    antialiased: bool  # scale opacities by the antialiasing factor
 
 
 SMALL_TILE, LARGE_TILE = 8, 16  # px
@@ -93,9 +77,6 @@ class Stages:
     """Functions with the signatures and results of the torch path's, which are the defaults.
 
     It draws views as `pop_fast.api.backend.ViewStages` says.
-
-    Attributes:
-        blend_tile: given the splats' extents, the tile to blend them in.
     """
 
     covariances: Callable[..., Tensor] = covariances
@@ -103,7 +84,7 @@ class Stages:
     colors_of_view: Callable[..., Tensor] = colors_of_view
     list_tiles: Callable[..., TileLists] = tile_lists
     composite: Callable[..., Composite] = composite
-    blend_tile: Callable[[Tensor], int] = torchs_tile
+    blend_tile: Callable[[Tensor], int] = torchs_tile  # given the splats' extents, the tile to blend them in
     contributions: Callable[..., Contributions] = contributions
     sensitivities: Callable[..., Tensor] = sensitivities
     screen_moments: Callable[..., Tensor] = screen_moments

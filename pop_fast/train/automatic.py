@@ -66,19 +66,15 @@ _PIXEL_BYTES: Final = 42
 
 @dataclass(frozen=True)
 class Speed:
-    """How fast this machine takes steps of a run.
+    """How fast this machine takes steps of a run."""
 
-    Attributes:
-        few, many: Gaussians that were trained.
-        seconds_few, seconds_many: a step with so many took.
-        took: s, all of the measurement.
-    """
-
+    # few, many: Gaussians that were trained
     few: int
     many: int
+    # seconds_few, seconds_many: a step with so many took
     seconds_few: float
     seconds_many: float
-    took: float = 0.0
+    took: float = 0.0  # s, all of the measurement
 
     def seconds_a_step(self, gaussians: float) -> float:
         """Give the time of a step with so many Gaussians, never less than with the fewest."""
@@ -88,21 +84,13 @@ class Speed:
 
 @dataclass(frozen=True)
 class Choice:
-    """What was chosen.
+    """What was chosen."""
 
-    Attributes:
-        scaler: of the paper's schedule.
-        gaussians: expected at the end.
-        seconds: expected of training and measuring.
-        memory_bytes: expected of the process.
-        why: what kept the schedule shorter than the minutes allow; None where that was nothing.
-    """
-
-    scaler: float
-    gaussians: float
-    seconds: float
-    memory_bytes: float
-    why: str | None = None
+    scaler: float  # of the paper's schedule
+    gaussians: float  # expected at the end
+    seconds: float  # expected of training and measuring
+    memory_bytes: float  # expected of the process
+    why: str | None = None  # what kept the schedule shorter than the minutes allow; None where that was nothing
 
 
 def factor_for(sizes: Sequence[tuple[int, int]], gpu: bool, minutes: float) -> int:
@@ -206,15 +194,10 @@ TERMS: Final = ("depth_lambda", "exposure")
 
 @dataclass(frozen=True)
 class Terms:
-    """Terms of the loss that were chosen.
+    """Terms of the loss that were chosen."""
 
-    Attributes:
-        settings: by name, those that nobody said.
-        why: a sentence for each that was chosen, or that could not be.
-    """
-
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    why: tuple[str, ...] = ()
+    settings: Mapping[str, Any] = field(default_factory=dict)  # by name, those that nobody said
+    why: tuple[str, ...] = ()  # a sentence for each that was chosen, or that could not be
 
 
 def choose_terms(capture: Capture, config: TrainConfig, stops: float | None) -> Terms:

@@ -77,15 +77,10 @@ class Coding(Protocol):
 
 @dataclass(frozen=True)
 class Compact:
-    """A splat that fits.
+    """A splat that fits."""
 
-    Attributes:
-        params: raw parameters, in the training frame.
-        level: of coarseness that it is written at.
-    """
-
-    params: dict[str, Tensor]
-    level: int = 0
+    params: dict[str, Tensor]  # raw parameters, in the training frame
+    level: int = 0  # of coarseness that it is written at
 
     @property
     def degree(self) -> int:
@@ -95,17 +90,11 @@ class Compact:
 
 @dataclass(frozen=True)
 class _Trial:
-    """A way to fit, tuned for a few steps.
+    """A way to fit, tuned for a few steps."""
 
-    Attributes:
-        compact: what came out.
-        scores: of its Gaussians. [N]
-        psnr: of what is read back, in training views.
-    """
-
-    compact: Compact
-    scores: Tensor
-    psnr: float
+    compact: Compact  # what came out
+    scores: Tensor  # of its Gaussians. [N]
+    psnr: float  # of what is read back, in training views
 
 
 def degree_of(params: Params) -> int:

@@ -203,21 +203,13 @@ _MOST_VIEWS: Final = 4
 
 @dataclass(frozen=True)
 class Encoding:
-    """A splat in a format.
+    """A splat in a format."""
 
-    Attributes:
-        format: its name.
-        bytes: of the file.
-        num_gaussians: in it.
-        psnr: mean over some held-out views after a round trip, dB; None where there is none.
-        views: how many these are.
-    """
-
-    format: str
-    bytes: int
-    num_gaussians: int
-    psnr: float | None
-    views: int
+    format: str  # its name
+    bytes: int  # of the file
+    num_gaussians: int  # in it
+    psnr: float | None  # mean over some held-out views after a round trip, dB; None where there is none
+    views: int  # how many these are
 
     def entry(self) -> dict[str, Any]:
         """Return what the statistics hold of it."""
@@ -231,7 +223,6 @@ def measure_encodings(
     config: TrainConfig,
     sh_degree: int,
     world_transform: np.ndarray,
-    names: Sequence[str] | None = None,
 ) -> Iterator[Encoding]:
     """Write a splat in every format, in the capture's own frame, read it back and measure it in the training frame.
 
@@ -242,7 +233,6 @@ def measure_encodings(
         config: background, profile and antialiasing are read.
         sh_degree: highest active colour band.
         world_transform: the training frame from the capture's. [4, 4]
-        names: of the formats; None takes all.
 
     Yields:
         One format after the other, as soon as it is measured.
@@ -250,7 +240,7 @@ def measure_encodings(
     some = evenly(views, _MOST_VIEWS)
     plain = {name: value.detach().cpu() for name, value in params.items()}
     own = to_capture_frame(plain, world_transform)
-    for name in format_names() if names is None else names:
+    for name in format_names():
         try:
             data = encoded(name, own, config.antialiased)
         except PopError:

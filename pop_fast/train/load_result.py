@@ -26,23 +26,14 @@ RECORD = "capture.json"
 
 @dataclass(frozen=True, kw_only=True)
 class Splat:
-    """Gaussians and what is known about them.
+    """Gaussians and what is known about them."""
 
-    Attributes:
-        path: the checkpoint or PLY that was read.
-        params: raw parameters.
-        config: the settings they were trained with; the defaults for a lone file.
-        step: the last step taken, from 0; None for a lone PLY.
-        folder: the result folder it belongs to, if any.
-        frame: the world it is in, where its file or its run says it.
-    """
-
-    path: Path
-    params: dict[str, Tensor]
-    config: TrainConfig
-    step: int | None = None
-    folder: Path | None = None
-    frame: Frame | None = None
+    path: Path  # the checkpoint or PLY that was read
+    params: dict[str, Tensor]  # raw parameters
+    config: TrainConfig  # the settings they were trained with; the defaults for a lone file
+    step: int | None = None  # the last step taken, from 0; None for a lone PLY
+    folder: Path | None = None  # the result folder it belongs to, if any
+    frame: Frame | None = None  # the world it is in, where its file or its run says it
 
     @property
     def sh_degree(self) -> int:

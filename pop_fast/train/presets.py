@@ -39,17 +39,8 @@ from typing import (
     get_type_hints,
 )
 
-from pop_fast.density import (
-    DensityControl,
-    GsplatStrategy,
-    Inria2023Strategy,
-    InriaStrategy,
-    MiniSplattingStrategy,
-    POPStrategy,
-    PupStrategy,
-    SpeedySplatStrategy,
-    TamingStrategy,
-)
+from pop_fast import density
+from pop_fast.density import DensityControl
 from pop_fast.errors import PopError
 from pop_ref.recipes import BASELINES, RECIPES, Recipe
 from pop_ref.registry import Registry
@@ -60,31 +51,25 @@ if TYPE_CHECKING:
 
 
 class Method(NamedTuple):
-    """A method that can be trained.
+    """A method that can be trained."""
 
-    Attributes:
-        strategy: density control, with the method's defaults.
-        recipe: that the rest of its defaults are from.
-        title: what tables and pages call it.
-    """
-
-    strategy: type[DensityControl]
-    recipe: Recipe
-    title: str
+    strategy: type[DensityControl]  # density control, with the method's defaults
+    recipe: Recipe  # that the rest of its defaults are from
+    title: str  # what tables and pages call it
 
 
 METHODS: Final[Registry[Method]] = Registry(
     "method",
     "pop_splatting.methods",
     {
-        "pop": Method(POPStrategy, RECIPES["POP"], "POP"),
-        "gsplat": Method(GsplatStrategy, RECIPES["gsplat"], "gsplat (default strategy)"),
-        "3dgs": Method(InriaStrategy, RECIPES["3DGS"], "3DGS (Inria)"),
-        "3dgs-2023": Method(Inria2023Strategy, RECIPES["3DGS 2023"], "3DGS (Inria, 2023)"),
-        "pup": Method(PupStrategy, BASELINES["PUP-3DGS"], "PUP-3DGS"),
-        "mini-splatting": Method(MiniSplattingStrategy, BASELINES["Mini-Splatting"], "Mini-Splatting"),
-        "taming": Method(TamingStrategy, BASELINES["Taming-3DGS"], "Taming-3DGS"),
-        "speedy-splat": Method(SpeedySplatStrategy, BASELINES["Speedy-Splat"], "Speedy-Splat"),
+        "pop": Method(density.POPStrategy, RECIPES["POP"], "POP"),
+        "gsplat": Method(density.GsplatStrategy, RECIPES["gsplat"], "gsplat (default strategy)"),
+        "3dgs": Method(density.InriaStrategy, RECIPES["3DGS"], "3DGS (Inria)"),
+        "3dgs-2023": Method(density.Inria2023Strategy, RECIPES["3DGS 2023"], "3DGS (Inria, 2023)"),
+        "pup": Method(density.PupStrategy, BASELINES["PUP-3DGS"], "PUP-3DGS"),
+        "mini-splatting": Method(density.MiniSplattingStrategy, BASELINES["Mini-Splatting"], "Mini-Splatting"),
+        "taming": Method(density.TamingStrategy, BASELINES["Taming-3DGS"], "Taming-3DGS"),
+        "speedy-splat": Method(density.SpeedySplatStrategy, BASELINES["Speedy-Splat"], "Speedy-Splat"),
     },
     needs=("strategy", "recipe", "title"),
     error=PopError,

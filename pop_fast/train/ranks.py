@@ -29,15 +29,10 @@ _PATIENCE: Final = timedelta(days=2)
 
 
 class Ranks:
-    """One process that trains by itself; `TorchRanks` is one of several.
+    """One process that trains by itself; `TorchRanks` is one of several."""
 
-    Attributes:
-        rank: number of this process, from 0; the one that writes and prints is 0.
-        size: how many there are.
-    """
-
-    rank: int = 0
-    size: int = 1
+    rank: int = 0  # number of this process, from 0; the one that writes and prints is 0
+    size: int = 1  # how many there are
 
     @property
     def writes(self) -> bool:

@@ -291,29 +291,17 @@ def _finite(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Segment:
-    """Steps of one phase, taken one after the other, and the densification step after the last of them.
+    """Steps of one phase, taken one after the other, and the densification step after the last of them."""
 
-    Attributes:
-        first: number of the first step, from 0.
-        phase: what they did.
-        views: name of the photograph of each step.
-        stats: of each step.
-        densification: what density control did after the last, None where nothing was due.
-        before: Gaussians that were trained.
-        after: Gaussians after that.
-        seconds: that all of it took, by the clock.
-        seconds_cpu: of processor time, over all threads.
-    """
-
-    first: int
-    phase: Phase
-    views: list[str]
-    stats: list[StepStats]
-    densification: DensificationStep | None
-    before: int
-    after: int
-    seconds: float
-    seconds_cpu: float
+    first: int  # number of the first step, from 0
+    phase: Phase  # what they did
+    views: list[str]  # name of the photograph of each step
+    stats: list[StepStats]  # of each step
+    densification: DensificationStep | None  # what density control did after the last, None where nothing was due
+    before: int  # Gaussians that were trained
+    after: int  # Gaussians after that
+    seconds: float  # that all of it took, by the clock
+    seconds_cpu: float  # of processor time, over all threads
 
 
 def record_of(
@@ -368,19 +356,12 @@ class Stopwatch:
 
 @dataclass
 class Times:
-    """The times of a run, s.
+    """The times of a run, s."""
 
-    Attributes:
-        loading: of reading the capture and of compiling, by the clock.
-        sfm: of searching for the capture's cameras before that, by the clock; 0 where they were there.
-        train: of steps and density control, by the clock.
-        cpu: of the same on the processor; None where a part of the run did not count it.
-    """
-
-    loading: float = 0.0
-    sfm: float = 0.0
-    train: float = 0.0
-    cpu: float | None = 0.0
+    loading: float = 0.0  # of reading the capture and of compiling, by the clock
+    sfm: float = 0.0  # of searching for the capture's cameras before that, by the clock; 0 where they were there
+    train: float = 0.0  # of steps and density control, by the clock
+    cpu: float | None = 0.0  # of the same on the processor; None where a part of the run did not count it
     _started: float = 0.0
 
     def start(self) -> None:

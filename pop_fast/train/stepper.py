@@ -27,14 +27,10 @@ class Stepper(Protocol):
     It works on what it is bound to and owns nothing that a checkpoint needs: after `steps` the parameters, the
     optimizers' state and the strategy's statistics in `state` are those of the last step; where several processes train
     together, after `synchronize`.
-
-    Attributes:
-        name: of the engine, for the statistics of a run.
-        step: steps taken.
     """
 
-    name: str
-    step: int
+    name: str  # of the engine, for the statistics of a run
+    step: int  # steps taken
 
     @property
     def longest(self) -> int:
@@ -67,31 +63,18 @@ class Stepper(Protocol):
 
 @dataclass(frozen=True)
 class Task:
-    """What a stepper is to train.
+    """What a stepper is to train."""
 
-    Attributes:
-        config: step numbers as they are run.
-        strategy: the one of density control.
-        views: to train on.
-        order: the views of every step, `config.batch_size` of them a step.
-        updates: which parameters Adam moves at which step.
-        step: steps taken.
-        appearance: what is learned of the photographs.
-        ranks: the processes that draw the views of a step.
-        stop: whether somebody has asked for an end.
-        scene_scale: by which depth is compared, world units.
-    """
-
-    config: TrainConfig
-    strategy: DensityControl | ForeignStrategy
-    views: Sequence[ViewTensors]
-    order: Sequence[int]
-    updates: Updates
-    step: int
-    appearance: Appearance
-    ranks: Ranks = ALONE
-    stop: StopRequest = field(default_factory=StopRequest)
-    scene_scale: float = 1.0
+    config: TrainConfig  # step numbers as they are run
+    strategy: DensityControl | ForeignStrategy  # the one of density control
+    views: Sequence[ViewTensors]  # to train on
+    order: Sequence[int]  # the views of every step, `config.batch_size` of them a step
+    updates: Updates  # which parameters Adam moves at which step
+    step: int  # steps taken
+    appearance: Appearance  # what is learned of the photographs
+    ranks: Ranks = ALONE  # the processes that draw the views of a step
+    stop: StopRequest = field(default_factory=StopRequest)  # whether somebody has asked for an end
+    scene_scale: float = 1.0  # by which depth is compared, world units
 
     @property
     def may_abandon(self) -> bool:
@@ -101,20 +84,12 @@ class Task:
 
 @dataclass(frozen=True)
 class Engine:
-    """Where and by what a run is done.
+    """Where and by what a run is done."""
 
-    Attributes:
-        name: that settings give it, under which a run is resumed.
-        device: holds parameters, moments and statistics.
-        backend: renders there for measurements, from and to the CPU.
-        make_stepper: makes what takes the steps.
-        facts: goes into the statistics of a run.
-        depends_on_threads: whether another number of threads may round otherwise; if not, a run is resumed with any.
-    """
-
-    name: str
-    device: torch.device
-    backend: Renderer
-    make_stepper: Callable[[Task], Stepper]
-    facts: Callable[[], dict[str, Any]] = dict
+    name: str  # that settings give it, under which a run is resumed
+    device: torch.device  # holds parameters, moments and statistics
+    backend: Renderer  # renders there for measurements, from and to the CPU
+    make_stepper: Callable[[Task], Stepper]  # makes what takes the steps
+    facts: Callable[[], dict[str, Any]] = dict  # goes into the statistics of a run
+    # whether another number of threads may round otherwise; if not, a run is resumed with any
     depends_on_threads: bool = True

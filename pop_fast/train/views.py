@@ -30,26 +30,18 @@ V = TypeVar("V")
 
 @dataclass(frozen=True, eq=False)
 class ViewTensors:
-    """One view.
+    """One view."""
 
-    Attributes:
-        name: relative file name.
-        photo: uint8 [H, W, 3]
-        mask: True where the photograph counts, or None. bool [H, W]
-        viewmat: world -> camera, in the precision of the training. [1, 4, 4]
-        K: intrinsics, px, likewise. [1, 3, 3]
-        alpha: opacity of a photograph with transparency, which `photo` has laid over the settings' background, of 255;
-            None where it has none. uint8 [H, W]
-        points: sparse points that it sees, world, in the precision of the camera; None where they are not known or not
-            asked for. [P, 3]
-    """
-
-    name: str
-    photo: Tensor
-    mask: Tensor | None
-    viewmat: Tensor
-    K: Tensor
+    name: str  # relative file name
+    photo: Tensor  # uint8 [H, W, 3]
+    mask: Tensor | None  # True where the photograph counts, or None. bool [H, W]
+    viewmat: Tensor  # world -> camera, in the precision of the training. [1, 4, 4]
+    K: Tensor  # intrinsics, px, likewise. [1, 3, 3]
+    # opacity of a photograph with transparency, which `photo` has laid over the settings' background, of 255; None
+    # where it has none. uint8 [H, W]
     alpha: Tensor | None = None
+    # sparse points that it sees, world, in the precision of the camera; None where they are not known or not asked
+    # for. [P, 3]
     points: Tensor | None = None
 
     @classmethod
@@ -209,18 +201,13 @@ def _counts_inside(dominant_ids: Tensor, mask: Tensor, n: int) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """What one camera sees.
+    """What one camera sees."""
 
-    Attributes:
-        image: encoded RGB, not clamped. float32 [H, W, 3]
-        alpha: 1 - T_final, how much of the background is covered. float32 [H, W]
-        depth: mean camera z of what is blended, by weight; world units, 0 where nothing is. float32 [H, W]
-        dominant_ids: the Gaussian with the largest weight, -1 none; None where it was not asked for. int [H, W]
-    """
-
-    image: np.ndarray
-    alpha: np.ndarray
+    image: np.ndarray  # encoded RGB, not clamped. float32 [H, W, 3]
+    alpha: np.ndarray  # 1 - T_final, how much of the background is covered. float32 [H, W]
+    # mean camera z of what is blended, by weight; world units, 0 where nothing is. float32 [H, W]
     depth: np.ndarray
+    # the Gaussian with the largest weight, -1 none; None where it was not asked for. int [H, W]
     dominant_ids: np.ndarray | None
 
 
