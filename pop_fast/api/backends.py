@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from pop_fast.cuda.stages import CudaStages
     from pop_fast.oracle import OracleStages
     from pop_fast.stages.stage_set import Stages
-    from pop_fast.train.fused_stepper import MakeFused
-    from pop_fast.train.stepper import Task
+    from pop_fast.train.stepper import MakeFused, Task
 
 
 @dataclass(frozen=True)

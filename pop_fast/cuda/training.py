@@ -10,8 +10,7 @@ import torch
 from cuda_ext.training.batch_step import BatchTrainer
 from cuda_ext.training.resident import ResidentViews
 from cuda_ext.training.train_step import FusedTrainer
-from pop_fast.train.fused_stepper import Fused, MakeFused, Rows
-from pop_fast.train.stepper import Task
+from pop_fast.train.stepper import Fused, MakeFused, Rows, Task
 from pop_fast.train.steps import StepSettings
 from pop_fast.train.views import ViewTensors
 

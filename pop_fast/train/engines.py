@@ -18,8 +18,7 @@ from pop_fast.api.backend import Backend, Renderer, by_speed, fastest_backend, g
 from pop_fast.api.rasterize import RenderMeta
 from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.fused_stepper import FusedStepper
-from pop_fast.train.stepper import Engine, Stepper, Task
+from pop_fast.train.stepper import Engine, FusedStepper, Stepper, Task
 from pop_fast.train.steps import why_not_trained
 from pop_fast.train.torch_stepper import BatchStepper, TorchStepper
 

@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.api.backend import get_backend
-from pop_fast.train.fused_stepper import FusedStepper
-from pop_fast.train.stepper import Engine
+from pop_fast.train.stepper import Engine, FusedStepper
 from pop_fast.train.steps import Collected, Phase, StepSettings, StepStats
 from pop_fast.train.views import ViewTensors
 from pop_ref.settings import PARAMETERS

@@ -24,11 +24,10 @@ from pop_fast.errors import PopError
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.engines import engine_of, torch_engine
-from pop_fast.train.fused_stepper import FusedStepper, step_settings
 from pop_fast.train.model import KEYS
 from pop_fast.train.presets import METHODS
 from pop_fast.train.schedule import at_rest, phase_at, refining, segment_end, updates_of
-from pop_fast.train.stepper import Task
+from pop_fast.train.stepper import FusedStepper, Task, step_settings
 from pop_fast.train.steps import why_not_trained
 from pop_fast.train.torch_stepper import BatchStepper, TorchStepper
 from pop_ref.settings import PARAMETERS

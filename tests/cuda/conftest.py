@@ -63,8 +63,7 @@ def emulated_engine() -> Any:
 
     from pop_fast.api.backend import get_backend
     from pop_fast.train.engines import GpuProxy
-    from pop_fast.train.fused_stepper import FusedStepper
-    from pop_fast.train.stepper import Engine, Task
+    from pop_fast.train.stepper import Engine, FusedStepper, Task
 
     device, cuda = torch.device("cpu"), get_backend("cuda")
     step = cuda.whole_step()
