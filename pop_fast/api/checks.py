@@ -44,13 +44,10 @@ UNSUPPORTED: Final[Mapping[str, tuple[Any, str]]] = {
 
 
 def check_supported(given: Mapping[str, Any], backend: Backend) -> None:
-    """Raise for any argument that is not at the one value supported, by all backends or by this one.
+    """Raise NotImplementedError for an argument that is not at the one value supported, by all backends or this one.
 
     Args:
         given: arguments by name, those of `UNSUPPORTED` and of `backend.lacks` among them.
-
-    Raises:
-        NotImplementedError: names the argument.
     """
     for table, by in ((UNSUPPORTED, ""), (backend.lacks, f" by backend {backend.name!r}")):
         for name, (supported, why) in table.items():
@@ -61,11 +58,7 @@ def check_supported(given: Mapping[str, Any], backend: Backend) -> None:
 
 
 def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    """Raise for a value that is not one of several.
-
-    Raises:
-        ValueError: names the argument.
-    """
+    """Raise ValueError, which names the argument, for a value that is not one of several."""
     if value not in choices:
         raise ValueError(f"{name} is {value!r}; it must be one of {', '.join(choices)}")
 
@@ -123,7 +116,7 @@ class _Rule:
 
 
 class Checks:
-    """The checks of one call.
+    """The checks of one call; what is wrong raises ValueError, which names the tensor or the argument.
 
     Args:
         backend: which says where tensors must lie, and of which type.
@@ -135,11 +128,7 @@ class Checks:
         self._rules: list[_Rule] = []
 
     def tensor(self, name: str, tensor: Tensor | None, shape: tuple[int, ...]) -> Tensor:
-        """Check one tensor's presence, place, type and shape, and return it; that it is finite is asked in `values`.
-
-        Raises:
-            ValueError: names the tensor.
-        """
+        """Check one tensor's presence, place, type and shape, and return it; that it is finite is asked in `values`."""
         if tensor is None:
             raise ValueError(f"{name} is missing")
         if not self._backend.holds(tensor):
@@ -176,11 +165,7 @@ class Checks:
         opacities: Tensor,
         covars: Tensor | None,
     ) -> tuple[int, ...]:
-        """Check the Gaussians' tensors, and return the batch dimensions.
-
-        Raises:
-            ValueError: names the tensor.
-        """
+        """Check the Gaussians' tensors, and return the batch dimensions."""
         if means.dim() < 2 or means.shape[-1] != 3:
             raise ValueError(f"means has shape {list(means.shape)}; it must be [..., N, 3]")
         batch, n = tuple(means.shape[:-2]), means.shape[-2]
@@ -212,11 +197,7 @@ class Checks:
     def cameras(
         self, viewmats: Tensor, Ks: Tensor, width: int, height: int, tile_size: int, batch: tuple[int, ...]
     ) -> int:
-        """Check the cameras' tensors and sizes, and return how many there are.
-
-        Raises:
-            ValueError: names the argument.
-        """
+        """Check the cameras' tensors and sizes, and return how many there are."""
         if viewmats.dim() < 3:
             raise ValueError(f"viewmats has shape {list(viewmats.shape)}; it must be [..., C, 4, 4]")
         n = viewmats.shape[-3]
@@ -237,11 +218,7 @@ class Checks:
         return n
 
     def colors(self, colors: Tensor, sh_degree: int | None, batch: tuple[int, ...], n_cameras: int, n: int) -> bool:
-        """Check the colours or coefficients, and tell whether they are given per camera.
-
-        Raises:
-            ValueError: names the tensor.
-        """
+        """Check the colours or coefficients, and tell whether they are given per camera."""
         tail = 1 if sh_degree is None else 2
         channels = tuple(colors.shape[max(colors.dim() - tail, 0) :])
         shared, per_camera = (*batch, n, *channels), (*batch, n_cameras, n, *channels)
@@ -259,11 +236,7 @@ class Checks:
         return tuple(colors.shape) == per_camera
 
     def values(self) -> None:
-        """Check what was left to be asked of values, in one go.
-
-        Raises:
-            ValueError: names the tensor and the index.
-        """
+        """Check what was left to be asked of values, in one go."""
         probes = [rule.probe() for rule in self._rules]
         # what is on a GPU comes in one copy
         there = [number for numbers in probes for number in numbers if _is_elsewhere(number)]
@@ -284,11 +257,7 @@ class Checks:
 
 
 def check_given(**tensors: Any) -> None:
-    """Raise for what must be given and is no tensor.
-
-    Raises:
-        ValueError: names the argument.
-    """
+    """Raise ValueError, which names the argument, for what must be given and is no tensor."""
     for name, value in tensors.items():
         if not isinstance(value, Tensor):
             problem = "is missing" if value is None else f"is of type {type(value).__name__}"
@@ -296,11 +265,7 @@ def check_given(**tensors: Any) -> None:
 
 
 def check_sizes(width: int, height: int, tile_size: int) -> None:
-    """Raise for an image or a tile that is none.
-
-    Raises:
-        ValueError: names the size.
-    """
+    """Raise ValueError, which names the size, for an image or a tile that is none."""
     for name, value in {"width": width, "height": height, "tile_size": tile_size}.items():
         if not isinstance(value, Integral) or value < 1:
             raise ValueError(f"{name} is {value!r}; it must be a whole number >= 1")
