@@ -179,11 +179,7 @@ def backend_names() -> tuple[str, ...]:
 
 
 def get_backend(name: str) -> Backend:
-    """Return the backend of that name, whether or not it can run here.
-
-    Raises:
-        PopError: the name is unknown, or another package registered something under it that cannot be imported.
-    """
+    """Return the backend of that name, if it can run here or not; PopError where none is, or not importable."""
     return BACKENDS.named(name)
 
 
@@ -218,11 +214,7 @@ def fastest_backend(device: str) -> Backend:
 
 
 def require_backend(backend: str | Backend) -> Backend:
-    """Return a backend, or that of a name, which can run here.
-
-    Raises:
-        PopError: it is unknown, or cannot; says why and what to do.
-    """
+    """Return a backend, or that of a name, which can run here; PopError says why one cannot, and what to do."""
     found = get_backend(backend) if isinstance(backend, str) else backend
     reason = found.why_not()
     if reason is not None:

@@ -161,11 +161,7 @@ def gpus_for(backend: str) -> int:
 
 @contextmanager
 def own_gpu(folder: Path, backend: str) -> Iterator[None]:
-    """Train on a GPU of this machine that no other block of a run is trained on.
-
-    Raises:
-        PopError: a block is trained on each of them.
-    """
+    """Train on a GPU that no other block of a run is trained on; PopError where one is trained on each."""
     count = gpus_for(backend)
     lock = _free_gpu(folder, count) if count > 1 else None
     try:

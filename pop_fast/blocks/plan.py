@@ -188,11 +188,7 @@ def job_text(job: Job) -> str:
 
 
 def read_job(folder: Path) -> Job | None:
-    """Read what was asked for, or None where a folder is no run in blocks.
-
-    Raises:
-        PopError: job.json is damaged.
-    """
+    """Read what was asked for, None where a folder is no run in blocks; PopError where job.json is damaged."""
     path = folder / JOB
     if not path.is_file():
         return None
@@ -241,11 +237,7 @@ def entry_of(block: Block) -> dict[str, Any]:
 
 
 def read_plan(folder: Path) -> tuple[Partition, list[dict[str, Any]]] | None:
-    """Read the borders and every block's numbers, or None where the capture is not divided yet.
-
-    Raises:
-        PopError: plan.json is damaged.
-    """
+    """Read the borders and every block's numbers, None where nothing is divided yet; PopError where that is damaged."""
     path = folder / FOLDER / _PLAN
     if not path.is_file():
         return None

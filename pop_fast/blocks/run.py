@@ -343,11 +343,7 @@ def _stats_path(folder: Path, number: int) -> Path:
 
 
 def read_round(folder: Path, number: int) -> dict[str, Any]:
-    """Read what a round that another one follows came to.
-
-    Raises:
-        PopError: it is absent or damaged.
-    """
+    """Read what a round that another one follows came to; PopError where that is absent or damaged."""
     path, fix = _stats_path(folder, number), f"run pop blocks merge {folder} --round {number}"
     if not path.is_file():
         raise PopError(f"{path}: is absent; {fix}")
@@ -429,11 +425,7 @@ def _evaluated(
 
 
 def _results_stats(result: Path, step: int) -> dict[str, Any]:
-    """Read the statistics of a block's last step: the training's, and the held-out views' where there are some.
-
-    Raises:
-        PopError: they are absent or damaged.
-    """
+    """Read the statistics of a block's last step, held-out views too; PopError where they are absent or damaged."""
     folder = ResultFolder(result)
     found = folder.read_stats("val", step)
     if found is None:

@@ -71,11 +71,7 @@ class DensificationContext:
 
     @property
     def views(self) -> Passes:
-        """Return the passes over the training views.
-
-        Raises:
-            ValueError: the trainer has none.
-        """
+        """Return the passes over the training views; ValueError where the trainer has none."""
         if self.passes is None:
             raise ValueError("this strategy looks at the training views when it changes the Gaussians; give it passes")
         return self.passes

@@ -21,11 +21,7 @@ _CLOSE: Final = 0.98
 
 
 def opaque_enough(params: Mapping[str, Tensor], min_opacity: float) -> Tensor:
-    """Tell which Gaussians have an opacity of at least `min_opacity`. [N] bool
-
-    Raises:
-        PopError: `min_opacity` lies outside [0, 1].
-    """
+    """Tell which Gaussians have an opacity of at least `min_opacity`; PopError outside [0, 1]. [N] bool"""
     if not 0.0 <= min_opacity <= 1.0:
         raise PopError(f"--min-opacity {min_opacity:g} must be in [0, 1]")
     return opacities_from_logits(params["opacities"]) >= min_opacity

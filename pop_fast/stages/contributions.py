@@ -392,11 +392,7 @@ class EntryRows:
 
 
 def background_or_black(background: Tensor | None, colors: Tensor) -> Tensor:
-    """Return the colour behind everything, black where none is given, in the precision of the colours. [D]
-
-    Raises:
-        ValueError: it has other channels than the colours.
-    """
+    """Return the colour behind everything, black for None, as the colours; ValueError for other channels. [D]"""
     behind = colors.new_zeros(colors.shape[1]) if background is None else background.to(colors.dtype)
     if behind.shape != colors.shape[1:]:
         raise ValueError(f"background has shape {list(behind.shape)}; it must be {list(colors.shape[1:])}, as a colour")
@@ -404,11 +400,7 @@ def background_or_black(background: Tensor | None, colors: Tensor) -> Tensor:
 
 
 def check_grid(lists: TileLists, width: int, height: int, tile_size: int) -> None:
-    """Make sure that lists are those of a grid.
-
-    Raises:
-        ValueError: they are not.
-    """
+    """Raise ValueError where lists are not those of a grid."""
     tiles = (-(-width // tile_size), -(-height // tile_size))
     if (lists.tile_size, lists.tiles_x, lists.tiles_y) != (tile_size, *tiles):
         raise ValueError(

@@ -178,11 +178,7 @@ def view_importance(found: Contributions, dominant_counts: Tensor, outdoor: bool
 
 
 def scene_importance(views: Sequence[tuple[Contributions, Tensor]], outdoor: bool) -> Tensor:
-    """See `pop_ref.mini_splatting.scene_importance`. [N] float64
-
-    Raises:
-        ValueError: there are no views.
-    """
+    """See `pop_ref.mini_splatting.scene_importance`; ValueError without a view. [N] float64"""
     if not views:
         raise ValueError("there are no views; importance is a sum over at least one")
     importance = torch.stack([view_importance(found, counts, outdoor) for found, counts in views]).sum(0)
@@ -191,11 +187,7 @@ def scene_importance(views: Sequence[tuple[Contributions, Tensor]], outdoor: boo
 
 
 def samples_per_view(n_views: int, width: int, height: int, max_points: int = 3_500_000) -> int:
-    """See `pop_ref.mini_splatting.samples_per_view`.
-
-    Raises:
-        ValueError: there is no view.
-    """
+    """See `pop_ref.mini_splatting.samples_per_view`; ValueError where there is no view."""
     if n_views < 1:
         raise ValueError(f"n_views is {n_views}; it must be >= 1")
     return min(max_points // n_views, width * height)
@@ -218,11 +210,7 @@ _LUMA = (19595, 38470, 7471)
 
 
 def budget_at(nth: int, n: int, start: int, target: int) -> int:
-    """See `pop_ref.taming.budget_at`.
-
-    Raises:
-        ValueError: nth lies outside 0 to n, or there are none.
-    """
+    """See `pop_ref.taming.budget_at`; ValueError where nth lies outside 0 to n, or there are none."""
     if n < 1 or not 0 <= nth <= n:
         raise ValueError(f"nth is {nth} of {n}; it must be in 0 to n, and n >= 1")
     return start + (target - start) * (2 * n * nth - nth * nth) // (n * n)
@@ -247,11 +235,7 @@ def edge_map(photo: Tensor) -> Tensor:
 
 
 def pixel_weights(image: Tensor, photo: Tensor) -> Tensor:
-    """See `pop_ref.taming.pixel_weights`. [H, W]
-
-    Raises:
-        ValueError: the photograph is not uint8 [H, W, 3], or the shapes differ.
-    """
+    """See `pop_ref.taming.pixel_weights`; ValueError where a photograph is not uint8 [H, W, 3] as the image. [H, W]"""
     edges = edge_map(photo).to(image.dtype)
     if image.shape != photo.shape:
         raise ValueError(f"image has shape {list(image.shape)}, photo {list(photo.shape)}; they must be the same")

@@ -62,11 +62,7 @@ class Shapes(NamedTuple):
 
 
 def colors_of(splats: Splats) -> Tensor:
-    """Return the colours of splats that have some. [N, D]
-
-    Raises:
-        ValueError: they have none.
-    """
+    """Return the colours of splats; ValueError where they have none. [N, D]"""
     if splats.colors is None:
         raise ValueError("the splats have no colours")
     return splats.colors

@@ -359,11 +359,7 @@ def _seconds_a_step(config: TrainConfig, capture: Capture, initial: Mapping[str,
 
 
 def check_minutes(minutes: float | None, config: TrainConfig, automatic: bool) -> None:
-    """Refuse minutes that cannot be, or that contradict a schedule that was said.
-
-    Raises:
-        PopError: says which option to leave out.
-    """
+    """Refuse, by PopError, minutes that cannot be or that contradict a schedule that was said."""
     if minutes is None:
         return
     if not 0.0 < minutes < math.inf:

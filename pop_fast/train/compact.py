@@ -143,11 +143,7 @@ class Tuner:
         self._planned = self._taken + steps
 
     def tuned(self, params: Params, steps: int) -> dict[str, Tensor]:
-        """Return parameters after so many steps, which leave nothing behind.
-
-        Raises:
-            PopError: a number is no longer finite.
-        """
+        """Return parameters after steps that leave nothing behind; PopError where a number is no longer finite."""
         if steps == 0 or len(params["means"]) == 0:
             return dict(params)
         with reproducible(self.config.threads):

@@ -44,11 +44,7 @@ def engine_of(config: TrainConfig, own_strategy: bool = True) -> Engine:
 
 
 def torch_engine(backend: str | Backend) -> Engine:
-    """Return autograd over the stages of a backend for CPU tensors.
-
-    Raises:
-        PopError: it is unknown or cannot run here.
-    """
+    """Return autograd over the stages of a backend for CPU tensors; PopError where it is unknown or cannot run here."""
     drawing = require_backend(backend)
 
     def by_autograd(task: Task) -> Stepper:
@@ -58,11 +54,7 @@ def torch_engine(backend: str | Backend) -> Engine:
 
 
 def whole_engine(backend: str | Backend = "compiled") -> Engine:
-    """Return the whole step that a backend offers.
-
-    Raises:
-        PopError: it is unknown, cannot run here, or offers none.
-    """
+    """Return the whole step that a backend offers; PopError where it is unknown, cannot run here, or offers none."""
     drawing = require_backend(backend)
     step = drawing.whole_step()
     if step is None:
@@ -129,11 +121,7 @@ def _fetched(value: Any) -> Any:
 
 @contextmanager
 def translate_oom() -> Iterator[None]:
-    """Turn what says that the GPU's memory is full into a sentence on what to lower.
-
-    Raises:
-        PopError: the memory is full.
-    """
+    """Turn what says that the GPU's memory is full into a PopError on what to lower."""
     from cuda_ext.arrays import CudaMemoryError
 
     try:

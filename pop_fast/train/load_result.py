@@ -92,11 +92,7 @@ def record_text(record: CaptureRecord) -> str:
 
 
 def read_record(folder: Path | None) -> CaptureRecord | None:
-    """Read capture.json, or None where there is none.
-
-    Raises:
-        PopError: it is damaged; names it.
-    """
+    """Read capture.json, or None where there is none; PopError where it is damaged."""
     path = folder / RECORD if folder else None
     if path is None or not path.is_file():
         return None
@@ -239,11 +235,7 @@ def frame_of_splat(splat: Splat, options: CaptureOptions) -> Literal["capture", 
 
 
 def _check_same_frame(splat: Splat, capture: Capture) -> None:
-    """Refuse a capture that is not normalized as the one that the splat was trained on.
-
-    Raises:
-        PopError: its training frame is another one.
-    """
+    """Refuse, by PopError, a capture that is not normalized as the one that the splat was trained on."""
     if splat.frame is None or splat.frame.transform is None:
         return
     theirs, ours = np.array(splat.frame.transform), capture.world_transform

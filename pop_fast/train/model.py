@@ -100,11 +100,7 @@ def first_unusable(params: Mapping[str, Tensor]) -> tuple[str, list[int], float]
 
 
 def require_usable(params: Mapping[str, Tensor], when: str) -> None:
-    """Check that raw parameters can be rendered.
-
-    Raises:
-        PopError: they cannot; names the first number, and says what to do.
-    """
+    """Raise PopError, which names the first number and says what to do, where raw parameters cannot be rendered."""
     if found := first_unusable(params):
         name, index, value = found
         raise PopError(

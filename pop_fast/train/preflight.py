@@ -50,11 +50,7 @@ def check_views(config: TrainConfig, name: str, train: Sequence[ViewTensors], te
 
 
 def check_start(name: str, initial: Mapping[str, Tensor]) -> None:
-    """Check that the first Gaussians can be rendered.
-
-    Raises:
-        PopError: an entry is not finite, or a scale is too large for a float; names it and what to do.
-    """
+    """Raise PopError, which names a number and says what to do, where the first Gaussians cannot be rendered."""
     found = first_unusable(initial)
     if found:
         key, index, value = found

@@ -176,11 +176,7 @@ ALONE: Final = Ranks()
 
 
 def local_rank() -> int:
-    """Return which of the processes of this machine this one is, from 0: LOCAL_RANK, or RANK where nobody says it.
-
-    Raises:
-        PopError: it is no whole number.
-    """
+    """Return which process of this machine this is, from 0: LOCAL_RANK, else RANK; PopError where that is no number."""
     name = next((name for name in ("LOCAL_RANK", "RANK") if os.environ.get(name)), None)
     said = "0" if name is None else os.environ[name]
     if not (said.isascii() and said.isdigit()):

@@ -103,11 +103,7 @@ class ResultFolder:
             self._lock.release()
 
     def hold(self) -> None:
-        """Lock the folder until `close`, where it is there already; `begin` locks one that it makes.
-
-        Raises:
-            PopError: another run is writing to it.
-        """
+        """Lock the folder until `close` where it is there, else by `begin`; PopError where another run writes to it."""
         if self.path.is_dir():
             self._lock.take()
 
@@ -417,11 +413,7 @@ def commands_text(earlier: Path | None, words: Sequence[str]) -> str:
 
 
 def read_commands(folder: Path) -> list[dict[str, Any]]:
-    """Read the commands of a result folder, with the folders that they were given in; none where it keeps none.
-
-    Raises:
-        PopError: commands.json is damaged.
-    """
+    """Read the commands of a result folder and where they were given; PopError where commands.json is damaged."""
     path = folder / COMMANDS_FILE
     if not path.is_file():
         return []

@@ -44,11 +44,7 @@ class StopRequest:
         return ctypes.addressof(self._flag)
 
     def ask(self) -> None:
-        """Ask for an end.
-
-        Raises:
-            Abandoned: within a block of `abandoning`.
-        """
+        """Ask for an end; within a block of `abandoning`, raise Abandoned."""
         self._flag.value = 1
         if self._abandons:
             self._abandons = False

@@ -297,11 +297,7 @@ class BatchStepper(TorchStepper):
             self._params[key].grad = part.view_as(self._params[key])
 
     def _agreed(self, numbers: Sequence[Tensor], indices: Sequence[int], step: int) -> StepStats:
-        """Return the means of the views' measurements.
-
-        Raises:
-            ValueError: the loss of a view is not finite; every process says so of the same view.
-        """
+        """Return the views' mean measurements; ValueError in every process where a loss is not finite."""
         rows = [row.tolist() for row in numbers]
         for index, row in zip(indices, rows, strict=True):
             if not math.isfinite(row[-1]):
