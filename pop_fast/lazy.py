@@ -11,11 +11,7 @@ from typing import Any, Final
 
 
 def given_by(package: str, modules: Mapping[str, tuple[str, ...]]) -> Callable[[str], Any]:
-    """Make the `__getattr__` of a package (PEP 562).
-
-    Args:
-        modules: which names each of its modules gives.
-    """
+    """Make the `__getattr__` of a package (PEP 562), by which names each of its modules gives."""
     homes = {name: f"{package}.{module}" for module, names in modules.items() for name in names}
 
     def find(name: str) -> Any:

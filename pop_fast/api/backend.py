@@ -153,11 +153,7 @@ class Backend(Renderer, Protocol):
         ...
 
     def open_view(self, pass_input: Any) -> Any:
-        """Project and list a `pop_fast.stages.stage_set.PassInput` for passes over it.
-
-        Returns:
-            What has the methods of `pop_fast.stages.stage_set.StagesView`.
-        """
+        """Project and list a `PassInput`; what comes back has the methods of `pop_fast.stages.stage_set.StagesView`."""
         ...
 
     def whole_step(self) -> WholeStep | None:

@@ -208,11 +208,7 @@ def run_workflow(
 def workflow_words(
     folder: Path, job: Job, jobs: int, threads: int, backend: str, profile: Path | None, *more: str
 ) -> list[str]:
-    """Return the command that runs the workflow; see `run_workflow`.
-
-    Args:
-        more: further words for Snakemake.
-    """
+    """Return the command that runs the workflow, with further words for Snakemake; see `run_workflow`."""
     place = folder.absolute()
     each = threads or os.cpu_count() or 1
     gpus = gpus_for(backend)

@@ -202,11 +202,7 @@ def read_job(folder: Path) -> Job | None:
 
 
 def write_plan(folder: Path, plan: Plan, listing: Listing, transform: np.ndarray) -> None:
-    """Write every block's list and points, and then the plan, which says that they are complete.
-
-    Args:
-        transform: the capture's training frame. float64 [4, 4]
-    """
+    """Write every block's list and points, then the plan, which says that they are complete; `transform` is [4, 4]."""
     cloud = listing.cloud
     if cloud is None:
         raise ValueError("a capture without points cannot be divided")

@@ -111,11 +111,7 @@ def read_start(folder: Path, name: str, number: int, config: TrainConfig, views:
 
 @torch.no_grad()
 def shown_in(views: Sequence[View], params: Mapping[str, Tensor], config: TrainConfig) -> Tensor:
-    """Tell which Gaussians at least one view shows, behind others or not. bool [N]
-
-    Args:
-        views: with their cameras; photographs are not read.
-    """
+    """Tell which Gaussians at least one view's camera shows, behind others or not. bool [N]"""
     drawn = (config.renderer, config.antialiased)
     Ks, viewmats = ([torch.from_numpy(getattr(view, name)).float() for view in views] for name in ("K", "viewmat"))
     settings_of = [ProjectionSettings(K, view.width, view.height, *drawn) for K, view in zip(Ks, views, strict=True)]

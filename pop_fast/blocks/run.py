@@ -158,11 +158,7 @@ def divide_capture(
 def merge_capture(
     folder: Path, config: TrainConfig, record: CaptureRecord, part: Part, progress: Progress | None = None
 ) -> tuple[Capture, dict[str, Any]]:
-    """Merge the blocks of a round and measure the held-out views of the whole capture; see `merge`.
-
-    Returns:
-        The capture, whose held-out photographs alone have been read, and the statistics.
-    """
+    """Merge the blocks of a round; see `merge`. Also gives the capture, of which held-out photographs were read."""
     capture = _load(config, record, "held out", progress)
     return capture, merge(folder, config, capture, part)
 
@@ -173,11 +169,7 @@ def config_of(folder: Path, config: TrainConfig, name: str) -> TrainConfig:
 
 
 def round_config(folder: Path, config: TrainConfig, part: Part, steps: int) -> TrainConfig:
-    """Return the settings of a block's training in a round from 1: they continue where those of the run have ended.
-
-    Args:
-        part: which block, in which round; each round draws another order of views.
-    """
+    """Return a block's settings in a round from 1: they go on where the run has ended, in another order of views."""
     if part.block is None:
         raise ValueError("a merge is no training")
     place = block_folder(folder, part.block, part.round)

@@ -96,11 +96,7 @@ class Passes:
         sh_degree: int,
         pixel_map: Tensor | Callable[[Tensor], Tensor] | None = None,
     ) -> ViewContributions:
-        """Draw a view and sum what every Gaussian contributes to it.
-
-        Args:
-            pixel_map: what `map_sum` adds up, or a function that makes it of the image. [H, W]
-        """
+        """Sum what every Gaussian contributes to a view, and a map [H, W] or what a function makes of the image."""
         view = self._open(self._shot(params, index, sh_degree))
         seen = view.seen()
         if callable(pixel_map):

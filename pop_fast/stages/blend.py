@@ -40,11 +40,7 @@ EIGHT: Final = 8  # entries whose comparisons of weights make one number
 
 
 class ActiveTiles:
-    """Named states with a row per tile of a group, of which a shrinking choice is held close together.
-
-    Attributes:
-        rows: the tiles that are held, ascending; all when None.
-    """
+    """States with a row per tile of a group, of which a shrinking choice, `rows`, is held together; None is all."""
 
     def __init__(self, states: dict[str, Tensor]) -> None:
         self.rows: Tensor | None = None

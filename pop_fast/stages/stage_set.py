@@ -57,11 +57,7 @@ SMALL_TILE_BELOW = 14.0  # px, root mean square extent of the visible splats; se
 
 
 def torchs_tile(radii: Tensor) -> int:
-    """Choose the tile that torch blends the cheapest, px; the image does not depend on it.
-
-    Args:
-        radii: extents of the splats, px, 0 where culled. [N, 2]
-    """
+    """Choose the tile that torch blends the cheapest, px, by extents [N, 2], px; the image does not depend on it."""
     visible = (radii > 0).all(1)
     area = (radii * visible[:, None]).to(torch.float64).prod(1).sum() / visible.sum().clamp_min(1)
     return SMALL_TILE if math.sqrt(float(area)) < SMALL_TILE_BELOW else LARGE_TILE
@@ -140,11 +136,7 @@ class Stages:
     def visible_lists(
         self, rows: Splats, settings: ProjectionSettings, tile_size: int | None, exact: bool = True
     ) -> TileLists:
-        """List rows in tiles of that size, None for the cheapest.
-
-        Args:
-            exact: leave out entries that reach no pixel.
-        """
+        """List rows in tiles of that size, None for the cheapest, if `exact` without entries that reach no pixel."""
         shape = {"conics": rows.conics.detach(), "opacities": rows.opacities.detach()} if exact else {}
         size = self.blend_tile(rows.radii) if tile_size is None else tile_size
         place = (rows.means2d.detach(), rows.radii, rows.depths.detach(), settings.width, settings.height)

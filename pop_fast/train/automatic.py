@@ -94,11 +94,7 @@ class Choice:
 
 
 def factor_for(sizes: Sequence[tuple[int, int]], gpu: bool, minutes: float) -> int:
-    """Choose the whole number that photographs are shrunk by.
-
-    Args:
-        sizes: width and height of the photographs, px; of none it is 1.
-    """
+    """Choose the whole number that photographs are shrunk by, of whose sizes, px, there may be none."""
     side = SIDES["gpu" if gpu else "cpu" if minutes >= SOON else "cpu, soon"]
     times = max([1.0, *(max(size) / side for size in sizes)])
     # f^2 + f = times^2 where the ratios to both neighbours are equal

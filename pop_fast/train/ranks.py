@@ -45,19 +45,11 @@ class Ranks:
         return range(self.rank * share, (self.rank + 1) * share)
 
     def gather(self, mine: Sequence[Tensor]) -> list[Tensor]:
-        """Return the tensors of all views of a batch, in its order.
-
-        Args:
-            mine: of the views of this process; all are of one shape and type.
-        """
+        """Return the tensors of all views of a batch, in its order; all are of one shape and type."""
         return list(mine)
 
     def total(self, mine: Iterable[Tensor]) -> Tensor:
-        """Return the sum over all views of a batch, added one after the other in its order. [P]
-
-        Args:
-            mine: vectors of the views of this process. [P]
-        """
+        """Return the sum over all views' vectors of a batch, added one after the other in its order. [P]"""
         parts = iter(mine)
         total = next(parts).clone()
         for part in parts:

@@ -403,11 +403,7 @@ _FIX: Final = "remove the file: nothing but the report reads it"
 
 
 def commands_text(earlier: Path | None, words: Sequence[str]) -> str:
-    """Return what commands.json holds: what it held, and a further command.
-
-    Args:
-        earlier: the folder of the run that is resumed; None begins anew.
-    """
+    """Return what commands.json holds: what it held if a run is resumed, and a further command."""
     before = read_commands(earlier) if earlier is not None else []
     return json.dumps([*before, {"words": list(words), "folder": str(Path.cwd())}], indent=2) + "\n"
 

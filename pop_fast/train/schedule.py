@@ -95,11 +95,7 @@ def active_sh_degree(step: int, interval: int, degree: int, start: int = 0) -> i
 
 
 def phase_at(config: TrainConfig, strategy: DensityControl | ForeignStrategy, step: int) -> Phase:
-    """Return what a step does.
-
-    Args:
-        strategy: decides what is collected; of one that is not ours it is not known, and it sees to that itself.
-    """
+    """Return what a step does; what a strategy of other people collects is not known, and it sees to that itself."""
     own = isinstance(strategy, DensityControl)
     return Phase(
         sh_degree=active_sh_degree(step, config.sh_interval, config.sh_degree, config.strategy.sh_start_iter),
@@ -143,11 +139,7 @@ def is_milestone(config: TrainConfig, taken: int) -> bool:
 
 
 def updates_of_strategy(config: TrainConfig, strategy: DensityControl | ForeignStrategy, scene_scale: float) -> Updates:
-    """List the rates and the numbers of all of Adam's updates of a run.
-
-    Args:
-        strategy: at whose changes Adam may skip or restart; of one that is not ours it is not known.
-    """
+    """List rates and numbers of all of Adam's updates of a run; of other people's strategy no edits are known."""
     if isinstance(strategy, ForeignStrategy):
         return updates_of(config.lr, scene_scale, config.max_steps)
     edits = [step for step in range(config.max_steps) if strategy.is_refine_step(step)]

@@ -146,11 +146,7 @@ MakeFused = Callable[[Rows, Rows, Rows, Sequence[ViewTensors], Sequence[int], St
 
 @dataclass
 class FusedStepper:
-    """Takes steps by `make`, of `batch_size` views where that knows them; see `Stepper` and `BatchStepper`.
-
-    Args:
-        most: steps at a time, where they take less than a second.
-    """
+    """Takes steps by `make`, of `batch_size` views where that knows them, at most `most` at a time; see `Stepper`."""
 
     task: Task
     name: str

@@ -241,11 +241,7 @@ SMALLEST_SIDE: Final = 32
 def coarse_to_fine(
     views: Sequence[ViewTensors], order: Sequence[int], stops: Sequence[int], size: int
 ) -> tuple[list[ViewTensors], list[int]]:
-    """Return the views at every size that is seen, and which of them every step sees.
-
-    Args:
-        order: the views of every step, `size` of them a step.
-    """
+    """Return the views at every size that is seen, and which of them every step, of `size` views, sees."""
     return with_shrunk(views, stops), [
         index_at(place // size, index, len(views), stops) for place, index in enumerate(order)
     ]
