@@ -90,7 +90,6 @@ def marker_of(folder: Path, name: str | None, number: int | None = 0) -> Path:
     """Return the file that says that a block is trained in a round or, of no block, that all are merged.
 
     Args:
-        name: of the block, or None.
         number: the round; None is the last one, of the merge.
     """
     if name is not None:

@@ -368,7 +368,6 @@ def divide(centers: np.ndarray, grid: tuple[int, int]) -> Partition:
 
     Args:
         centers: of the training cameras. [V, 3]
-        grid: K and L.
 
     Raises:
         PopError: there are fewer cameras than blocks, or so many at one place that a block gets none.

@@ -164,9 +164,7 @@ def prepare(
     """Prepare the training of a block in a round.
 
     Args:
-        config: its settings, of `pop_fast.train.schedule`, with a backend's name.
         resume: continue from the latest checkpoint of `config.result_dir`, or start where there is none.
-        loading_seconds: how long reading took, for the statistics.
         beside: texts to write beside cfg.json, by file name.
     """
     keep_freed_memory()
@@ -185,7 +183,6 @@ def write_round_block(
     """Draw the views of a block for a round and write their list, unless that is there already.
 
     Args:
-        config: its settings; the seed is read, and how photographs are.
         core: centres of the Gaussians in its core, in the training frame. [N, 3]
 
     Raises:

@@ -144,9 +144,6 @@ def divide_capture(
 ) -> Division:
     """Read a capture's cameras and points, and divide it.
 
-    Args:
-        sfm: how the cameras of bare photographs are found.
-
     Raises:
         PopError: the capture cannot be read, or not be divided as asked for.
     """

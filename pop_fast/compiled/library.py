@@ -174,9 +174,6 @@ class StepperFunctions:
 def stepper_functions(given_bytes: int) -> StepperFunctions:
     """Return the functions that take whole training steps.
 
-    Args:
-        given_bytes: size of the caller's layout of `pop::StepGiven`.
-
     Raises:
         OSError: the library has another layout.
     """
@@ -206,7 +203,6 @@ def call_library(
     """Call a function of the library.
 
     Args:
-        name: of `_LAYOUTS`.
         dtype: float32 or float64.
         numbers: fields of its arguments that are numbers; those that are not given are 0 or null.
         tensors: fields that are pointers; what is not contiguous is copied, and so must not be a result.

@@ -29,6 +29,5 @@ def rasterization(
 
     Args:
         backward, deterministic: as `pop_fast.api.backends.CudaBackend` says.
-        kwargs: as there, without `backend`.
     """
     return on_every_backend(*args, **kwargs, backend=replace(CUDA, backward=backward, deterministic=deterministic))

@@ -286,9 +286,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         """Do what is due after a step whose statistics are collected.
 
         Args:
-            params: raw parameters, replaced under their keys.
             draws: random numbers; None takes them from the state's generator.
-            passes: over the training views, which some methods look at.
             sh_degree: colour bands that those are drawn with.
 
         Returns:

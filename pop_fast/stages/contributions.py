@@ -202,10 +202,8 @@ def fisher_blocks(
 
     Args:
         gaussians: activated.
-        camera: the view.
         moments: of `screen_moments`. [N, 31]
         sh_degree: bands to use, default all.
-        profile: of the projection.
         project: the stage, as `pop_fast.stages.splatting.project`.
         colors_of_view: as `pop_fast.stages.splatting.colors_of_view`.
         covariances: as `pop_fast.stages.splatting.covariances`.
@@ -500,7 +498,6 @@ def points_on_rays(ids: Tensor, gaussians: Gaussians, camera: Camera, profile: P
     Args:
         ids: -1 for none. [H, W]
         gaussians: in the world.
-        camera: the view.
         profile: which principal point is used.
     """
     viewmat = camera.viewmat.double()

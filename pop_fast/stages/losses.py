@@ -348,8 +348,6 @@ def photometric(
     """Weigh a loss between pixels against D-SSIM, in one pass where the losses have one for it.
 
     Args:
-        loss: that of the objective's name.
-        objective: the weights.
         image: the render. [H, W, 3]
         target: the photograph. [H, W, 3]
         mask: True where a pixel counts. [H, W]

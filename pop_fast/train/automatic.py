@@ -107,7 +107,6 @@ def expected_gaussians(method: str, first: int, pixels: float, photographs: int,
     With POP what grows follows the size of one photograph, without the prior that of all of them together.
 
     Args:
-        method: of density control; those that prune at their end are foretold as they are before.
         pixels: of a photograph as it is trained on.
     """
     if method == "pop":
@@ -134,7 +133,6 @@ def choose_length(
     """Choose as much of the paper's schedule as the minutes allow, and as few photographs bear.
 
     Args:
-        config: the settings; the paper's steps are read.
         minutes: that training, measuring and the report may take.
         photographs: there are, with those held out.
     """
@@ -299,7 +297,6 @@ def measure_speed(config: TrainConfig, capture: Capture) -> Speed:
     The many Gaussians are as many as the whole schedule has on average.
 
     Args:
-        config: its settings, with the backend settled.
         capture: loaded at the size that is trained on.
 
     Raises:

@@ -154,8 +154,6 @@ def check_fits(
 
     Args:
         threads: of one operation; None where the bits of the steps do not depend on it.
-        n_views: how many the run trains on.
-        known: what the state of the run's strategy holds.
 
     Raises:
         PopError: it belongs to other settings or another capture, or cannot be of this run; names what differs.
@@ -317,9 +315,6 @@ def check_splats(splats: Any, kind: torch.dtype | None = None) -> dict[str, Tens
 
 def check_content(content: Mapping[str, Any]) -> dict[str, Any]:
     """Check all that a run continues from, except what only the run knows: its settings, its capture, its strategy.
-
-    Args:
-        content: of a checkpoint, with every key that one must have.
 
     Returns:
         The same with tensors that are contiguous and share no memory.

@@ -19,9 +19,6 @@ def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConf
 
     A resumed run keeps the backend that it was begun with.
 
-    Args:
-        resume: continue with the run in `config.result_dir`, if there is one.
-
     Returns:
         The settings with a backend's name, and one line that says which and why.
     """
@@ -73,7 +70,6 @@ def check_gpus(config: TrainConfig, processes: int = 1) -> str | None:
     """Settle which GPUs of this machine a run uses.
 
     Args:
-        config: with a backend's name.
         processes: that train together, of which LOCAL_WORLD_SIZE run here where a launcher says so.
 
     Returns:

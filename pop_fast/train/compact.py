@@ -110,7 +110,6 @@ class Tuner:
         held_out: views that nothing here trains on or chooses by.
 
     Args:
-        sh_degree: highest active colour band.
         learned: what the run has learned of its photographs, as a checkpoint holds it.
         steps: that what is kept is trained for; 0 trains nothing.
         report: is called with the steps taken so far, those planned, and the seconds that all of them will take, None
@@ -222,9 +221,6 @@ class Tuner:
 def with_pictures(capture: Capture, params: Params, config: TrainConfig, sh_degree: int) -> tuple[Capture, TrainConfig]:
     """Put pictures of a splat in the place of a capture's photographs, which show what it has lost.
 
-    Args:
-        sh_degree: highest active colour band.
-
     Returns:
         The capture, and settings that learn nothing of single photographs.
     """
@@ -250,9 +246,6 @@ def tuned_to_the_end(tuner: Tuner) -> dict[str, Tensor]:
 
 def within(tuner: Tuner, score: Callable[[Params], Tensor], most: int, coding: Coding) -> Compact:
     """Fit a splat into so many bytes.
-
-    Args:
-        score: gives the scores of Gaussians, of which those of the highest stay. -> [N]
 
     Returns:
         What `coding.write` makes at most so many bytes of, no worse in training views than fewer Gaussians alone.

@@ -410,9 +410,6 @@ _BETWEEN_OF_STRATEGY: Final = ("reinit_opacity",)
 def check_values(config: Any) -> None:
     """Check every setting of a run.
 
-    Args:
-        config: a `TrainConfig`, or a dataclass with the same settings.
-
     Raises:
         PopError: a setting is out of range or, being a number, not finite.
     """

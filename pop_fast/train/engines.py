@@ -28,7 +28,6 @@ def engine_of(config: TrainConfig, own_strategy: bool = True) -> Engine:
 
     Args:
         config: with a backend's name; "auto" is "fast" here, see `choose_backend`.
-        own_strategy: whether the density strategy is one of this package.
 
     Raises:
         PopError: the backend is unknown or cannot run here, or does not know a setting.

@@ -139,7 +139,6 @@ def evaluate(
 
     Args:
         config: background, profile and the like; with `exposure` PSNR is also measured after fitting colours.
-        sh_degree: highest active colour band.
         folder: where pictures of the first `config.max_renders` views go; None keeps none.
 
     Returns:
@@ -230,8 +229,6 @@ def measure_encodings(
 
     Args:
         params: raw parameters, in the training frame.
-        config: background, profile and antialiasing are read.
-        sh_degree: highest active colour band.
         world_transform: the training frame from the capture's. [4, 4]
 
     Yields:

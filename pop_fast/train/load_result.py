@@ -176,9 +176,6 @@ def open_capture(
 ) -> tuple[Capture, TrainConfig]:
     """Load the capture that a splat shows, and give the settings to look at it with.
 
-    Args:
-        photographs: which are read; see `pop_fast.data.load_capture`.
-
     Raises:
         PopError: no capture is known, or it cannot be read.
     """
@@ -249,9 +246,6 @@ def _check_same_frame(splat: Splat, capture: Capture) -> None:
 
 def paths_read(splat: Splat, root: Path, capture: Capture) -> list[Path]:
     """List what the rendering of a splat reads: it, its result folder, the capture and where its photographs lie.
-
-    Args:
-        root: the capture's folder.
 
     Returns:
         Files and folders; no output may take the place of one.

@@ -52,7 +52,6 @@ def adam_step(
     moments Adam would not move it.
 
     Args:
-        params: raw parameters with gradients.
         state: holds the gradients that wait for an update, under "sh_rest_sum".
     """
     rates, numbers = updates.rates[step].tolist(), updates.numbers[step].tolist()

@@ -343,7 +343,6 @@ def from_plain(kind: type[T], plain: Any, where: str, skipped: tuple[str, ...] =
     """Build a dataclass from what `to_plain` made of it; absent fields keep their default.
 
     Args:
-        where: what errors call it.
         skipped: fields that plain values cannot give.
 
     Raises:

@@ -80,9 +80,6 @@ class Ranks:
     def require_same(self, params: Mapping[str, Tensor], step: int) -> None:
         """Compare what the processes hold, bit by bit.
 
-        Args:
-            params: raw parameters, on the CPU.
-
         Raises:
             PopError: they differ, as machines of different kinds or libraries may round otherwise.
         """

@@ -120,8 +120,6 @@ class ResultFolder:
         """Write what a run has from its start, in place of earlier results: all of it, or the folder is as it was.
 
         Args:
-            config: the settings, for cfg.json.
-            beside: other texts, by file name.
             opacities: of the first Gaussians. [N]
             overwrite: earlier results go; without it nothing but a run without checkpoints may be there.
 

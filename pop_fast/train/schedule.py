@@ -111,9 +111,6 @@ def phase_at(config: TrainConfig, strategy: DensityControl | ForeignStrategy, st
 def segment_end(config: TrainConfig, strategy: DensityControl | ForeignStrategy, first: int, longest: int) -> int:
     """Return how far a stepper goes by itself: to a densification step, a milestone, another phase, or far enough.
 
-    Args:
-        strategy: as in `phase_at`.
-
     Returns:
         One more than the last step of the segment.
     """

@@ -54,9 +54,6 @@ class StopRequest:
     def abandoning(self, allowed: bool = True) -> Iterator[None]:
         """Let a request end the block at once, as nothing that must be kept is changed by it.
 
-        Args:
-            allowed: False only runs the block.
-
         Raises:
             Abandoned: somebody has asked, before the block or while it ran.
         """
@@ -103,9 +100,6 @@ def stop_requests(stop: StopRequest | None = None) -> Iterator[StopRequest]:
 
     The second one is obeyed at once. SIGHUP stays ignored where it is, as under nohup. Outside the main thread, where
     Python delivers no signals, nobody ever asks.
-
-    Args:
-        stop: what is asked; None makes one.
     """
     stop = StopRequest() if stop is None else stop
     if threading.current_thread() is not threading.main_thread():

@@ -260,7 +260,6 @@ def step_settings(config: TrainConfig, updates: Updates, scene_scale: float = 1.
     """Return what stays the same over a run.
 
     Args:
-        updates: which parameters Adam moves at which step.
         scene_scale: world units.
     """
     of_strategy = ("lambda_pop", "lambda_entropy", "pop_views", "pop_over")

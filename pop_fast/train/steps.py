@@ -187,9 +187,6 @@ def why_not_trained(backend: Backend, config: TrainConfig, own_strategy: bool = 
     """Return one sentence on why a backend cannot take the steps of a run and what to do, or None.
 
     Where the tensors are the CPU's, autograd over the stages takes whatever steps a whole one does not know.
-
-    Args:
-        own_strategy: whether the density strategy is one of this package.
     """
     if backend.device == "cpu":
         return None

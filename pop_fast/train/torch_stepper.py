@@ -64,9 +64,6 @@ class PhotoLoss:
 
     What SSIM needs of a photograph alone is computed at its first visit and kept, for as many views as
     `target_cache_mb` has room for; the others compute it anew at every visit, to the same bits.
-
-    Args:
-        losses: of a backend; see `pop_fast.stages.losses`.
     """
 
     def __init__(self, config: TrainConfig, views: Sequence[ViewTensors], losses: Any) -> None:
@@ -311,10 +308,6 @@ def _numbers(stats: StepStats, loss: Tensor) -> Tensor:
 
 def check_batch(config: TrainConfig, own_strategy: bool, ranks: Ranks) -> None:
     """Check that the views of a step can be shared out.
-
-    Args:
-        own_strategy: whether the density strategy is one of this package.
-        ranks: the processes that draw them.
 
     Raises:
         PopError: they cannot; says what to change.

@@ -86,6 +86,8 @@ class TrainingRun:
         """Prepare a run; nothing is written yet.
 
         Args:
+            config: the settings.
+            capture: the photographs and cameras.
             resume: continue from the latest checkpoint of `config.result_dir`, or start where there is none.
             overwrite: replace the results of an earlier run in `config.result_dir`, once the first step has been taken.
             loading_seconds, sfm_seconds: how long reading and the search for cameras took, for the statistics.

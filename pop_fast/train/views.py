@@ -143,8 +143,6 @@ def render_view(
 
     Args:
         view: the camera, and the mask that `dominant_counts` are restricted to.
-        config: background, profile and antialiasing are read.
-        sh_degree: highest active colour band.
         dominance: dominant ids and counts will be read from `info`.
         counts: Gaussians per pixel will be read from `info`.
         absgrad: so will the gradient of the screen centres summed of absolute values.
@@ -224,8 +222,6 @@ def render_layers(
 
     Args:
         view: the camera; its photograph gives the size alone.
-        config: background, profile and antialiasing are read.
-        sh_degree: highest active colour band.
     """
     given = rasterization_arguments(params, view, config, sh_degree)
     drawn, alphas, info = backend.rasterization(**given, render_mode="RGB+ED", dominance=dominance)
