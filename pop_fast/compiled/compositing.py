@@ -183,19 +183,9 @@ def project(means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, v
 
 
 def colors_of_view(sh: Tensor, means: Tensor, viewmat: Tensor, degree: int, visible: Tensor) -> Tensor:
-    """Evaluate harmonics for the visible Gaussians; zero for the others. [N, 3]
+    """See `pop_fast.stages.splatting.colors_of_view`; ValueError where `visible` is no list of rows, ascending.
 
     Optimizations: one pass over the coefficients forward and one backward (`colors.h`).
-
-    Args:
-        sh: coefficients. [N, n_sh, 3]
-        means: centres, world units. [N, 3]
-        viewmat: world -> camera. [4, 4]
-        degree: bands to use.
-        visible: rows to evaluate, ascending. [V] int64
-
-    Raises:
-        ValueError: `visible` is no list of rows.
     """
     if visible.dtype != torch.int64 or visible.dim() != 1:
         shape = list(visible.shape)

@@ -61,21 +61,10 @@ def composite(
     before every eighth entry.
 
     Args:
-        means2d: screen centres, px. [N, 2]
-        conics: inverse screen covariances, px^-2. [N, 3]
-        opacities: [N]
-        colors: any number of channels. [N, D]
-        lists: what each tile blends.
-        width: px.
-        height: px.
-        profile: constants and strictness.
         dominance: also find dominant ids.
         counts: also count blended and traversed entries.
         absgrad_sink: [N, 2], to which the transpose adds the sum over pixels of |dL/dmeans2d|.
         function: what blends, from the four tensors and `BlendOptions`; None takes torch's.
-
-    Returns:
-        The blended view; `image` and `alphas` are differentiable.
     """
     inputs = (means2d, conics, opacities, colors)
     keep = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)

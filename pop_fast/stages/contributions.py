@@ -198,15 +198,7 @@ def fisher_blocks(
     """See `pop_ref.fisher.fisher_blocks`. [N, 6, 6] float64, whatever the precision of what is given
 
     Optimizations: only Gaussians that have moments; the Jacobian of their (mean2d, conic, colour) is the stages' own
-    transpose, called once a row for all of them.
-
-    Args:
-        gaussians: activated.
-        moments: of `screen_moments`. [N, 31]
-        sh_degree: bands to use, default all.
-        project: the stage, as `pop_fast.stages.splatting.project`.
-        colors_of_view: as `pop_fast.stages.splatting.colors_of_view`.
-        covariances: as `pop_fast.stages.splatting.covariances`.
+    transpose, called once a row for all of them; `project`, `colors_of_view` and `covariances` may be another backend's.
     """
     blocks = torch.zeros((len(moments), 6, 6), dtype=torch.float64)
     rows = (moments != 0.0).any(1).nonzero().squeeze(1)
@@ -278,14 +270,7 @@ class Pairs:
 
 
 class PairWalk:
-    """Goes through the pairs of a view.
-
-    Args:
-        lists: what each tile blends.
-        width: px.
-        height: px.
-        profile: constants and strictness.
-    """
+    """Goes through the pairs of a view of that width and height, px."""
 
     def __init__(self, splats: Splats, lists: TileLists, width: int, height: int, profile: Profile) -> None:
         colors = splats.means2d.new_empty((len(splats.means2d), 0)) if splats.colors is None else splats.colors
@@ -493,13 +478,7 @@ def ray_directions(camera: Camera, profile: Profile) -> Tensor:
 
 
 def points_on_rays(ids: Tensor, gaussians: Gaussians, camera: Camera, profile: Profile) -> Tensor:
-    """Return the point at t* of each pixel's Gaussian, 0 where the pixel has none. [H, W, 3] float64
-
-    Args:
-        ids: -1 for none. [H, W]
-        gaussians: in the world.
-        profile: which principal point is used.
-    """
+    """Return the point at t* of each pixel's Gaussian, 0 where its id [H, W] is -1. [H, W, 3] float64"""
     viewmat = camera.viewmat.double()
     found = ids >= 0
     chosen = ids[found]

@@ -86,17 +86,11 @@ def covariances(quats: Tensor, scales: Tensor) -> Tensor:
 
 
 def project(means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: ProjectionSettings) -> Splats:
-    """Project Gaussians; see `pop_ref.splatting.project`.
+    """Project Gaussians; see `pop_ref.splatting.project`. Everything but `radii` is differentiable.
 
     Args:
-        means: centres, world units. [N, 3]
         covars: covariances, world units^2. [N, 3, 3]
-        opacities: in [0, 1]. [N]
-        viewmat: world -> camera. [4, 4]
         view: the rest of the camera.
-
-    Returns:
-        The splats; everything but `radii` is differentiable.
     """
     means2d, depths, conics, effective_opacities, radii, factors = _Projection.apply(
         means, covars, opacities, viewmat, view
