@@ -11,7 +11,7 @@ on the number of threads.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import wraps
+from functools import partial, wraps
 from typing import Any, ParamSpec, TypeVar
 
 import torch
@@ -350,7 +350,7 @@ def _dominant_ids(
 ) -> tuple[Tensor, Tensor]:
     size, like = (camera.width, camera.height), splats.means2d
     ids, T_final = torch.empty(size[::-1], dtype=torch.int64), like.new_empty(size[::-1])
-    rays = dict(zip(("fx", "fy", "cx", "cy"), intrinsics(camera.K, *size, profile), strict=True))
+    rays: dict[str, float] = dict(zip(("fx", "fy", "cx", "cy"), intrinsics(camera.K, *size, profile), strict=True))
     results = {"dominant_ids": ids, "T_final": T_final}
     _scored(
         "dominant_points", splats, like.new_empty((len(like), 0)), lists, size, profile, rays, facing=facing, **results
@@ -360,10 +360,11 @@ def _dominant_ids(
 
 def _by_the_library(stage: Callable[P, T], /, **own: Any) -> Callable[P, T]:
     """Make a stage of torch's that leaves its work to the library's functions."""
+    bound = partial(stage, **own)
 
     @wraps(stage)
     def compiled(*args: P.args, **kwargs: P.kwargs) -> T:
-        return stage(*args, **own, **kwargs)
+        return bound(*args, **kwargs)
 
     return compiled
 

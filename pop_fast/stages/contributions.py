@@ -198,7 +198,7 @@ def fisher_blocks(
     """See `pop_ref.fisher.fisher_blocks`. [N, 6, 6] float64, whatever the precision of what is given
 
     Optimizations: only Gaussians that have moments; the Jacobian of their (mean2d, conic, colour) is the stages' own
-    transpose, called once a row for all of them; `project`, `colors_of_view` and `covariances` may be another backend's.
+    transpose, called once a row for all of them. `project`, `colors_of_view`, `covariances` may be a backend's own.
     """
     blocks = torch.zeros((len(moments), 6, 6), dtype=torch.float64)
     rows = (moments != 0.0).any(1).nonzero().squeeze(1)

@@ -277,9 +277,13 @@ class TrainConfig:
 
     def objective_at(self, step: int) -> Objective:
         """Return what the render of a step is compared with its photograph by."""
-        scale, halved = 1.0 / self.photometric_divisor, self.d_ssim_halved
-        said = Objective(self.photometric, scale, self.lambda_ssim, padding=self.ssim_padding, d_ssim_halved=halved)
-        return said.at(step, self.l2_stop_iter)
+        return Objective(
+            pixelwise=self.photometric,
+            pixel_scale=1.0 / self.photometric_divisor,
+            lambda_ssim=self.lambda_ssim,
+            padding=self.ssim_padding,
+            d_ssim_halved=self.d_ssim_halved,
+        ).at(step, self.l2_stop_iter)
 
     def to_json(self) -> str:
         """Write the settings as JSON, in reading order: as given (null where no preset was), and as they are run."""
