@@ -375,7 +375,7 @@ class EntryRows:
 
 
 def background_or_black(background: Tensor | None, colors: Tensor) -> Tensor:
-    """Return the colour behind everything, black for None, as the colours; ValueError for other channels. [D]"""
+    """See `pop_ref.compositing.background_or_black`; in the precision of the colours. [D]"""
     behind = colors.new_zeros(colors.shape[1]) if background is None else background.to(colors.dtype)
     if behind.shape != colors.shape[1:]:
         raise ValueError(f"background has shape {list(behind.shape)}; it must be {list(colors.shape[1:])}, as a colour")
