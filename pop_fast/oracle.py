@@ -46,7 +46,6 @@ class OracleStages:
         settings: ProjectionSettings,
         sh_degree: int | None,
     ) -> Splats:
-        """See `pop_ref.splatting.project`."""
         made = _Project.apply(means, *shapes, opacities, colors, viewmat, settings, sh_degree)
         means2d, depths, conics, blended, shaded, radii = made
         return Splats(means2d, depths, conics, blended, radii, colors=shaded)
@@ -63,7 +62,6 @@ class OracleStages:
         counts: bool,
         absgrad_sink: Tensor | None,
     ) -> Composite:
-        """See `pop_ref.compositing.composite`."""
         colors = colors_of(rows)
         behind = colors.new_zeros(colors.shape[1]) if background is None else background
         place = (rows.depths.detach(), rows.radii, settings, tile_size, absgrad_sink)
@@ -72,12 +70,10 @@ class OracleStages:
         return Composite(image, alphas, ids, weights, blended, traversed, None)
 
     def tile_lists(self, rows: Splats, settings: ProjectionSettings, tile_size: int) -> TileLists:
-        """See `pop_ref.tiles.tile_lists`."""
         width, height = settings.width, settings.height
         return TileLists.of(_lists(_records(rows), settings, tile_size), width, height, tile_size)
 
     def counts_entries(self, tile_size: int) -> bool:
-        """Visited entries are counted with tiles of any size."""
         return True
 
 
@@ -184,31 +180,26 @@ class OracleView:
         )
 
     def seen(self) -> Seen:
-        """Return the drawing."""
         made = self._render
         radii = torch.as_tensor(made.splats.radii, dtype=torch.int32)
         depths = self._floats(made.splats.depths)
         return Seen(self._floats(made.image), torch.as_tensor(made.dominant_ids), radii, depths)
 
     def contributions(self, pixel_map: Tensor | None) -> Contributions:
-        """See `pop_ref.contributions.contributions`."""
         given = None if pixel_map is None else _array(pixel_map)
         made = contributions(*self._listed(), given, self._shot.profile)
         found = (made.weight_sum, made.n_pixels, made.map_sum, made.distance_sum)
         return Contributions(*(torch.as_tensor(sums) for sums in found))
 
     def sensitivities(self) -> Tensor:
-        """See `pop_ref.sensitivity.sensitivities`."""
         return torch.as_tensor(sensitivities(*self._listed(), self._background, self._shot.profile))
 
     def fisher_blocks(self) -> Tensor:
-        """See `pop_ref.fisher.fisher_blocks`."""
         moments = screen_moments(*self._listed(), self._background, self._shot.profile)
         shot = self._shot
         return torch.as_tensor(fisher_blocks(self._gaussians, self._camera, moments, shot.sh_degree, shot.profile))
 
     def dominant_points(self) -> DominantPoints:
-        """See `pop_ref.chord.dominant_points`."""
         made, profile = self._render, self._shot.profile
         found = dominant_points(made.splats, made.tile_lists, self._gaussians, self._camera, profile.tile_size, profile)
         return DominantPoints(self._floats(found.points), torch.as_tensor(found.ids), self._floats(found.T_final))

@@ -38,15 +38,12 @@ class BaseBackend:
     lacks: Mapping[str, tuple[Any, str]] = field(default_factory=dict)
 
     def why_not(self) -> str | None:
-        """Return one sentence on why it cannot run here and what to do, or None."""
         return None
 
     def available(self) -> bool:
-        """Tell whether it can run here."""
         return self.why_not() is None
 
     def holds(self, tensor: Tensor) -> bool:
-        """Tell whether a tensor is where this backend reads it."""
         return tensor.device.type == self.device
 
     def losses(self) -> Any:
@@ -76,13 +73,11 @@ class TorchBackend(BaseBackend):
     """Draws with torch on the CPU."""
 
     def stages(self) -> Stages:
-        """Return torch's stages."""
         from pop_fast.stages.stage_set import Stages
 
         return Stages()
 
     def open_view(self, pass_input: Any) -> Any:
-        """Project and list a view for passes over it."""
         from pop_fast.stages.stage_set import view_of
 
         return view_of(pass_input, self.stages())
@@ -96,11 +91,9 @@ class CompiledBackend(TorchBackend):
     """Draws on the CPU with stages in C++; what has none there is torch's."""
 
     def why_not(self) -> str | None:
-        """Return one sentence on why it cannot run here and what to do, or None."""
         return compiled.why_not()
 
     def stages(self) -> Stages:
-        """Return the compiled stages."""
         from pop_fast.compiled import compositing as own
         from pop_fast.stages.stage_set import Stages, large_tile
 
@@ -144,7 +137,6 @@ class CudaBackend(BaseBackend):
     deterministic: bool = True  # sum gradients in one order; False adds atomically and saves 48 bytes an instance
 
     def why_not(self) -> str | None:
-        """Return one sentence on why it cannot run here and what to do, or None."""
         return cuda_ext.why_not()
 
     def holds(self, tensor: Tensor) -> bool:
@@ -154,13 +146,11 @@ class CudaBackend(BaseBackend):
         return arrays.on_gpu(tensor)
 
     def stages(self) -> CudaStages:
-        """Return the kernels' stages."""
         from pop_fast.cuda.stages import CudaStages
 
         return CudaStages(self.backward, self.deterministic)
 
     def open_view(self, pass_input: Any) -> Any:
-        """Draw a view for passes over it."""
         from pop_fast.cuda.stages import CudaView
 
         return CudaView(pass_input)
@@ -187,13 +177,11 @@ class OracleBackend(BaseBackend):
     """Draws with `pop_ref`, whatever the precision of the tensors."""
 
     def stages(self) -> OracleStages:
-        """Return the oracle's stages."""
         from pop_fast.oracle import OracleStages
 
         return OracleStages()
 
     def open_view(self, pass_input: Any) -> Any:
-        """Draw a view for passes over it."""
         from pop_fast.oracle import OracleView
 
         return OracleView(pass_input)

@@ -115,7 +115,6 @@ class CudaStages:
         return Composite(image, 1.0 - left[0], ids, stats.dominant_weights, stats.n_blended, stats.n_traversed, None)
 
     def tile_lists(self, rows: Splats, settings: ProjectionSettings, tile_size: int) -> TileLists:
-        """List every tile's rows by their extents alone."""
         own, size = self._settings(settings, tile_size), (tile_size, tile_size)
         with _on_device_of(rows.means2d):
             found = make_lists(own, _struct(rows), len(rows.depths), rows.depths.device, size, False)
@@ -180,19 +179,16 @@ class CudaView:
             self._view = ScoredView(rows, c.viewmat, c.K, c.width, c.height, *how)
 
     def seen(self) -> Seen:
-        """Return the drawing."""
         view = self._view
         return Seen(view.image, view.dominant_ids.long(), view.radii, view.depths)
 
     def contributions(self, pixel_map: Tensor | None) -> Contributions:
-        """As `pop_fast.stages.contributions.contributions`."""
         with translate_oom():
             found = self._view.contributions(None if pixel_map is None else pixel_map.float())
         weight_sum, n_pixels, map_sum, distance_sum = found.T
         return Contributions(weight_sum, n_pixels.to(torch.int64), map_sum, distance_sum)
 
     def sensitivities(self) -> Tensor:
-        """As `pop_fast.stages.contributions.sensitivities`."""
         with translate_oom():
             return self._view.sensitivities()
 
@@ -208,7 +204,6 @@ class CudaView:
         return blocks.to(moments.device)
 
     def dominant_points(self) -> DominantPoints:
-        """As `pop_fast.stages.contributions.dominant_points`."""
         pass_input = self._input
         c = pass_input.camera
         rays = intrinsics(c.K, c.width, c.height, pass_input.profile)

@@ -185,7 +185,6 @@ class ForeignStrategy:
 
     @property
     def name(self) -> str:
-        """Return the name of its class."""
         return type(self.strategy).__name__
 
     def check_sanity(self, params: Params, optimizers: Optimizers) -> None:
@@ -200,12 +199,10 @@ class ForeignStrategy:
         return {**own, "generator": torch.Generator().manual_seed(seed)} if self._lends else own
 
     def needs_dominance(self, step: int) -> bool:
-        """Tell whether `info["dominant_counts"]` is read at this step."""
         asked: Callable[[int], bool] | None = getattr(self.strategy, "needs_dominance", None)
         return asked is not None and asked(step)
 
     def changes_after(self, step: int) -> bool:
-        """Tell whether the Gaussians may change after this step: always."""
         return True
 
     def needs_passes(self, step: int) -> bool:

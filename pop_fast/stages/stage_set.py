@@ -143,13 +143,11 @@ class Stages:
         return self.list_tiles(*place, size, settings.profile, **shape)
 
     def tile_lists(self, rows: Splats, settings: ProjectionSettings, tile_size: int) -> TileLists:
-        """List every tile's rows by their extents alone."""
         # torch's, whatever blends: what meta shows is the same of all backends on the CPU
         place = (rows.means2d.detach(), rows.radii, rows.depths.detach(), settings.width, settings.height)
         return tile_lists(*place, tile_size, settings.profile)
 
     def counts_entries(self, tile_size: int) -> bool:
-        """Visited entries are counted with tiles of any size."""
         return True
 
 
@@ -163,7 +161,6 @@ class StagesView:
     lists: TileLists
 
     def seen(self) -> Seen:
-        """Draw it."""
         s, camera, background = self.splats, self.shot.camera, self.shot.background
         blend = self.stages.composite(
             *(s.means2d, s.conics, s.opacities, colors_of(s), self.lists, camera.width, camera.height),

@@ -87,15 +87,12 @@ class GpuProxy:
 
     @property
     def name(self) -> str:
-        """Return the backend's name."""
         return self._backend.name
 
     def available(self) -> bool:
-        """Tell whether it can run here."""
         return self._backend.available()
 
     def why_not(self) -> str | None:
-        """Return why it cannot run here and what to do, or None."""
         return self._backend.why_not()
 
     def rasterization(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, RenderMeta]:
