@@ -211,13 +211,9 @@ def write_plan(folder: Path, plan: Plan, listing: Listing, transform: np.ndarray
         shots += [replace(shot, split="test") for shot in listing.shots if shot.name in block.held_out]
         points = SparsePoints(cloud.xyz[block.points], cloud.rgb[block.points])
         write_block(folder / FOLDER / block.name, replace(listing, shots=shots, cloud=points, transform=transform))
-    _write_json(
-        folder / FOLDER / _PLAN,
-        {
-            "blocks": [entry_of(block) for block in plan.blocks],
-            "partition": plan.partition.plain(),
-        },
-    )
+    content = {"blocks": [entry_of(block) for block in plan.blocks], "partition": plan.partition.plain()}
+    text = json.dumps(content, indent=2) + "\n"
+    write_atomically(folder / FOLDER / _PLAN, lambda file: file.write(text.encode()))
 
 
 def entry_of(block: Block) -> dict[str, Any]:
@@ -246,11 +242,6 @@ def read_plan(folder: Path) -> tuple[Partition, list[dict[str, Any]]] | None:
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise PopError(f"{path}: is not what 'pop train --blocks' writes ({error!r}); {_FIX}") from error
     return partition, list(entries)
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    text = json.dumps(content, indent=2) + "\n"
-    write_atomically(path, lambda file: file.write(text.encode()))
 
 
 # more jobs than a workflow shows, and surely a slip
@@ -322,12 +313,7 @@ class Partition:
             Lower and upper border on either axis. float64 [2 axes, 2]
         """
         i, j = divmod(block, self.grid[1])
-        open_box = np.array(
-            [
-                _between(self.strips, i),
-                _between(self.cores[i], j),
-            ]
-        )
+        open_box = np.array([_between(self.strips, i), _between(self.cores[i], j)])
         ends = np.stack([self.low, self.high], axis=1)
         closed = np.where(np.isfinite(open_box), open_box, ends)
         size = np.maximum(closed[:, 1] - closed[:, 0], 0.0)

@@ -185,15 +185,8 @@ def _keep_pictures(
     # of a large view, a second or more within OpenCV
     heard(write_png, folder.path / "renders" / f"val_{name}.png", np.concatenate([render, photo, error], axis=1))
     write_png(folder.path / "renders" / f"dominant_{name}.png", id_colors(ids))
-    folder.write_arrays(
-        f"val_{name}",
-        name=view.name,
-        render=render,
-        photo=photo,
-        dominant_ids=ids.astype(np.int32),
-        psnr=metrics.psnr,
-        ssim=metrics.ssim,
-    )
+    arrays = {"name": view.name, "render": render, "photo": photo, "dominant_ids": ids.astype(np.int32)}
+    folder.write_arrays(f"val_{name}", **arrays, psnr=metrics.psnr, ssim=metrics.ssim)
 
 
 # held-out views that are rendered for every format, at most; of more, an even selection

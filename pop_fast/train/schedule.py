@@ -184,21 +184,11 @@ class ViewOrder:
 _MEANS_AGAIN: Final = 10.0
 # settings of every method that time a change of the Gaussians or of the schedule, and what each is when there is none
 _NEVER: Final[dict[str, Any]] = {
-    "refine_stop_iter": 0,
-    "reset_every": 0,
+    **dict.fromkeys(("refine_stop_iter", "reset_every", "blur_start_iter", "refine_scale2d_stop_iter"), 0),
+    **dict.fromkeys(("means_rewind_iter", "rounds_start_iter"), 0),
+    **dict.fromkeys(("final_prune_iter", "blur_stop_iter", "sample_iter", "prune_iter"), -1),
+    **dict.fromkeys(("prune_shares", "reinit_iters", "soft_prune_iters", "hard_prune_iters"), ()),
     "reset_at_zero": False,
-    "final_prune_iter": -1,
-    "blur_start_iter": 0,
-    "blur_stop_iter": -1,
-    "refine_scale2d_stop_iter": 0,
-    "means_rewind_iter": 0,
-    "rounds_start_iter": 0,
-    "prune_shares": (),
-    "reinit_iters": (),
-    "sample_iter": -1,
-    "prune_iter": -1,
-    "soft_prune_iters": (),
-    "hard_prune_iters": (),
 }
 
 
