@@ -86,12 +86,8 @@ class _Project(torch.autograd.Function):
         gaussians = Gaussians(_array(means), _array(quats), _array(scales), _array(opacities), sh)
         camera = Camera(_array(viewmat), _array(settings.K), settings.width, settings.height)
         ctx.of = (gaussians, camera)
-        ctx.options = {
-            "sh_degree": sh_degree,
-            "profile": settings.profile,
-            "antialiased": settings.antialiased,
-            "colors": given,
-        }
+        how = {"profile": settings.profile, "antialiased": settings.antialiased}
+        ctx.options = {"sh_degree": sh_degree, "colors": given, **how}
         ctx.like = means
         made = splatting.project(gaussians, camera, **ctx.options)
         radii = torch.as_tensor(made.radii, dtype=torch.int32)
@@ -170,14 +166,8 @@ class OracleView:
         self._gaussians = Gaussians(*(_array(t) for t in (g.means, g.quats, g.scales, g.opacities, g.sh)))
         self._camera = Camera(_array(c.viewmat), _array(c.K), c.width, c.height)
         self._background, self._dtype, self._shot = _array(shot.background), g.means.dtype, shot
-        self._render = render(
-            self._gaussians,
-            self._camera,
-            sh_degree=shot.sh_degree,
-            background=self._background,
-            profile=shot.profile,
-            antialiased=shot.antialiased,
-        )
+        how = {name: getattr(shot, name) for name in ("sh_degree", "profile", "antialiased")}
+        self._render = render(self._gaussians, self._camera, background=self._background, **how)
 
     def seen(self) -> Seen:
         made = self._render

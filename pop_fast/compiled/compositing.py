@@ -130,23 +130,13 @@ def _arguments(inputs: tuple[Tensor, ...], options: BlendOptions) -> dict[str, T
 
 def blend_numbers(inputs: tuple[Tensor, ...], options: BlendOptions) -> dict[str, float]:
     """Return the fields of a blend that are numbers."""
-    lists, profile, dtype = options.lists, options.profile, inputs[0].dtype
-    return {
-        "n": len(inputs[0]),
-        "channels": inputs[3].shape[1],
-        "tiles_x": lists.tiles_x,
-        "tiles_y": lists.tiles_y,
-        "tile_size": lists.tile_size,
-        "width": options.width,
-        "height": options.height,
-        "threads": torch.get_num_threads(),
-        "alpha_floor": below(profile.alpha_floor, dtype),
-        "alpha_ceiling": profile.alpha_ceiling,
-        "stop": Stop.of(profile, dtype).at,
-        "pixel_stride": inputs[3].shape[1],
-        "channel_stride": 1,
-        "ceiling_passes": profile.as_numbers()["pass_ceiling"],
-    }
+    lists, profile, dtype, channels = options.lists, options.profile, inputs[0].dtype, inputs[3].shape[1]
+    grid = {name: getattr(lists, name) for name in ("tiles_x", "tiles_y", "tile_size")}
+    sizes = {"n": len(inputs[0]), "channels": channels, "width": options.width, "height": options.height}
+    layout = {"pixel_stride": channels, "channel_stride": 1, "threads": torch.get_num_threads()}
+    stops = {"alpha_floor": below(profile.alpha_floor, dtype), "stop": Stop.of(profile, dtype).at}
+    ceiling = {"alpha_ceiling": profile.alpha_ceiling, "ceiling_passes": profile.as_numbers()["pass_ceiling"]}
+    return {**grid, **sizes, **layout, **stops, **ceiling}
 
 
 def aligned_records(n: int, each: int) -> Tensor:
@@ -270,10 +260,7 @@ def _projection_numbers(n: int, view: ProjectionSettings) -> dict[str, float]:
     constants = view.profile.as_numbers()
     return {
         **{name: constants[name] for name in (*PROJECTION_CONSTANTS, "tile_size")},
-        "antialiased": view.antialiased,
-        "radius_clip": view.radius_clip,
-        "width": view.width,
-        "height": view.height,
+        **{name: getattr(view, name) for name in ("antialiased", "radius_clip", "width", "height")},
         "n": n,
         "threads": torch.get_num_threads(),
     }
