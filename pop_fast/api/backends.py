@@ -25,11 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BaseBackend:
-    """A backend by its facts; what it draws with comes from those who derive from it.
-
-    Attributes:
-        name, device, dtypes, speed, lacks: as `pop_fast.api.backend.Backend` says.
-    """
+    """A backend by its facts, as `pop_fast.api.backend.Backend` says; those who derive from it bring what draws."""
 
     name: str
     device: str

@@ -134,12 +134,9 @@ class _Target:
         border = border_of(padding)
         target = torch.empty((3, height, width))
         mu_y, s_yy = (torch.empty((3, height + 2 * border - REACH, width + 2 * border - REACH)) for _ in range(2))
-        call_library(
-            "moments",
-            torch.float32,
-            {"height": height, "width": width, "border": border, "threads": torch.get_num_threads()},
-            {"photograph": view.photo, "target": target, "mu_y": mu_y, "s_yy": s_yy},
-        )
+        numbers = {"height": height, "width": width, "border": border, "threads": torch.get_num_threads()}
+        tensors = {"photograph": view.photo, "target": target, "mu_y": mu_y, "s_yy": s_yy}
+        call_library("moments", torch.float32, numbers, tensors)
         mask = view.mask
         found = view.depth_samples() if with_depth else None
         return cls(
@@ -169,9 +166,6 @@ class NativeTrainer:
         cache_mb: memory for what is made of photographs; the others' is made anew at every visit, to the same bits.
         stop: whether somebody has asked for an end; a step that is being taken is then left, and changes nothing.
         exposures: of the photographs, which learn with every step; None where none are learned.
-
-    Attributes:
-        step: steps taken.
     """
 
     def __init__(

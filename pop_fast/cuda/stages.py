@@ -40,7 +40,7 @@ class CudaStages:
     """
 
     # backward, deterministic: as `pop_fast.api.backends.CudaBackend` says
-    backward: str
+    backward: str  # as `pop_fast.api.backends.CudaBackend` says
     deterministic: bool
 
     def covariances(self, quats: Tensor, scales: Tensor) -> Shapes:

@@ -43,13 +43,7 @@ def _fused(
 def _resident(views: Sequence[ViewTensors], settings: StepSettings, device: torch.device) -> ResidentViews:
     pixels = sum(view.height * view.width for view in views)
     free, _ = torch.cuda.mem_get_info(device)
-    return ResidentViews(
-        [view.photo for view in views],
-        torch.cat([view.viewmat for view in views]),
-        torch.cat([view.K for view in views]),
-        [view.mask for view in views],
-        settings.padding,
-        device,
-        cache_moments=_BYTES_OF_MOMENTS * pixels <= MOMENTS_SHARE * free,
-        room=int(PHOTOGRAPHS_SHARE * free),
-    )
+    cameras = (torch.cat([view.viewmat for view in views]), torch.cat([view.K for view in views]))
+    given = ([view.photo for view in views], *cameras, [view.mask for view in views], settings.padding, device)
+    keeps = _BYTES_OF_MOMENTS * pixels <= MOMENTS_SHARE * free
+    return ResidentViews(*given, cache_moments=keeps, room=int(PHOTOGRAPHS_SHARE * free))

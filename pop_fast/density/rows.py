@@ -151,13 +151,8 @@ def prune_lowest(context: DensificationContext, scores: Tensor, share: float) ->
 def window(state: State) -> Statistics:
     """Return what the window has collected."""
     blurred, none = state.get("blurred"), torch.zeros_like(state["count"], dtype=torch.bool)
-    return Statistics(
-        grad_sum=state["grad2d"],
-        n_visible=state["count"],
-        n_views=state["views"],
-        dominant_sum=none,
-        blurred=none if blurred is None else blurred,
-    )
+    flags = none if blurred is None else blurred
+    return Statistics(state["grad2d"], state["count"], state["views"], dominant_sum=none, blurred=flags)
 
 
 def clear(state: State) -> None:

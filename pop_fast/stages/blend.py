@@ -267,16 +267,9 @@ class Blender:
 
     @staticmethod
     def _result(states: dict[str, Tensor], steps: list[Step], n_pairs: int) -> GroupBlend:
-        codes = states.get("codes")
-        return GroupBlend(
-            states["image"],
-            steps,
-            states.get("n_blended"),
-            states.get("n_passed"),
-            states.get("best"),
-            None if codes is None else Dominance.places(codes),
-            n_pairs,
-        )
+        n_blended, n_passed, best, codes = (states.get(name) for name in ("n_blended", "n_passed", "best", "codes"))
+        places = None if codes is None else Dominance.places(codes)
+        return GroupBlend(states["image"], steps, n_blended, n_passed, best, places, n_pairs)
 
     def _entries(self, blocks: Tensor) -> Tensor:
         """Gather a step's rows of the table. [n, K, 6 + D + 1]"""

@@ -61,12 +61,7 @@ def check_start(name: str, initial: Mapping[str, Tensor]) -> None:
 
 
 def facts(config: TrainConfig, views: Sequence[ViewTensors]) -> dict[str, Any]:
-    """Return what a run's statistics say of its settings.
-
-    Returns:
-        method, preset, seed, lambda_pop, theta_blur_pixels (share of the smallest and of the largest view, px),
-        blur_min_pixels (px), blur_events (densification steps that look at blur).
-    """
+    """Return what a run's statistics say of its settings; blur pixels are of the smallest and the largest view."""
     plan = config.strategy
     sizes = [view.kept_pixels for view in views]
     return {
