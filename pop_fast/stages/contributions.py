@@ -119,7 +119,7 @@ def sensitivities(
     """
     check_grid(lists, width, height, tile_size)
     grey = replace(splats, colors=colors_of(splats).sum(1, keepdim=True))
-    behind = background_or_black(background, colors_of(splats))
+    behind = _background_or_black(background, colors_of(splats))
     found = sums(grey, lists, (width, height), profile, behind.sum(0, keepdim=True))
     return found[:, 0] * splats.opacities.double().square()
 
@@ -168,7 +168,7 @@ def screen_moments(
     check_grid(lists, width, height, tile_size)
     if (channels := colors_of(splats).shape[1]) != 3:
         raise ValueError(f"the splats have {channels} colour channels; they must have 3")
-    return sums(splats, lists, (width, height), profile, background_or_black(background, colors_of(splats)))
+    return sums(splats, lists, (width, height), profile, _background_or_black(background, colors_of(splats)))
 
 
 def _slopes(walk: PairWalk, pairs: Pairs, conics: Tensor) -> Tensor:
@@ -374,7 +374,7 @@ class EntryRows:
         return totals[:, :-1].T
 
 
-def background_or_black(background: Tensor | None, colors: Tensor) -> Tensor:
+def _background_or_black(background: Tensor | None, colors: Tensor) -> Tensor:
     """See `pop_ref.compositing.background_or_black`; in the precision of the colours. [D]"""
     behind = colors.new_zeros(colors.shape[1]) if background is None else background.to(colors.dtype)
     if behind.shape != colors.shape[1:]:
