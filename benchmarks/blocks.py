@@ -70,7 +70,7 @@ def train_on(whole: Path, steps: int, folder: Path) -> dict[str, Any]:
     """
     from pop_fast.train import TrainingRun
     from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
-    from pop_fast.train.refining import refining
+    from pop_fast.train.schedule import refining
 
     if not (folder / "stats").is_dir():
         splat = load_splat(whole)

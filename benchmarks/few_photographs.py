@@ -29,7 +29,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.record import machine, read_json, write_json
-from pop_fast.api.registry import get_backend
+from pop_fast.api.backend import get_backend
 from pop_fast.data import Capture, View, load_capture
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.choose import choose_backend

@@ -32,7 +32,7 @@ import numpy as np
 import torch
 
 from pop_fast import rasterization
-from pop_fast.api.registry import get_backend
+from pop_fast.api.backend import get_backend
 from pop_fast.children import module_command
 from pop_fast.data.load import load_capture
 from pop_fast.io.formats import load_splat_file

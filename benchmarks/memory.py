@@ -15,7 +15,7 @@ from cases import MEMORY_CASE, Case, gaussians_of
 from raster import SCENE
 from steps import run_of_case, take_turn
 
-from pop_fast.api.registry import get_backend
+from pop_fast.api.backend import get_backend
 from pop_fast.children import python_command
 from pop_fast.train.environment import keep_freed_memory
 

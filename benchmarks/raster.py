@@ -16,7 +16,7 @@ from cases import GATE_CASE, Case, gaussians_of
 from timing import turns_ms
 from torch import Tensor
 
-from pop_fast.api.registry import backend_names, get_backend
+from pop_fast.api.backend import backend_names, get_backend
 from pop_fast.stages.compositing import Composite, composite
 from pop_fast.stages.tiles import TileLists, tile_lists
 from pop_ref.records import Camera, Gaussians

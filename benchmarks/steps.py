@@ -18,7 +18,7 @@ from cases import Case, capture_of, gaussians_of
 from timing import median_ratio, turns
 
 import pop_fast.train
-from pop_fast.api.registry import get_backend
+from pop_fast.api.backend import get_backend
 from pop_fast.data import Capture, load_capture
 from pop_fast.train import TrainConfig
 from pop_fast.train.environment import reproducible

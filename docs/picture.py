@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from pop_fast.api.registry import get_backend
+from pop_fast.api.backend import get_backend
 from pop_fast.data.initialize import initialize_params
 from pop_fast.data.load import load_capture
 from pop_fast.io.pictures import id_colors

@@ -103,7 +103,7 @@ def _memory(jobs: Sequence[Job]) -> list[str]:
 
 
 def _gpu(jobs: Sequence[Job], backend: str) -> list[str]:
-    from pop_fast.api.registry import get_backend
+    from pop_fast.api.backend import get_backend
 
     on_gpu = backend == "auto" or get_backend(backend).device == "cuda"
     if not on_gpu or not any(job.scale.name == "paper" for job in jobs):

@@ -23,7 +23,7 @@ from pop_fast.stages import losses
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.engines import engine_of
 from pop_fast.train.evaluate import gaussians_per_pixel
-from pop_fast.train.records import Segment
+from pop_fast.train.results import Segment
 from pop_fast.train.schedule import active_sh_degree
 from pop_fast.train.training_run import TrainingRun
 from pop_fast.train.views import ViewTensors, render_view

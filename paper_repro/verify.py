@@ -26,7 +26,7 @@ from paper_repro.jobs import Job
 from paper_repro.published import file_hash, ply_of
 from paper_repro.record import Result
 from paper_repro.train_row import Options
-from pop_fast.api.registry import backend_names, get_backend
+from pop_fast.api.backend import backend_names, get_backend
 from pop_fast.children import python_command
 from pop_fast.errors import PopError
 from pop_fast.machine import machine_name, processor_kind

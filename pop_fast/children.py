@@ -17,21 +17,12 @@ SAFE_PATH: Final = {"PYTHONSAFEPATH": "1"}
 
 
 def python_command(*words: str) -> list[str]:
-    """Return the command of a child Python that finds no module in the current folder.
-
-    Args:
-        words: what `python` is given: a script and its words, or `-m MODULE`, or `-c CODE`.
-    """
+    """Return the command of a child Python, given its words, that finds no module in the current folder."""
     return [sys.executable, "-P", *words]
 
 
 def module_command(module: str, *words: str) -> list[str]:
-    """Return the command that runs a module, as `python -m` does, of the packages that this process runs.
-
-    Args:
-        module: of this project, installed or not, or of another one that is installed.
-        words: the module's arguments.
-    """
+    """Return the command that runs a module, as `python -m` does, of the packages that this process runs."""
     return python_command(str(Path(__file__).resolve()), module, *words)
 
 

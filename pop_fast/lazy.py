@@ -11,12 +11,7 @@ from typing import Any, Final
 
 
 def given_by(package: str, modules: Mapping[str, tuple[str, ...]]) -> Callable[[str], Any]:
-    """Make the `__getattr__` of a package (PEP 562).
-
-    Args:
-        package: the package's name.
-        modules: which names each of its modules gives.
-    """
+    """Make the `__getattr__` of a package (PEP 562), by which names each of its modules gives."""
     homes = {name: f"{package}.{module}" for module, names in modules.items() for name in names}
 
     def find(name: str) -> Any:
@@ -39,9 +34,6 @@ def background_import(*modules: str) -> Iterator[None]:
     A block that is left by an error or an interruption waits for nothing. A failure is not reported here: whoever
     imports such a module afterwards meets it. The block must have imported all that it needs, as two threads do not
     import one package at a time.
-
-    Args:
-        modules: their names.
     """
 
     def work() -> None:

@@ -12,7 +12,7 @@ flat, C2 = 9e-4 is all that is left of it, and what rounding leaves of the varia
 constant tells what is allowed there, the images do. Two ways to write the same function are analysed:
 
     textbook      S as in `pop_ref.ssim`: variances are differences of squares of size 1;
-    difference    1 - S written in d = x - y (`pop_fast.stages.ssim` derives it): rounding shrinks with d.
+    difference    1 - S written in d = x - y (`pop_fast.stages.losses` derives it): rounding shrinks with d.
 """
 
 from __future__ import annotations

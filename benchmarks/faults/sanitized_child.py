@@ -10,8 +10,8 @@ import torch
 
 import pop_fast.compiled
 from pop_fast import rasterization
+from pop_fast.api.backends import COMPILED
 from pop_fast.compiled import build, library
-from pop_fast.compiled.backend import COMPILED
 from pop_fast.compiled.native_step import NativeTrainer
 from pop_fast.data.load import load_capture
 from pop_fast.stages.stage_set import PassInput

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from paper_repro.scales import SCALES
-from pop_fast.api.registry import backend_names
+from pop_fast.api.backend import backend_names
 
 __all__ = ["add_backend", "add_data", "add_results", "add_scale", "add_training", "training_words"]
 

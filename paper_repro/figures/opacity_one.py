@@ -137,7 +137,7 @@ def _base(asked: Asked, job: Job) -> tuple[Result, Path]:
 
 
 def _config(asked: Asked, job: Job, folder: Path) -> TrainConfig:
-    from pop_fast.api.registry import get_backend
+    from pop_fast.api.backend import get_backend
 
     whole = job.config()
     ended = whole.lr.means * whole.lr.means_decay
@@ -165,7 +165,7 @@ def _train(config: TrainConfig, capture: Capture, ply: Path) -> None:
 def _seen(config: TrainConfig, capture: Capture, base: Result, ply: Path) -> Pushed:
     import torch
 
-    from pop_fast.api.registry import get_backend
+    from pop_fast.api.backend import get_backend
     from pop_fast.io.ply import load_ply
     from pop_fast.stages.covariance import opacities_from_logits
     from pop_fast.train.views import ViewTensors, render_view

@@ -1,18 +1,25 @@
-"""What a backend is: a name, whether it can run here, the stages that it draws with, and the whole step if it has one.
+"""What a backend is, and backends by name: those of this package, which `pop_fast.api` registers, and others'.
 
 `rasterization` checks, gathers and makes `meta` for all of them; a backend supplies what is between. Stages take one
 scene and one camera at a time, and are differentiable.
+
+Another package declares its own under the entry point group `pop_splatting.backends`, or calls `BACKENDS.register`.
+Which one runs is a value that is passed; nothing is patched, so two can be alive in one process and be compared in one
+assertion. Asking which there are, and why one cannot run, imports no torch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+from pop_fast.errors import PopError
+from pop_ref.registry import Registry
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from pop_fast.api.meta import RenderMeta
+    from pop_fast.api.rasterize import RenderMeta
     from pop_fast.stages.compositing import Composite
     from pop_fast.stages.splatting import ProjectionSettings, Splats
     from pop_fast.stages.tiles import TileLists
@@ -146,16 +153,66 @@ class Backend(Renderer, Protocol):
         ...
 
     def open_view(self, pass_input: Any) -> Any:
-        """Project and list a view for passes over it.
-
-        Args:
-            pass_input: a `pop_fast.stages.stage_set.PassInput`.
-
-        Returns:
-            A `pop_fast.stages.stage_set.ViewPass`.
-        """
+        """Project and list a `PassInput`; what comes back has the methods of `pop_fast.stages.stage_set.StagesView`."""
         ...
 
     def whole_step(self) -> WholeStep | None:
         """Return how it takes a whole training step by itself, or None: autograd over the stages takes them."""
         ...
+
+
+BACKENDS: Final[Registry[Backend]] = Registry(
+    "backend",
+    "pop_splatting.backends",
+    needs=("name", "device", "dtypes", "speed", "lacks", "why_not", "stages", "losses", "open_view", "whole_step"),
+    error=PopError,
+)
+
+
+def backend_names() -> tuple[str, ...]:
+    """Return the names that `get_backend` knows."""
+    return tuple(BACKENDS)
+
+
+def get_backend(name: str) -> Backend:
+    """Return the backend of that name, if it can run here or not; PopError where none is, or not importable."""
+    return BACKENDS.named(name)
+
+
+def by_speed() -> Iterator[Backend]:
+    """Give the backends that "auto" may take, the fastest first; one that cannot be imported is none."""
+    found: list[tuple[int, Backend]] = []
+    for name in BACKENDS:
+        try:
+            backend = BACKENDS.named(name)
+        except PopError:
+            continue
+        if backend.speed is not None:
+            found.append((backend.speed, backend))
+    yield from (backend for _, backend in sorted(found, key=lambda pair: pair[0], reverse=True))
+
+
+def fastest_backend(device: str) -> Backend:
+    """Return the fastest backend for tensors on a kind of device that can run here.
+
+    Args:
+        device: as `torch.device.type` says it.
+
+    Raises:
+        PopError: none can; says why.
+    """
+    known = [backend for backend in by_speed() if backend.device == device]
+    for backend in known:
+        if backend.why_not() is None:
+            return backend
+    reasons = "; ".join(f"backend {b.name!r} cannot run: {b.why_not()}" for b in known)
+    raise PopError(reasons or f"no backend renders tensors on {device!r}; move them to the CPU")
+
+
+def require_backend(backend: str | Backend) -> Backend:
+    """Return a backend, or that of a name, which can run here; PopError says why one cannot, and what to do."""
+    found = get_backend(backend) if isinstance(backend, str) else backend
+    reason = found.why_not()
+    if reason is not None:
+        raise PopError(f"backend {found.name!r} cannot run: {reason}")
+    return found

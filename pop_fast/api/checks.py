@@ -44,14 +44,10 @@ UNSUPPORTED: Final[Mapping[str, tuple[Any, str]]] = {
 
 
 def check_supported(given: Mapping[str, Any], backend: Backend) -> None:
-    """Raise for any argument that is not at the one value supported, by all backends or by this one.
+    """Raise NotImplementedError for an argument that is not at the one value supported, by all backends or this one.
 
     Args:
         given: arguments by name, those of `UNSUPPORTED` and of `backend.lacks` among them.
-        backend: what is to draw.
-
-    Raises:
-        NotImplementedError: names the argument.
     """
     for table, by in ((UNSUPPORTED, ""), (backend.lacks, f" by backend {backend.name!r}")):
         for name, (supported, why) in table.items():
@@ -62,11 +58,7 @@ def check_supported(given: Mapping[str, Any], backend: Backend) -> None:
 
 
 def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    """Raise for a value that is not one of several.
-
-    Raises:
-        ValueError: names the argument.
-    """
+    """Raise ValueError, which names the argument, for a value that is not one of several."""
     if value not in choices:
         raise ValueError(f"{name} is {value!r}; it must be one of {', '.join(choices)}")
 
@@ -112,27 +104,19 @@ def _check_profile(profile: Profile) -> None:
 
 @dataclass(frozen=True)
 class _Rule:
-    """A rule of a tensor's values.
+    """A rule of a tensor's values."""
 
-    Attributes:
-        name: of the tensor.
-        tensor: it, or an array of it that came from a GPU.
-        probe: a few numbers of it, each made in a pass or two: a tensor's or an array's.
-        suspicious: whether these numbers leave room for a bad entry; only then it is looked at closely.
-        bad: which entries or rows are.
-        words: what it must be.
-    """
-
-    name: str
-    tensor: Tensor | Array
-    probe: Callable[[], Sequence[Any]]
+    name: str  # of the tensor
+    tensor: Tensor | Array  # it, or an array of it that came from a GPU
+    probe: Callable[[], Sequence[Any]]  # a few numbers of it, each made in a pass or two: a tensor's or an array's
+    # whether these numbers leave room for a bad entry; only then it is looked at closely
     suspicious: Callable[..., bool]
-    bad: Callable[[], Tensor | Array]
-    words: str
+    bad: Callable[[], Tensor | Array]  # which entries or rows are
+    words: str  # what it must be
 
 
 class Checks:
-    """The checks of one call.
+    """The checks of one call; what is wrong raises ValueError, which names the tensor or the argument.
 
     Args:
         backend: which says where tensors must lie, and of which type.
@@ -144,11 +128,7 @@ class Checks:
         self._rules: list[_Rule] = []
 
     def tensor(self, name: str, tensor: Tensor | None, shape: tuple[int, ...]) -> Tensor:
-        """Check one tensor's presence, place, type and shape, and return it; that it is finite is asked in `values`.
-
-        Raises:
-            ValueError: names the tensor.
-        """
+        """Check one tensor's presence, place, type and shape, and return it; that it is finite is asked in `values`."""
         if tensor is None:
             raise ValueError(f"{name} is missing")
         if not self._backend.holds(tensor):
@@ -169,8 +149,12 @@ class Checks:
     def finite(self, name: str, tensor: Tensor) -> Tensor:
         """Ask in `values` that a tensor is finite, and return it without its gradient."""
         t = tensor.detach()
+
+        def infinite(total: float) -> bool:
+            return not math.isfinite(total)
+
         # a sum is one fast pass
-        self._rule(name, t, lambda: (t.sum(),), _not_finite, lambda: ~torch.isfinite(t), "must be finite")
+        self._rule(name, t, lambda: (t.sum(),), infinite, lambda: ~torch.isfinite(t), "must be finite")
         return t
 
     def gaussians(
@@ -181,49 +165,39 @@ class Checks:
         opacities: Tensor,
         covars: Tensor | None,
     ) -> tuple[int, ...]:
-        """Check the Gaussians' tensors, and return the batch dimensions.
-
-        Raises:
-            ValueError: names the tensor.
-        """
+        """Check the Gaussians' tensors, and return the batch dimensions."""
         if means.dim() < 2 or means.shape[-1] != 3:
             raise ValueError(f"means has shape {list(means.shape)}; it must be [..., N, 3]")
         batch, n = tuple(means.shape[:-2]), means.shape[-2]
         self.finite("means", self.tensor("means", means, tuple(means.shape)))
-        self._opacities(self.finite("opacities", self.tensor("opacities", opacities, (*batch, n))))
-        if covars is not None:
-            self.finite("covars", self.tensor("covars", covars, (*batch, n, 3, 3)))
-        else:
-            self._quats(self.finite("quats", self.tensor("quats", quats, (*batch, n, 4))))
-            self._scales(self.finite("scales", self.tensor("scales", scales, (*batch, n, 3))))
-        return batch
+        o = self.finite("opacities", self.tensor("opacities", opacities, (*batch, n)))
 
-    def _opacities(self, o: Tensor) -> None:
         def outside(least: float, most: float) -> bool:
             return not (least >= 0.0 and most <= 1.0)
 
         bad = "must be in [0, 1]"
         self._rule("opacities", o, lambda: torch.aminmax(o), outside, lambda: ~((o >= 0.0) & (o <= 1.0)), bad)
+        if covars is not None:
+            self.finite("covars", self.tensor("covars", covars, (*batch, n, 3, 3)))
+            return batch
+        q = self.finite("quats", self.tensor("quats", quats, (*batch, n, 4)))
 
-    def _quats(self, q: Tensor) -> None:
         def shortest() -> tuple[Tensor]:
             # of a tiny quaternion it may be rounded to 0, which is looked at closely
             return (torch.linalg.vector_norm(q, dim=-1).amin(),)
 
-        self._rule("quats", q, shortest, _zero, lambda: q.abs().amax(-1) == 0.0, "must have a norm > 0")
-
-    def _scales(self, s: Tensor) -> None:
+        self._rule(
+            "quats", q, shortest, lambda least: least == 0.0, lambda: q.abs().amax(-1) == 0.0, "must have a norm > 0"
+        )
+        s = self.finite("scales", self.tensor("scales", scales, (*batch, n, 3)))
         words = "must be >= 0; give standard deviations, not logarithms"
-        self._rule("scales", s, lambda: (s.amin(),), _negative, lambda: s < 0.0, words)
+        self._rule("scales", s, lambda: (s.amin(),), lambda least: least < 0.0, lambda: s < 0.0, words)
+        return batch
 
     def cameras(
         self, viewmats: Tensor, Ks: Tensor, width: int, height: int, tile_size: int, batch: tuple[int, ...]
     ) -> int:
-        """Check the cameras' tensors and sizes, and return how many there are.
-
-        Raises:
-            ValueError: names the argument.
-        """
+        """Check the cameras' tensors and sizes, and return how many there are."""
         if viewmats.dim() < 3:
             raise ValueError(f"viewmats has shape {list(viewmats.shape)}; it must be [..., C, 4, 4]")
         n = viewmats.shape[-3]
@@ -244,11 +218,7 @@ class Checks:
         return n
 
     def colors(self, colors: Tensor, sh_degree: int | None, batch: tuple[int, ...], n_cameras: int, n: int) -> bool:
-        """Check the colours or coefficients, and tell whether they are given per camera.
-
-        Raises:
-            ValueError: names the tensor.
-        """
+        """Check the colours or coefficients, and tell whether they are given per camera."""
         tail = 1 if sh_degree is None else 2
         channels = tuple(colors.shape[max(colors.dim() - tail, 0) :])
         shared, per_camera = (*batch, n, *channels), (*batch, n_cameras, n, *channels)
@@ -266,11 +236,7 @@ class Checks:
         return tuple(colors.shape) == per_camera
 
     def values(self) -> None:
-        """Check what was left to be asked of values, in one go.
-
-        Raises:
-            ValueError: names the tensor and the index.
-        """
+        """Check what was left to be asked of values, in one go."""
         probes = [rule.probe() for rule in self._rules]
         # what is on a GPU comes in one copy
         there = [number for numbers in probes for number in numbers if _is_elsewhere(number)]
@@ -285,25 +251,13 @@ class Checks:
     def _each(self, name: str, array: Array, bad: Callable[[], Array], words: str) -> None:
         self._rule(name, array, lambda: (bad().any(),), bool, bad, words)
 
-    def _rule(
-        self,
-        name: str,
-        tensor: Tensor | Array,
-        probe: Callable[[], Sequence[Any]],
-        suspicious: Callable[..., bool],
-        bad: Callable[[], Tensor | Array],
-        words: str,
-    ) -> None:
+    def _rule(self, name: str, tensor: Tensor | Array, *rest: Any) -> None:
         if 0 not in tensor.shape:
-            self._rules.append(_Rule(name, tensor, probe, suspicious, bad, words))
+            self._rules.append(_Rule(name, tensor, *rest))
 
 
 def check_given(**tensors: Any) -> None:
-    """Raise for what must be given and is no tensor.
-
-    Raises:
-        ValueError: names the argument.
-    """
+    """Raise ValueError, which names the argument, for what must be given and is no tensor."""
     for name, value in tensors.items():
         if not isinstance(value, Tensor):
             problem = "is missing" if value is None else f"is of type {type(value).__name__}"
@@ -311,28 +265,12 @@ def check_given(**tensors: Any) -> None:
 
 
 def check_sizes(width: int, height: int, tile_size: int) -> None:
-    """Raise for an image or a tile that is none.
-
-    Raises:
-        ValueError: names the size.
-    """
+    """Raise ValueError, which names the size, for an image or a tile that is none."""
     for name, value in {"width": width, "height": height, "tile_size": tile_size}.items():
         if not isinstance(value, Integral) or value < 1:
             raise ValueError(f"{name} is {value!r}; it must be a whole number >= 1")
     if tile_size > LARGEST_TILE:
         raise ValueError(f"tile_size is {tile_size}; it must be <= {LARGEST_TILE}")
-
-
-def _not_finite(total: float) -> bool:
-    return not math.isfinite(total)
-
-
-def _zero(least: float) -> bool:
-    return least == 0.0
-
-
-def _negative(least: float) -> bool:
-    return least < 0.0
 
 
 def _is_elsewhere(number: Any) -> bool:

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from pop_fast.api.registry import get_backend
+from pop_fast.api.backend import get_backend
 from pop_fast.blocks.plan import FOLDER, Job
 from pop_fast.children import SAFE_PATH, module_command
 from pop_fast.errors import PopError
@@ -34,17 +34,11 @@ from pop_fast.train.signals import stop_requests
 
 @dataclass(frozen=True)
 class Part:
-    """A training of a block, or a merge.
+    """A training of a block, or a merge."""
 
-    Attributes:
-        round: which it belongs to, from 0.
-        block: which is trained; None merges all.
-        last: whether it is the last merge, which writes the run's result.
-    """
-
-    round: int
-    block: str | None
-    last: bool = False
+    round: int  # which it belongs to, from 0
+    block: str | None  # which is trained; None merges all
+    last: bool = False  # whether it is the last merge, which writes the run's result
 
     @property
     def name(self) -> str:
@@ -96,8 +90,6 @@ def marker_of(folder: Path, name: str | None, number: int | None = 0) -> Path:
     """Return the file that says that a block is trained in a round or, of no block, that all are merged.
 
     Args:
-        folder: the run's.
-        name: of the block, or None.
         number: the round; None is the last one, of the merge.
     """
     if name is not None:
@@ -138,10 +130,7 @@ def run_in_turn(folder: Path, job: Job, quiet: bool = False, say: Callable[[str]
     """Do the parts that are not done yet, one after the other: train the blocks, merge them, and so in every round.
 
     Args:
-        folder: the run's, whose capture is divided.
-        job: what was asked for.
         quiet: what they print is not shown; warnings and errors are.
-        say: is called with a line on what begins.
 
     Returns:
         The exit status of the first part that failed, or 0; 130 after Ctrl-C or SIGTERM.
@@ -171,15 +160,7 @@ def gpus_for(backend: str) -> int:
 
 @contextmanager
 def own_gpu(folder: Path, backend: str) -> Iterator[None]:
-    """Train on a GPU of this machine that no other block of a run is trained on.
-
-    Args:
-        folder: the run's.
-        backend: what trains.
-
-    Raises:
-        PopError: a block is trained on each of them.
-    """
+    """Train on a GPU that no other block of a run is trained on; PopError where one is trained on each."""
     count = gpus_for(backend)
     lock = _free_gpu(folder, count) if count > 1 else None
     try:
@@ -211,10 +192,7 @@ def run_workflow(
     """Run the workflow by Snakemake.
 
     Args:
-        folder: the run's.
-        job: what was asked for.
         jobs: how many blocks are trained at a time on this machine; as many as it has GPUs where one trains.
-        threads: of a training.
         backend: what trains; one on a GPU asks for one each.
         profile: a profile's folder, by which it runs on a cluster; None stays here.
         quiet: what it prints is not shown; warnings and errors are.
@@ -229,12 +207,7 @@ def run_workflow(
 def workflow_words(
     folder: Path, job: Job, jobs: int, threads: int, backend: str, profile: Path | None, *more: str
 ) -> list[str]:
-    """Return the command that runs the workflow; see `run_workflow`.
-
-    Args:
-        folder, job, jobs, threads, backend, profile: as `run_workflow`.
-        more: further words for Snakemake.
-    """
+    """Return the command that runs the workflow, with further words for Snakemake; see `run_workflow`."""
     place = folder.absolute()
     each = threads or os.cpu_count() or 1
     gpus = gpus_for(backend)

@@ -44,7 +44,7 @@ from pop_fast.train.checkpoint import load_splats
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.engines import engine_of
 from pop_fast.train.environment import keep_freed_memory
-from pop_fast.train.load_result import CaptureRecord
+from pop_fast.train.load_result import CaptureRecord, how_to_load
 from pop_fast.train.model import KEYS
 from pop_fast.train.stepper import Engine, Stepper
 from pop_fast.train.steps import Phase, StepStats
@@ -57,17 +57,11 @@ _COUNTS = "start.json"
 
 @dataclass(frozen=True)
 class Start:
-    """What a block starts from.
+    """What a block starts from."""
 
-    Attributes:
-        params: raw parameters: first those that are trained, then those that are held fixed.
-        own: how many are trained.
-        merged: how many Gaussians there are in all cores.
-    """
-
-    params: dict[str, Tensor]
-    own: int
-    merged: int
+    params: dict[str, Tensor]  # raw parameters: first those that are trained, then those that are held fixed
+    own: int  # how many are trained
+    merged: int  # how many Gaussians there are in all cores
 
     @property
     def fixed(self) -> dict[str, Tensor]:
@@ -77,10 +71,6 @@ class Start:
 
 def check_merged(folder: Path, number: int) -> list[str]:
     """Return the names of the blocks of a run in which a round can begin.
-
-    Args:
-        folder: the run's.
-        number: of the round, from 1.
 
     Raises:
         PopError: the capture is not divided, or the blocks of the round before are not merged.
@@ -97,25 +87,12 @@ def check_merged(folder: Path, number: int) -> list[str]:
 
 
 def read_core(folder: Path, name: str, number: int) -> dict[str, Tensor]:
-    """Read the merged Gaussians of a block's core that a round starts from.
-
-    Args:
-        folder: the run's.
-        name: of the block.
-        number: of the round, from 1.
-    """
+    """Read the merged Gaussians of a block's core that a round starts from."""
     return load_splats(core_of(folder, name, number - 1))[0]
 
 
 def read_start(folder: Path, name: str, number: int, config: TrainConfig, views: Sequence[View]) -> Start:
     """Read what a block starts from in a round.
-
-    Args:
-        folder: the run's.
-        name: of the block.
-        number: of the round, from 1.
-        config: profile and antialiasing are read.
-        views: of the block, to train on and held out.
 
     Raises:
         PopError: the capture is not divided, or the blocks of the round before are not merged.
@@ -134,28 +111,15 @@ def read_start(folder: Path, name: str, number: int, config: TrainConfig, views:
 
 @torch.no_grad()
 def shown_in(views: Sequence[View], params: Mapping[str, Tensor], config: TrainConfig) -> Tensor:
-    """Tell which Gaussians at least one view shows, behind others or not. bool [N]
-
-    Args:
-        views: with their cameras; photographs are not read.
-        params: raw parameters.
-        config: profile and antialiasing are read.
-    """
-    profile = config.renderer
-    cameras = [
-        (
-            torch.from_numpy(view.viewmat).float(),
-            ProjectionSettings(
-                torch.from_numpy(view.K).float(), view.width, view.height, profile, antialiased=config.antialiased
-            ),
-        )
-        for view in views
-    ]
+    """Tell which Gaussians at least one view's camera shows, behind others or not. bool [N]"""
+    drawn = (config.renderer, config.antialiased)
+    Ks, viewmats = ([torch.from_numpy(getattr(view, name)).float() for view in views] for name in ("K", "viewmat"))
+    settings_of = [ProjectionSettings(K, view.width, view.height, *drawn) for K, view in zip(Ks, views, strict=True)]
     shown = torch.zeros(len(params["means"]), dtype=torch.bool)
     for rows in torch.arange(len(shown)).split(_AT_A_TIME):
         means, opacities = params["means"][rows], opacities_from_logits(params["opacities"][rows])
         shapes = covariances(params["quats"][rows], scales_from_log_scales(params["scales"][rows]))
-        for viewmat, settings in cameras:
+        for viewmat, settings in zip(viewmats, settings_of, strict=True):
             if len(rows) == 0:
                 break
             seen = (project(means, shapes, opacities, viewmat, settings).radii > 0).all(1)
@@ -200,11 +164,7 @@ def prepare(
     """Prepare the training of a block in a round.
 
     Args:
-        config: its settings, of `pop_fast.train.refining`, with a backend's name.
-        capture: the block's photographs.
-        start: what it begins with.
         resume: continue from the latest checkpoint of `config.result_dir`, or start where there is none.
-        loading_seconds: how long reading took, for the statistics.
         beside: texts to write beside cfg.json, by file name.
     """
     keep_freed_memory()
@@ -223,12 +183,6 @@ def write_round_block(
     """Draw the views of a block for a round and write their list, unless that is there already.
 
     Args:
-        folder: the run's.
-        config: its settings; the seed is read, and how photographs are.
-        record: how the capture is read.
-        names: of all blocks.
-        name: of this one.
-        number: of the round, from 1.
         core: centres of the Gaussians in its core, in the training frame. [N, 3]
 
     Raises:
@@ -240,17 +194,9 @@ def write_round_block(
     listings = {other: read_block(block_folder(folder, other)) for other in names}
     own = listings[name]
     shots = {shot.name: shot for each in listings.values() for shot in each.shots if shot.split == "train"}
-    cameras = load_capture(
-        block_folder(folder, name),
-        factor=config.factor,
-        normalize=config.normalize,
-        masks=record.masks,
-        missing=record.missing,
-        images=record.images,
-        resize=config.resize,
-        photographs="none",
-        listing=replace(own, shots=list(shots.values())),
-    )
+    every = replace(own, shots=list(shots.values()))
+    given = how_to_load(config, record)
+    cameras = load_capture(block_folder(folder, name), **given, photographs="none", listing=every)
     points = core.astype(np.float64)
     showing = [view.name for view in cameras.views if in_picture(points, view).mean() >= _SHOWN] if len(core) else []
     had = [shot for shot in own.shots if shot.split == "train"]
@@ -260,14 +206,10 @@ def write_round_block(
     write_block(place, replace(own, shots=[*chosen, *(shot for shot in own.shots if shot.split == "test")]))
 
 
-__all__ = ["HoldingStepper", "hold_last"]
-
-
 def hold_last(engine: Engine, rows: Mapping[str, Tensor]) -> Engine:
     """Return an engine that keeps the last rows of the parameters as they are.
 
     Args:
-        engine: takes the steps.
         rows: raw parameters of these Gaussians, which the parameters of the run must end with; they are not copied.
             The run's strategy must not change the number of Gaussians.
     """
@@ -278,7 +220,6 @@ class HoldingStepper:
     """Takes steps by another stepper, one at a time, and puts fixed rows back after each; see `Stepper`.
 
     Args:
-        stepper: takes them.
         rows: raw parameters of the Gaussians that are held, the last ones of those that are trained.
     """
 
@@ -289,7 +230,6 @@ class HoldingStepper:
 
     @property
     def longest(self) -> int:
-        """See `Stepper.longest`."""
         return self._stepper.longest
 
     def rebind(self, params: dict[str, Parameter], optimizers: Mapping[str, Adam], state: State) -> None:
@@ -309,7 +249,6 @@ class HoldingStepper:
         self._stepper.rebind(params, optimizers, state)
 
     def steps(self, first: int, last: int, phase: Phase) -> list[StepStats]:
-        """See `Stepper.steps`."""
         found: list[StepStats] = []
         for step in range(first, last):
             try:
@@ -323,7 +262,6 @@ class HoldingStepper:
         return found
 
     def synchronize(self) -> None:
-        """See `Stepper.synchronize`."""
         self._stepper.synchronize()
 
     def facts(self) -> dict[str, Any]:

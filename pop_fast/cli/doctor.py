@@ -14,7 +14,7 @@ from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Final, Literal
 
-from pop_fast.api.registry import backend_names, get_backend
+from pop_fast.api.backend import backend_names, get_backend
 from pop_fast.cli.arguments import parse
 from pop_fast.machine import machine_name, memory_bytes
 

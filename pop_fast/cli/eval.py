@@ -91,9 +91,9 @@ def measured(splat: Splat, options: CaptureOptions, nets: Sequence[LPIPS]) -> tu
 def measure_splat(splat: Splat, config: TrainConfig, views: list[ViewTensors], nets: Sequence[LPIPS]) -> dict[str, Any]:
     """Measure a splat on views; the numbers are those that training itself would write."""
     from pop_fast.io.heartbeat import Heartbeat
+    from pop_fast.train.engines import renderer
     from pop_fast.train.environment import reproducible
     from pop_fast.train.evaluate import evaluate, population
-    from pop_fast.train.gpu_proxy import renderer
 
     backend, note = renderer(config.backend)
     if note:

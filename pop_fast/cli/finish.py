@@ -112,8 +112,8 @@ def _finish(folder: Path, capture: Capture, options: FinishOptions) -> None:
 def checked(folder: Path, splat: Splat, capture: Capture, config: TrainConfig) -> None:
     """Render and measure what the report shows besides the results; see `pop_fast.view.report.checks`."""
     from pop_fast.io.heartbeat import Heartbeat
+    from pop_fast.train.engines import renderer
     from pop_fast.train.environment import reproducible
-    from pop_fast.train.gpu_proxy import renderer
     from pop_fast.view.report.checks import write_checks
 
     backend, _ = renderer(config.backend)
@@ -125,9 +125,9 @@ def checked(folder: Path, splat: Splat, capture: Capture, config: TrainConfig) -
 
 def _sizes(folder: Path, splat: Splat, capture: Capture, params: dict[str, Tensor]) -> None:
     """Measure the encodings, print them and add them to the statistics."""
-    from pop_fast.train.encodings import measure_encodings
+    from pop_fast.train.engines import renderer
     from pop_fast.train.environment import reproducible
-    from pop_fast.train.gpu_proxy import renderer
+    from pop_fast.train.evaluate import measure_encodings
     from pop_fast.train.results import ResultFolder
     from pop_fast.train.views import ViewTensors
     from pop_fast.view.report.sections import encoding_heads, encoding_rows

@@ -346,7 +346,7 @@ def _scores(shown: Shown, params: Mapping[str, Tensor], score: Score) -> Tensor:
 
     from pop_fast.density.passes import Passes
     from pop_fast.train.compact import degree_of
-    from pop_fast.train.gpu_proxy import renderer
+    from pop_fast.train.engines import renderer
     from pop_fast.train.views import ViewTensors, evenly
 
     capture, config = shown.photographed()

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import tyro
 
-from pop_fast.api.registry import BACKENDS, require_backend
+from pop_fast.api.backend import BACKENDS, require_backend
 from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED
 from pop_fast.cli.arguments import parse
 from pop_fast.cli.errors import describe, printable
@@ -231,8 +231,8 @@ def train_capture(
     Returns:
         The exit status.
     """
-    from pop_fast.train.commands import COMMANDS_FILE, commands_text
     from pop_fast.train.load_result import RECORD, read_record, record_text
+    from pop_fast.train.results import COMMANDS_FILE, commands_text
 
     folder, start = Path(config.result_dir), time.perf_counter()
     capture = _open_in_turn(config, options, ranks)

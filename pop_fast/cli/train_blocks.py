@@ -257,9 +257,8 @@ def _begin(folder: Path, config: TrainConfig, options: Any, job: Job, division: 
 
     from pop_fast.blocks.plan import JOB, job_text
     from pop_fast.cli.train_checks import record_of
-    from pop_fast.train.commands import COMMANDS_FILE, commands_text
     from pop_fast.train.load_result import RECORD, record_text
-    from pop_fast.train.results import ResultFolder
+    from pop_fast.train.results import COMMANDS_FILE, ResultFolder, commands_text
 
     record = record_text(record_of(division.capture, options))
     beside = {RECORD: record, COMMANDS_FILE: commands_text(None, ["pop", "train", *argv]), JOB: job_text(job)}

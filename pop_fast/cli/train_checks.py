@@ -43,8 +43,8 @@ def check_early(config: TrainConfig, source: Source, images: str | None, ranks: 
             if not Path(file).is_file():
                 raise PopError(f"{file}: there is no such file of LPIPS weights; give {name} another, or leave it out")
     if ranks is not None or config.batch_size > 1:
-        from pop_fast.train.batch_stepper import check_batch
         from pop_fast.train.ranks import ALONE
+        from pop_fast.train.torch_stepper import check_batch
 
         check_batch(config, True, ranks or ALONE)
     if not Path(config.data).is_dir() or config.factor == 1:

@@ -65,7 +65,7 @@ def run(argv: Sequence[str]) -> int:
 
 def make_viewer(args: Args, splat: Splat) -> LiveViewer:
     """Start the viewer of a splat: with the cameras of its capture, or where none is known with one made up."""
-    from pop_fast.train.gpu_proxy import renderer
+    from pop_fast.train.engines import renderer
     from pop_fast.view.html import camera_of_points
     from pop_fast.view.live import SplatScene
     from pop_fast.view.live.server import LiveViewer, stands_of

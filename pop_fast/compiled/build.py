@@ -26,19 +26,12 @@ import cuda_ext
 from cuda_ext.compiler import find_compiler, no_compiler
 
 HERE: Final = Path(__file__).resolve().parent
-UNITS: Final = (
-    "blend.cpp",
-    "scores.cpp",
-    "step.cpp",
-    "step_lists.cpp",
-    "step_pixels.cpp",
-    "step_update.cpp",
-    "counts.cpp",
+UNITS: Final = tuple(
+    f"{name}.cpp" for name in ("blend", "scores", "step", "step_lists", "step_pixels", "step_update", "counts")
 )
 SOURCES: Final = (
     *("projection.h", "colors.h", "lists.h", "tile.h", "forward.h", "backward.h", "ssim.h", "moments.h"),
-    *("scores.h", "c_api.h", "lanes.h", "threads.h", "pool.h", "step.h", "step_rows.h"),
-    "row_block.h",
+    *("scores.h", "c_api.h", "lanes.h", "threads.h", "pool.h", "step.h", "step_rows.h", "row_block.h"),
     *UNITS,
 )
 # one Gaussian's arithmetic is that of the CUDA kernels
@@ -52,14 +45,8 @@ SHARED: Final = tuple(
 )
 # roots and comparisons of many numbers at once neither set errno nor stop at a NaN
 FLAGS: Final = (
-    "-std=c++17",
-    "-O3",
-    "-fno-math-errno",
-    "-fno-trapping-math",
-    "-fno-tree-slp-vectorize",
-    "-fPIC",
-    "-shared",
-    "-pthread",
+    *("-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-fno-tree-slp-vectorize"),
+    *("-fPIC", "-shared", "-pthread"),
 )
 # for this processor, as compilers of different kinds and ages spell it; the last resort is any processor of its kind
 # whole vectors where there are any: compilers halve those of sixteen floats unasked, which costs the transpose a fifth
@@ -141,9 +128,6 @@ def _tuning() -> tuple[tuple[str, ...], ...]:
 def build(verbose: bool = False) -> Path:
     """Compile the library for this processor, unless it is there and loads; older versions of it are removed.
 
-    Args:
-        verbose: print the compiler's command.
-
     Returns:
         The library's file.
 
@@ -178,9 +162,6 @@ def build(verbose: bool = False) -> Path:
 
 def build_levels(folder: Path) -> list[Path]:
     """Compile the libraries of a wheel for this kind of machine.
-
-    Args:
-        folder: where they go.
 
     Raises:
         BuildError: there are no levels for this kind of machine, no compiler was found, or it failed.

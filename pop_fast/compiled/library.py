@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _PRECISIONS: Final = ("float32", "float64")
-_POINTER, _WHOLE, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+POINTER, WHOLE, REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
 # what projecting and culling read of `pop_ref.constants.Profile.as_numbers`
 PROJECTION_CONSTANTS: Final = (
     *("near_inclusive", "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas", "alpha_floor"),
@@ -29,7 +29,8 @@ PROJECTION_CONSTANTS: Final = (
 )
 
 
-def _fields(kind: Any, *names: str) -> tuple[tuple[str, Any], ...]:
+def fields_of(kind: Any, *names: str) -> tuple[tuple[str, Any], ...]:
+    """Return fields of one kind, as `ctypes.Structure` takes them."""
     return tuple((name, kind) for name in names)
 
 
@@ -37,57 +38,45 @@ class Covariances(ctypes.Structure):
     """`pop::Covariances` of projection.h, where every field is explained, in its order."""
 
     _fields_ = (
-        *_fields(_POINTER, "quats", "scales"),
-        *_fields(_WHOLE, "n", "threads"),
-        *_fields(_POINTER, "covars", "v_covars", "v_quats", "v_scales"),
+        *fields_of(POINTER, "quats", "scales"),
+        *fields_of(WHOLE, "n", "threads"),
+        *fields_of(POINTER, "covars", "v_covars", "v_quats", "v_scales"),
     )
-
-
-class CovariancesBackward(Covariances):
-    """The same, for the transpose."""
 
 
 class Projection(ctypes.Structure):
     """`pop::Projection` of projection.h, where every field is explained, in its order."""
 
     _fields_ = (
-        *_fields(_POINTER, "means", "covars", "opacities", "viewmat", "K"),
-        *_fields(_WHOLE, "n", "threads", "width", "height", "tile_size"),
-        *_fields(_WHOLE, "near_inclusive", "centred", "inria_clamp", "square", "antialiased"),
-        *_fields(_REAL, "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas", "alpha_floor"),
-        *_fields(_REAL, "radius_clip"),
-        *_fields(_POINTER, "means2d", "depths", "conics", "effective_opacities", "factors", "radii"),
-        *_fields(_POINTER, "v_means2d", "v_depths", "v_conics", "v_effective_opacities", "v_factors"),
-        *_fields(_POINTER, "v_means", "v_covars", "v_opacities", "v_viewmats"),
+        *fields_of(POINTER, "means", "covars", "opacities", "viewmat", "K"),
+        *fields_of(WHOLE, "n", "threads", "width", "height", "tile_size"),
+        *fields_of(WHOLE, "near_inclusive", "centred", "inria_clamp", "square", "antialiased"),
+        *fields_of(REAL, "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas", "alpha_floor"),
+        *fields_of(REAL, "radius_clip"),
+        *fields_of(POINTER, "means2d", "depths", "conics", "effective_opacities", "factors", "radii"),
+        *fields_of(POINTER, "v_means2d", "v_depths", "v_conics", "v_effective_opacities", "v_factors"),
+        *fields_of(POINTER, "v_means", "v_covars", "v_opacities", "v_viewmats"),
     )
-
-
-class ProjectionBackward(Projection):
-    """The same, for the transpose."""
 
 
 class Colors(ctypes.Structure):
     """`pop::Colors` of colors.h, where every field is explained, in its order."""
 
     _fields_ = (
-        *_fields(_POINTER, "sh", "means", "viewmat", "visible"),
-        *_fields(_WHOLE, "n", "n_visible", "n_sh", "degree", "threads"),
-        *_fields(_POINTER, "colors", "v_colors", "v_sh", "v_dirs"),
+        *fields_of(POINTER, "sh", "means", "viewmat", "visible"),
+        *fields_of(WHOLE, "n", "n_visible", "n_sh", "degree", "threads"),
+        *fields_of(POINTER, "colors", "v_colors", "v_sh", "v_dirs"),
     )
-
-
-class ColorsBackward(Colors):
-    """The same, for the transpose."""
 
 
 class Lists(ctypes.Structure):
     """`pop::Lists` of lists.h, where every field is explained, in its order."""
 
     _fields_ = (
-        *_fields(_POINTER, "means2d", "conics", "opacities", "rects", "order", "candidates"),
-        *_fields(_WHOLE, "n", "m", "tiles_x", "tiles_y", "tile_size", "threads"),
-        *_fields(_REAL, "alpha_floor"),
-        *_fields(_POINTER, "tiles", "ids", "offsets"),
+        *fields_of(POINTER, "means2d", "conics", "opacities", "rects", "order", "candidates"),
+        *fields_of(WHOLE, "n", "m", "tiles_x", "tiles_y", "tile_size", "threads"),
+        *fields_of(REAL, "alpha_floor"),
+        *fields_of(POINTER, "tiles", "ids", "offsets"),
     )
 
 
@@ -95,53 +84,37 @@ class Blend(ctypes.Structure):
     """`pop::Blend` of tile.h, where every field is explained, in its order."""
 
     _fields_ = (
-        *_fields(_POINTER, "means2d", "conics", "opacities", "colors", "ids", "offsets", "first_chunks"),
-        *_fields(_WHOLE, "n", "channels", "tiles_x", "tiles_y", "tile_size", "width", "height", "threads"),
-        *_fields(_WHOLE, "pixel_stride", "channel_stride"),
-        *_fields(_REAL, "alpha_floor", "alpha_ceiling", "stop"),
-        *_fields(_WHOLE, "ceiling_passes"),
-        *_fields(_POINTER, "splats", "transmittances", "reached", "n_reached", "n_pairs", "image", "alphas"),
-        *_fields(_POINTER, "dominant_ids", "dominant_weights", "n_blended", "n_traversed"),
-        *_fields(_POINTER, "v_image", "v_alphas", "rows"),
-        *_fields(_POINTER, "v_means2d", "v_conics", "v_opacities", "v_colors", "absgrad"),
-        *_fields(_POINTER, "slots", "dominant_counts", "kept"),
+        *fields_of(POINTER, "means2d", "conics", "opacities", "colors", "ids", "offsets", "first_chunks"),
+        *fields_of(WHOLE, "n", "channels", "tiles_x", "tiles_y", "tile_size", "width", "height", "threads"),
+        *fields_of(WHOLE, "pixel_stride", "channel_stride"),
+        *fields_of(REAL, "alpha_floor", "alpha_ceiling", "stop"),
+        *fields_of(WHOLE, "ceiling_passes"),
+        *fields_of(POINTER, "splats", "transmittances", "reached", "n_reached", "n_pairs", "image", "alphas"),
+        *fields_of(POINTER, "dominant_ids", "dominant_weights", "n_blended", "n_traversed"),
+        *fields_of(POINTER, "v_image", "v_alphas", "rows"),
+        *fields_of(POINTER, "v_means2d", "v_conics", "v_opacities", "v_colors", "absgrad"),
+        *fields_of(POINTER, "slots", "dominant_counts", "kept"),
     )
-
-
-class BlendBackward(Blend):
-    """The same, for the transpose."""
 
 
 class Scores(Blend):
-    """`pop::Scores` of scores.h, where every field is explained, in its order: sums over pixels for `contributions`."""
+    """`pop::Scores` of scores.h, where every field is explained, in its order: what all sums over pixels take."""
 
     _fields_ = (
-        *_fields(_POINTER, "background", "pixel_map", "facing"),
-        *_fields(_REAL, "fx", "fy", "cx", "cy"),
-        *_fields(_POINTER, "T_final", "totals"),
+        *fields_of(POINTER, "background", "pixel_map", "facing"),
+        *fields_of(REAL, "fx", "fy", "cx", "cy"),
+        *fields_of(POINTER, "T_final", "totals"),
     )
-
-
-class SensitivityScores(Scores):
-    """The same, for `sensitivities`."""
-
-
-class MomentScores(Scores):
-    """The same, for `screen_moments`."""
-
-
-class PointScores(Scores):
-    """The same, for `dominant_points`."""
 
 
 class Ssim(ctypes.Structure):
     """`pop::Ssim` of ssim.h, where every field is explained, in its order."""
 
     _fields_ = (
-        *_fields(_POINTER, "difference", "target", "mu_y", "s_yy", "kept"),
-        *_fields(_WHOLE, "height", "width", "channels", "border", "stride", "threads"),
-        *_fields(_REAL, "weight"),
-        *_fields(_POINTER, "totals", "partials", "gradient"),
+        *fields_of(POINTER, "difference", "target", "mu_y", "s_yy", "kept"),
+        *fields_of(WHOLE, "height", "width", "channels", "border", "stride", "threads"),
+        *fields_of(REAL, "weight"),
+        *fields_of(POINTER, "totals", "partials", "gradient"),
     )
 
 
@@ -149,58 +122,41 @@ class Moments(ctypes.Structure):
     """`pop::Moments` of moments.h, where every field is explained, in its order."""
 
     _fields_ = (
-        *_fields(_POINTER, "photograph"),
-        *_fields(_WHOLE, "height", "width", "border", "threads"),
-        *_fields(_POINTER, "target", "mu_y", "s_yy"),
+        *fields_of(POINTER, "photograph"),
+        *fields_of(WHOLE, "height", "width", "border", "threads"),
+        *fields_of(POINTER, "target", "mu_y", "s_yy"),
     )
 
 
-_NAMES: dict[type[ctypes.Structure], str] = {
-    Covariances: "covariances",
-    CovariancesBackward: "covariances_backward",
-    Projection: "projection",
-    ProjectionBackward: "projection_backward",
-    Colors: "colors",
-    ColorsBackward: "colors_backward",
-    Lists: "lists",
-    Blend: "forward",
-    BlendBackward: "backward",
-    Scores: "contributions",
-    SensitivityScores: "sensitivities",
-    MomentScores: "screen_moments",
-    PointScores: "dominant_points",
-    Ssim: "ssim",
-    Moments: "moments",
+# the functions by name, each in both precisions, and the layout of what each is given
+_LAYOUTS: Final[dict[str, type[ctypes.Structure]]] = {
+    **dict.fromkeys(("covariances", "covariances_backward"), Covariances),
+    **dict.fromkeys(("projection", "projection_backward"), Projection),
+    **dict.fromkeys(("colors", "colors_backward"), Colors),
+    "lists": Lists,
+    **dict.fromkeys(("forward", "backward"), Blend),
+    **dict.fromkeys(("contributions", "sensitivities", "screen_moments", "dominant_points"), Scores),
+    "ssim": Ssim,
+    "moments": Moments,
 }
 
 
 @dataclass(frozen=True)
 class Library:
-    """What is in the library.
+    """What is in the library."""
 
-    Attributes:
-        functions: by layout and precision.
-        chunk: list entries after which the blend writes down the light.
-        padded_pixels: pixels of a tile of that size, padded to whole vectors of floats of so many bytes.
-        splat_bytes: size of what blending keeps of a splat, and its alignment.
-        lanes: numbers of so many bytes in a vector.
-        window_rows: rows of SSIM's windows whose total is one number.
-        padded_line: numbers from one row of maps to the next, for rows of that many numbers of so many bytes.
-        rows_at_a_time: Gaussians whose share of the camera's gradient is one sum.
-        adam: moves so many floats by one update of Adam.
-        fork: starts the threads, or None.
-    """
-
-    functions: dict[tuple[type[ctypes.Structure], str], Callable[..., int]]
-    chunk: int
+    functions: dict[tuple[str, str], Callable[..., int]]  # by name and precision
+    chunk: int  # list entries after which the blend writes down the light
+    # pixels of a tile of that size, padded to whole vectors of floats of so many bytes
     padded_pixels: Callable[[int, int], int]
-    splat_bytes: int
-    lanes: Callable[[int], int]
-    window_rows: int
+    splat_bytes: int  # size of what blending keeps of a splat, and its alignment
+    lanes: Callable[[int], int]  # numbers of so many bytes in a vector
+    window_rows: int  # rows of SSIM's windows whose total is one number
+    # numbers from one row of maps to the next, for rows of that many numbers of so many bytes
     padded_line: Callable[[int, int], int]
-    rows_at_a_time: int
-    adam: Callable[..., None]
-    fork: Any
+    rows_at_a_time: int  # Gaussians whose share of the camera's gradient is one sum
+    adam: Callable[..., None]  # moves so many floats by one update of Adam
+    fork: Any  # starts the threads, or None
 
 
 @dataclass(frozen=True)
@@ -218,48 +174,37 @@ class StepperFunctions:
 def stepper_functions(given_bytes: int) -> StepperFunctions:
     """Return the functions that take whole training steps.
 
-    Args:
-        given_bytes: size of the caller's layout of `pop::StepGiven`.
-
     Raises:
         OSError: the library has another layout.
     """
     path = str(library_path())
     this_library()
     loaded = ctypes.CDLL(path)
-    loaded.pop_step_given_bytes.restype = _WHOLE
+    loaded.pop_step_given_bytes.restype = WHOLE
     if loaded.pop_step_given_bytes() != given_bytes:
         raise OSError(f"{path} expects arguments of another layout")
-    loaded.pop_stepper_open.argtypes, loaded.pop_stepper_open.restype = (_WHOLE,), _POINTER
-    loaded.pop_stepper_close.argtypes, loaded.pop_stepper_close.restype = (_POINTER,), None
-    steps = loaded.pop_stepper_steps
-    steps.argtypes, steps.restype = (_POINTER, _POINTER, _WHOLE, _POINTER), _WHOLE
-    loaded.pop_stepper_bytes.argtypes, loaded.pop_stepper_bytes.restype = (_POINTER,), _WHOLE
-    loaded.pop_stepper_counts.argtypes, loaded.pop_stepper_counts.restype = (_POINTER, _POINTER), None
-    trace = loaded.pop_stepper_trace
-    trace.argtypes, trace.restype = (_POINTER, _POINTER, _WHOLE), _WHOLE
-    return StepperFunctions(
-        loaded.pop_stepper_open,
-        loaded.pop_stepper_close,
-        loaded.pop_stepper_steps,
-        loaded.pop_stepper_bytes,
-        loaded.pop_stepper_counts,
-        trace,
-    )
+    signatures = {
+        "open": ((WHOLE,), POINTER),
+        "close": ((POINTER,), None),
+        "steps": ((POINTER, POINTER, WHOLE, POINTER), WHOLE),
+        "bytes": ((POINTER,), WHOLE),
+        "counts": ((POINTER, POINTER), None),
+        "trace": ((POINTER, POINTER, WHOLE), WHOLE),
+    }
+    found: dict[str, Any] = {name: getattr(loaded, f"pop_stepper_{name}") for name in signatures}
+    for name, signature in signatures.items():
+        found[name].argtypes, found[name].restype = signature
+    return StepperFunctions(**found)
 
 
 def call_library(
-    layout: type[ctypes.Structure],
-    dtype: torch.dtype,
-    numbers: Mapping[str, float],
-    tensors: Mapping[str, Tensor | None],
+    name: str, dtype: torch.dtype, numbers: Mapping[str, float], tensors: Mapping[str, Tensor | None]
 ) -> None:
-    """Call the function of a layout.
+    """Call a function of the library.
 
     Args:
-        layout: of its arguments; fields that are not given are 0 or null.
         dtype: float32 or float64.
-        numbers: fields that are numbers.
+        numbers: fields of its arguments that are numbers; those that are not given are 0 or null.
         tensors: fields that are pointers; what is not contiguous is copied, and so must not be a result.
 
     Raises:
@@ -267,10 +212,10 @@ def call_library(
     """
     library = this_library()
     # the arguments only point: these are what they point into, and live until the function has returned
-    held = {name: tensor.contiguous() for name, tensor in tensors.items() if tensor is not None}
-    arguments = layout(**numbers, **{name: tensor.data_ptr() for name, tensor in held.items()})
-    if not library.functions[layout, str(dtype).removeprefix("torch.")](ctypes.byref(arguments), library.fork):
-        raise MemoryError(f"the compiled CPU kernels ran out of memory in stage {_NAMES[layout]}")
+    held = {field: tensor.contiguous() for field, tensor in tensors.items() if tensor is not None}
+    arguments = _LAYOUTS[name](**numbers, **{field: tensor.data_ptr() for field, tensor in held.items()})
+    if not library.functions[name, str(dtype).removeprefix("torch.")](ctypes.byref(arguments), library.fork):
+        raise MemoryError(f"the compiled CPU kernels ran out of memory in stage {name}")
 
 
 def this_library() -> Library:
@@ -286,30 +231,26 @@ def open_library(path: str) -> Library:
         OSError: it is missing, does not load, or was not made from the same source as this module.
     """
     loaded = load_library(path)
-    numbers = ("chunk", "padded_pixels", "splat_bytes", "lanes", "window_rows", "padded_line", "rows_at_a_time")
-    for number in numbers:
-        getattr(loaded, f"pop_{number}").restype = _WHOLE
-    loaded.pop_lanes.argtypes = (_WHOLE,)
-    loaded.pop_padded_pixels.argtypes = loaded.pop_padded_line.argtypes = (_WHOLE, _WHOLE)
-    loaded.pop_adam.argtypes = (*(_POINTER,) * 4, *(_WHOLE,) * 2, *(_REAL,) * 4)
+    numbers = ("chunk", "splat_bytes", "window_rows", "rows_at_a_time")
+    sizes = ("padded_pixels", "lanes", "padded_line")
+    for number in (*numbers, *sizes):
+        getattr(loaded, f"pop_{number}").restype = WHOLE
+    loaded.pop_lanes.argtypes = (WHOLE,)
+    loaded.pop_padded_pixels.argtypes = loaded.pop_padded_line.argtypes = (WHOLE, WHOLE)
+    loaded.pop_adam.argtypes = (*(POINTER,) * 4, *(WHOLE,) * 2, *(REAL,) * 4)
     loaded.pop_adam.restype = None
-    functions: dict[tuple[type[ctypes.Structure], str], Callable[..., int]] = {}
-    for layout, name in _NAMES.items():
+    functions: dict[tuple[str, str], Callable[..., int]] = {}
+    for name in _LAYOUTS:
         for precision in _PRECISIONS:
             function = getattr(loaded, f"pop_{name}_{precision}")
-            function.argtypes, function.restype = (_POINTER, _POINTER), ctypes.c_int
-            functions[layout, precision] = function
+            function.argtypes, function.restype = (POINTER, POINTER), ctypes.c_int
+            functions[name, precision] = function
     return Library(
         functions,
-        loaded.pop_chunk(),
-        loaded.pop_padded_pixels,
-        loaded.pop_splat_bytes(),
-        loaded.pop_lanes,
-        loaded.pop_window_rows(),
-        loaded.pop_padded_line,
-        loaded.pop_rows_at_a_time(),
-        loaded.pop_adam,
-        _fork(),
+        **{number: getattr(loaded, f"pop_{number}")() for number in numbers},
+        **{size: getattr(loaded, f"pop_{size}") for size in sizes},
+        adam=loaded.pop_adam,
+        fork=_fork(),
     )
 
 
@@ -320,9 +261,9 @@ def load_library(path: str) -> ctypes.CDLL:
         OSError: it is missing, does not load, or was not made from the same source as this module.
     """
     loaded = ctypes.CDLL(path)
-    for layout in (Covariances, Projection, Colors, Lists, Blend, Scores, Ssim, Moments):
+    for layout in dict.fromkeys(_LAYOUTS.values()):
         size = getattr(loaded, f"pop_{layout.__name__.lower()}_bytes")
-        size.restype = _WHOLE
+        size.restype = WHOLE
         if size() != ctypes.sizeof(layout):
             raise OSError(f"{path} expects arguments of another layout")
     return loaded
@@ -342,5 +283,5 @@ def _fork() -> Any:
     for file in sorted(files):
         function = getattr(ctypes.CDLL(file), "GOMP_parallel", None)
         if function is not None:
-            return ctypes.cast(function, _POINTER)
+            return ctypes.cast(function, POINTER)
     return None

@@ -11,15 +11,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pop_fast.compiled.library import Ssim, call_library, this_library
+from pop_fast.compiled.library import call_library, this_library
 from pop_fast.stages import losses
-from pop_fast.stages.ssim import REACH, TargetMoments, border_of, kept_windows
+from pop_fast.stages.losses import REACH, TargetMoments, border_of, kept_windows
 
 
 def mean_dissimilarity(
     difference: Tensor, moments: TargetMoments, mask: Tensor | None, weight: float | None
 ) -> tuple[Tensor, Tensor | None]:
-    """See `pop_fast.stages.ssim.mean_dissimilarity`.
+    """See `pop_fast.stages.losses.mean_dissimilarity`.
 
     Optimizations: one pass from the difference to the derivatives by the windows' moments, and one from these to the
     gradient (`ssim.h`); what is blurred stays in the cache.
@@ -35,7 +35,7 @@ def mean_dissimilarity(
     totals = torch.empty(-(-len(moments.mu_y) // library.window_rows), dtype=torch.float64)
     partials = None if weight is None else difference.new_empty((3, height + REACH, stride))
     call_library(
-        Ssim,
+        "ssim",
         difference.dtype,
         {"height": height, "width": width, "channels": channels, "border": border_of(moments.padding)}
         | {"stride": stride, "threads": torch.get_num_threads(), "weight": (weight or 0.0) / n},

@@ -1,5 +1,5 @@
 // A photograph as the native step compares with it: planes of floats, and their moments under SSIM's windows. Meaning:
-// `pop_fast.stages.ssim.target_moments`.
+// `pop_fast.stages.losses.target_moments`.
 #pragma once
 
 #include <algorithm>

@@ -11,17 +11,30 @@ import ctypes
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import torch
 from torch import Tensor
 
-from pop_fast.compiled.library import PROJECTION_CONSTANTS, Moments, call_library, stepper_functions, this_library
-from pop_fast.stages.blend.blend import Stop, below
-from pop_fast.stages.ssim import REACH, Padding, border_of, check_size, kept_windows
+from pop_fast.compiled.library import (
+    POINTER,
+    PROJECTION_CONSTANTS,
+    REAL,
+    WHOLE,
+    call_library,
+    fields_of,
+    stepper_functions,
+    this_library,
+)
+from pop_fast.stages.blend import Stop, below
+from pop_fast.stages.losses import REACH, Padding, border_of, check_size, kept_windows
 from pop_fast.train.signals import Abandoned, StopRequest, heard
 from pop_fast.train.steps import Collected, Phase, StepSettings, StepStats
 from pop_ref.settings import BETAS, EPS, PARAMETERS
+
+if TYPE_CHECKING:
+    from pop_fast.train.appearance import Appearance
+    from pop_fast.train.views import ViewTensors
 
 Moved = tuple[dict[str, Tensor], dict[str, Tensor], dict[str, Tensor]]
 
@@ -69,84 +82,35 @@ PARTS: Final = ("project", "list", "blend", "loss", "image_gradient", "transpose
 # what a step had to do: `pop::StepCounts` of step.h, where each is explained, in its order
 COUNTS: Final = ("visible", "entries", "walked", "chunks", "pairs", "marked", "reached")
 T = TypeVar("T")
-_POINTER, _WHOLE, _REAL = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
-
-
-def _fields(kind: Any, *names: str) -> tuple[tuple[str, Any], ...]:
-    return tuple((name, kind) for name in names)
 
 
 class StepGiven(ctypes.Structure):
     """`pop::StepGiven` of step.h, where every field is explained, in its order."""
 
     _fields_ = (
-        *_fields(_POINTER * len(PARAMETERS), "params", "m", "v"),
-        *_fields(_WHOLE, "n", "n_rest"),
-        *_fields(_POINTER, "viewmat", "K", "target", "mu_y", "s_yy", "kept", "kept_windows"),
-        *_fields(_WHOLE, "width", "height", "n_kept", "n_windows"),
-        *_fields(_WHOLE, "near_inclusive", "centred", "inria_clamp", "square", "antialiased", "ceiling_passes"),
-        *_fields(_REAL, "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas", "alpha_floor"),
-        *_fields(_REAL, "floor_below", "alpha_ceiling", "stop"),
-        *_fields(_POINTER, "exposure", "samples"),
-        *_fields(_WHOLE, "n_samples"),
-        *_fields(_REAL * 3, "background"),
-        *_fields(_WHOLE, "degree", "border", "l1"),
-        *_fields(_REAL, "pixel_weight", "ssim_weight", "lambda_pop", "lambda_entropy"),
-        *_fields(_REAL, "depth_weight", "opacity_reg", "scale_reg"),
-        *_fields(_WHOLE, "dominance", "pop_window", "pop_visible", "blur_own_view"),
-        *_fields(_REAL, "blur_pixels"),
-        *_fields(_REAL * len(PARAMETERS), "lr"),
-        *_fields(_REAL, "beta1", "beta2", "eps"),
-        *_fields(_WHOLE, "most_entries"),
-        *_fields(_WHOLE * len(PARAMETERS), "updates"),
-        *_fields(_POINTER, "sh_rest_sum"),
-        *_fields(_POINTER, "grad_sum", "n_visible", "dominant_sum", "blurred"),
-        *_fields(_POINTER, "v_exposure", "values", "seconds", "bad_row"),
+        *fields_of(POINTER * len(PARAMETERS), "params", "m", "v"),
+        *fields_of(WHOLE, "n", "n_rest"),
+        *fields_of(POINTER, "viewmat", "K", "target", "mu_y", "s_yy", "kept", "kept_windows"),
+        *fields_of(WHOLE, "width", "height", "n_kept", "n_windows"),
+        *fields_of(WHOLE, "near_inclusive", "centred", "inria_clamp", "square", "antialiased", "ceiling_passes"),
+        *fields_of(REAL, "near_plane", "far_plane", "eps2d", "frustum_margin", "extent_sigmas", "alpha_floor"),
+        *fields_of(REAL, "floor_below", "alpha_ceiling", "stop"),
+        *fields_of(POINTER, "exposure", "samples"),
+        *fields_of(WHOLE, "n_samples"),
+        *fields_of(REAL * 3, "background"),
+        *fields_of(WHOLE, "degree", "border", "l1"),
+        *fields_of(REAL, "pixel_weight", "ssim_weight", "lambda_pop", "lambda_entropy"),
+        *fields_of(REAL, "depth_weight", "opacity_reg", "scale_reg"),
+        *fields_of(WHOLE, "dominance", "pop_window", "pop_visible", "blur_own_view"),
+        *fields_of(REAL, "blur_pixels"),
+        *fields_of(REAL * len(PARAMETERS), "lr"),
+        *fields_of(REAL, "beta1", "beta2", "eps"),
+        *fields_of(WHOLE, "most_entries"),
+        *fields_of(WHOLE * len(PARAMETERS), "updates"),
+        *fields_of(POINTER, "sh_rest_sum"),
+        *fields_of(POINTER, "grad_sum", "n_visible", "dominant_sum", "blurred"),
+        *fields_of(POINTER, "v_exposure", "values", "seconds", "bad_row"),
     )
-
-
-class TrainingView(Protocol):
-    """A photograph with its camera, as `pop_fast.train.views.ViewTensors`."""
-
-    @property
-    def photo(self) -> Tensor:
-        """Photograph. uint8 [H, W, 3]"""
-        ...
-
-    @property
-    def mask(self) -> Tensor | None:
-        """True for the pixels that count, or None. [H, W]"""
-        ...
-
-    @property
-    def viewmat(self) -> Tensor:
-        """World -> camera. [1, 4, 4]"""
-        ...
-
-    @property
-    def K(self) -> Tensor:
-        """Intrinsics, px. [1, 3, 3]"""
-        ...
-
-    def depth_samples(self) -> tuple[Tensor, Tensor] | None:
-        """Return where it shows its sparse points, px [M, 2], and their disparities [M]; None without any."""
-        ...
-
-
-class Exposures(Protocol):
-    """What is learned of the photographs' exposures, as `pop_fast.train.appearance.Appearance`."""
-
-    def exposure(self, index: int) -> Tensor:
-        """Return the exposure of a view's photograph as it is kept. float32 [3, 4]"""
-        ...
-
-    def pull_exposure(self, index: int, gradient: Tensor) -> None:
-        """Take the gradient of a step with that view. [3, 4]"""
-        ...
-
-    def update(self, step: int) -> None:
-        """Move by the gradients of a step."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -164,18 +128,15 @@ class _Target:
     samples: Tensor | None
 
     @classmethod
-    def of(cls, view: TrainingView, padding: Padding, with_depth: bool) -> _Target:
+    def of(cls, view: ViewTensors, padding: Padding, with_depth: bool) -> _Target:
         height, width = view.photo.shape[:2]
         check_size(view.photo, padding)
         border = border_of(padding)
         target = torch.empty((3, height, width))
         mu_y, s_yy = (torch.empty((3, height + 2 * border - REACH, width + 2 * border - REACH)) for _ in range(2))
-        call_library(
-            Moments,
-            torch.float32,
-            {"height": height, "width": width, "border": border, "threads": torch.get_num_threads()},
-            {"photograph": view.photo, "target": target, "mu_y": mu_y, "s_yy": s_yy},
-        )
+        numbers = {"height": height, "width": width, "border": border, "threads": torch.get_num_threads()}
+        tensors = {"photograph": view.photo, "target": target, "mu_y": mu_y, "s_yy": s_yy}
+        call_library("moments", torch.float32, numbers, tensors)
         mask = view.mask
         found = view.depth_samples() if with_depth else None
         return cls(
@@ -201,17 +162,10 @@ class NativeTrainer:
     Args:
         params: raw float32 tensors by gsplat's keys, updated in place.
         m, v: Adam's moments, likewise.
-        views: photographs and cameras.
-        order: the view of every step of the schedule.
-        settings: objective and update.
-        step: the step to begin at.
         threads: None takes torch's number.
         cache_mb: memory for what is made of photographs; the others' is made anew at every visit, to the same bits.
         stop: whether somebody has asked for an end; a step that is being taken is then left, and changes nothing.
         exposures: of the photographs, which learn with every step; None where none are learned.
-
-    Attributes:
-        step: steps taken.
     """
 
     def __init__(
@@ -219,7 +173,7 @@ class NativeTrainer:
         params: Mapping[str, Tensor],
         m: Mapping[str, Tensor],
         v: Mapping[str, Tensor],
-        views: Sequence[TrainingView],
+        views: Sequence[ViewTensors],
         order: Sequence[int],
         settings: StepSettings,
         step: int = 0,
@@ -227,7 +181,7 @@ class NativeTrainer:
         threads: int | None = None,
         cache_mb: float = 1024,
         stop: StopRequest | None = None,
-        exposures: Exposures | None = None,
+        exposures: Appearance | None = None,
     ) -> None:
         self.settings, self.step = settings, step
         self._stop, self._alone = stop or StopRequest(), stop is None
@@ -288,7 +242,7 @@ class NativeTrainer:
 
     def counts(self) -> dict[str, int]:
         """Count what the last step had to do, by the names of `COUNTS`; all are 0 before the first."""
-        found = (_WHOLE * len(COUNTS))()
+        found = (WHOLE * len(COUNTS))()
         self._functions.counts(self._stepper, found)
         return dict(zip(COUNTS, found, strict=True))
 
@@ -352,7 +306,7 @@ class NativeTrainer:
         given.ceiling_passes = constants["pass_ceiling"]
         given.floor_below = below(profile.alpha_floor, torch.float32)
         given.stop = Stop.of(profile, torch.float32).at
-        given.background = (_REAL * 3)(*settings.background)
+        given.background = (REAL * 3)(*settings.background)
         given.border = border_of(self._padding)
         given.pop_visible, given.pop_window = settings.pop_over == "visible", settings.pop_views == "window"
         given.blur_own_view = settings.blur_window == "own_view"
@@ -424,8 +378,8 @@ class NativeTrainer:
             given.exposure = self._exposures.exposure(self._order[step]).data_ptr()
         given.blur_pixels = settings.blur_pixels(given.n_kept)
         rates, numbers = settings.updates.rates, settings.updates.numbers
-        given.lr = (_REAL * len(PARAMETERS))(*rates[step].tolist())
-        given.updates = (_WHOLE * len(PARAMETERS))(*numbers[step].tolist())
+        given.lr = (REAL * len(PARAMETERS))(*rates[step].tolist())
+        given.updates = (WHOLE * len(PARAMETERS))(*numbers[step].tolist())
 
     def _target(self, index: int) -> _Target:
         if index in self._targets:

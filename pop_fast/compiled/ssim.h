@@ -1,5 +1,5 @@
 // 1 - SSIM of every window and its gradient by the render. Meaning: `pop_ref.ssim`; the formulas, which are written in
-// the difference of render and photograph, are those of `pop_fast/stages/ssim.py`.
+// the difference of render and photograph, are those of `pop_fast/stages/losses.py`.
 #pragma once
 
 #include <algorithm>

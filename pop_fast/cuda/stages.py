@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,35 +13,23 @@ from cuda_ext.arrays import Settings, new_state
 from cuda_ext.render.autograd import Blend, Project, RenderStats
 from cuda_ext.render.lists import WARP_TILE, list_tile, make_lists, splat_struct
 from cuda_ext.render.scores import ScoredView
-from pop_fast.stages.chord import DominantPoints, points_on_rays, towards_camera
 from pop_fast.stages.compositing import Composite
-from pop_fast.stages.contributions import Contributions, fisher_blocks
+from pop_fast.stages.contributions import Contributions, DominantPoints, fisher_blocks, points_on_rays, towards_camera
 from pop_fast.stages.projection import intrinsics
-from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of
+from pop_fast.stages.splatting import ProjectionSettings, Shapes, Splats, colors_of
 from pop_fast.stages.stage_set import PassInput, Seen
 from pop_fast.stages.tiles import TileLists
 from pop_fast.stages.types import Camera, Gaussians
-from pop_fast.train.gpu_proxy import translate_oom
+from pop_fast.train.engines import translate_oom
 
 WIDEST = 4  # channels that one launch blends
 
 
-class Shapes(NamedTuple):
-    """Rotations and sizes as they are: one kernel makes covariances and projects them."""
-
-    quats: Tensor
-    scales: Tensor
-
-
 @dataclass(frozen=True)
 class SplatsOnGpu(Splats):
-    """Splats, and the flags that the kernels have raised while they were made.
+    """Splats, and the flags that the kernels have raised while they were made."""
 
-    Attributes:
-        state: int32, on the device.
-    """
-
-    state: Tensor | None = None
+    state: Tensor | None = None  # int32, on the device
 
 
 @dataclass(frozen=True)
@@ -50,16 +37,14 @@ class CudaStages:
     """Draws views as `pop_fast.api.backend.ViewStages` says.
 
     Optimizations: exact tile lists, two narrow stable sorts, one warp a 16 x 8 tile, moment-form gradients.
-
-    Attributes:
-        backward, deterministic: as `pop_fast.cuda.backend.CudaBackend` says.
     """
 
-    backward: str
+    # backward, deterministic: as `pop_fast.api.backends.CudaBackend` says
+    backward: str  # as `pop_fast.api.backends.CudaBackend` says
     deterministic: bool
 
     def covariances(self, quats: Tensor, scales: Tensor) -> Shapes:
-        """Return both as they are."""
+        """Return both as they are: one kernel makes covariances and projects them."""
         return Shapes(quats, scales)
 
     def splats(
@@ -130,7 +115,6 @@ class CudaStages:
         return Composite(image, 1.0 - left[0], ids, stats.dominant_weights, stats.n_blended, stats.n_traversed, None)
 
     def tile_lists(self, rows: Splats, settings: ProjectionSettings, tile_size: int) -> TileLists:
-        """List every tile's rows by their extents alone."""
         own, size = self._settings(settings, tile_size), (tile_size, tile_size)
         with _on_device_of(rows.means2d):
             found = make_lists(own, _struct(rows), len(rows.depths), rows.depths.device, size, False)
@@ -182,9 +166,6 @@ def _empty_stats(rows: Splats, settings: ProjectionSettings) -> RenderStats:
 class CudaView:
     """A shot that has been drawn on the GPU where its Gaussians lie.
 
-    Args:
-        pass_input: what is drawn.
-
     Raises:
         PopError: the GPU has no room; says what to lower.
     """
@@ -194,32 +175,20 @@ class CudaView:
         g, c = pass_input.gaussians, pass_input.camera
         rows = (g.means, g.quats, g.scales, g.opacities, g.sh)
         with translate_oom():
-            self._view = ScoredView(
-                rows,
-                c.viewmat,
-                c.K,
-                c.width,
-                c.height,
-                pass_input.sh_degree,
-                pass_input.background,
-                pass_input.profile,
-                pass_input.antialiased,
-            )
+            how = (pass_input.sh_degree, pass_input.background, pass_input.profile, pass_input.antialiased)
+            self._view = ScoredView(rows, c.viewmat, c.K, c.width, c.height, *how)
 
     def seen(self) -> Seen:
-        """Return the drawing."""
         view = self._view
         return Seen(view.image, view.dominant_ids.long(), view.radii, view.depths)
 
     def contributions(self, pixel_map: Tensor | None) -> Contributions:
-        """As `pop_fast.stages.contributions.contributions`."""
         with translate_oom():
             found = self._view.contributions(None if pixel_map is None else pixel_map.float())
         weight_sum, n_pixels, map_sum, distance_sum = found.T
         return Contributions(weight_sum, n_pixels.to(torch.int64), map_sum, distance_sum)
 
     def sensitivities(self) -> Tensor:
-        """As `pop_fast.stages.contributions.sensitivities`."""
         with translate_oom():
             return self._view.sensitivities()
 
@@ -235,7 +204,6 @@ class CudaView:
         return blocks.to(moments.device)
 
     def dominant_points(self) -> DominantPoints:
-        """As `pop_fast.stages.chord.dominant_points`."""
         pass_input = self._input
         c = pass_input.camera
         rays = intrinsics(c.K, c.width, c.height, pass_input.profile)

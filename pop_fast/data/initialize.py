@@ -9,7 +9,7 @@ import torch
 
 from pop_fast.data.capture import Capture
 from pop_fast.errors import CaptureError
-from pop_fast.stages.neighbours import mean_squared_distances
+from pop_fast.stages.density import mean_squared_distances
 
 __all__ = ["SH_C0", "initialize_params"]
 

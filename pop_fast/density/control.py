@@ -118,8 +118,8 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         return prior or self.collects_blur(step) or self.collects_window(step)
 
     def needs_passes(self, step: int) -> bool:
-        """Tell whether the change after this step looks at the training views."""
-        return False
+        """Tell whether the change after this step looks at the training views: where Adam begins anew, most do."""
+        return step in self.adam_restarts
 
     def regularizes(self, step: int) -> bool:
         """Tell whether `regularizer` adds a prior on opacities at this step."""
@@ -140,20 +140,19 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
 
     def changes_after(self, step: int) -> bool:
         """Tell whether the Gaussians are edited after this step."""
-        return self.is_refine_step(step) or self.is_reset_step(step) or step == self.final_prune_iter
+        due = self.is_refine_step(step) or self.is_reset_step(step) or self.needs_passes(step)
+        return due or step == self.final_prune_iter
 
     def regularizer(self, opacities: Tensor, state: State, step: int, info: Info) -> Tensor | None:
         """Return `lambda_pop L_pop` of this view, with `lambda_entropy` times the entropy, or None when both are off.
 
         Args:
             opacities: activated opacities, in the graph. [N]
-            state: the strategy's state.
-            step: counts from 0.
             info: what `rasterization()` returned last; its `dominant_counts` decide which Gaussians are important.
         """
         if not self.regularizes(step):
             return None
-        from pop_fast.stages.polarization import opacity_entropy
+        from pop_fast.stages.regularizers import opacity_entropy
 
         if isinstance(info, MutableMapping):
             info[_REGULARIZED] = True
@@ -163,7 +162,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         return sum(terms[1:], terms[0])
 
     def _prior(self, opacities: Tensor, state: State, info: Info) -> Tensor:
-        from pop_fast.stages.polarization import importance_mask, pop_loss
+        from pop_fast.stages.regularizers import importance_mask, pop_loss
 
         mask = importance_mask(dominant_counts(info).sum(0))
         if self.pop_views == "window" and state["dominant_sum"] is not None:
@@ -219,8 +218,6 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
 
         Args:
             params: raw parameters, after the optimizers' step.
-            state: the strategy's state.
-            step: counts from 0.
             info: what `rasterization()` returned last, after the backward pass.
             packed: whether its rows are those of visible Gaussians alone.
         """
@@ -289,12 +286,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         """Do what is due after a step whose statistics are collected.
 
         Args:
-            params: raw parameters, replaced under their keys.
-            optimizers: one per key.
-            state: the strategy's state.
-            step: counts from 0.
             draws: random numbers; None takes them from the state's generator.
-            passes: over the training views, which some methods look at.
             sh_degree: colour bands that those are drawn with.
 
         Returns:
@@ -326,7 +318,6 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         """Clone, split, prune, and start a new window.
 
         Args:
-            context: the Gaussians, and what a step may ask for.
             clones: which Gaussians are cloned. [N] bool
             splits: which are split. [N] bool
             prunes: given the grown set of Gaussians, tells which are pruned. -> bool

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from pop_fast.api.registry import require_backend
+from pop_fast.api.backend import require_backend
 from pop_fast.errors import PopError
 from pop_fast.stages.compositing import dominant_counts
 from pop_fast.stages.contributions import Contributions
@@ -29,19 +29,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ViewContributions(Contributions):
-    """What every Gaussian contributes to a view, and the view.
+    """What every Gaussian contributes to a view, and the view."""
 
-    Attributes:
-        dominant_counts: pixels that it dominates, of those that the view's mask keeps. [N] int64
-        image: not clamped. [H, W, 3]
-        radii: extents, px; 0 where culled. [N, 2] int32
-        depths: camera z, world units. [N]
-    """
-
-    dominant_counts: Tensor
-    image: Tensor
-    radii: Tensor
-    depths: Tensor
+    dominant_counts: Tensor  # pixels that it dominates, of those that the view's mask keeps. [N] int64
+    image: Tensor  # not clamped. [H, W, 3]
+    radii: Tensor  # extents, px; 0 where culled. [N, 2] int32
+    depths: Tensor  # camera z, world units. [N]
 
     @property
     def visible(self) -> Tensor:
@@ -54,10 +47,6 @@ class Passes:
 
     Args:
         backend: which trains, or its name: "fast", "compiled", "cuda" or "ref".
-        views: to pass over.
-        profile: the rasterizer's constants.
-        background: colour behind everything.
-        antialiased: render with opacity compensation.
         device: where the parameters lie; the CPU by default.
 
     Raises:
@@ -107,14 +96,7 @@ class Passes:
         sh_degree: int,
         pixel_map: Tensor | Callable[[Tensor], Tensor] | None = None,
     ) -> ViewContributions:
-        """Draw a view and sum what every Gaussian contributes to it.
-
-        Args:
-            params: raw parameters.
-            index: of the view.
-            sh_degree: bands to use.
-            pixel_map: what `map_sum` adds up, or a function that makes it of the image. [H, W]
-        """
+        """Sum what every Gaussian contributes to a view, and a map [H, W] or what a function makes of the image."""
         view = self._open(self._shot(params, index, sh_degree))
         seen = view.seen()
         if callable(pixel_map):
@@ -140,9 +122,6 @@ class Passes:
         """Return PUP-3DGS's Fisher block of every Gaussian in a view by (mean, log-scale). [N, 6, 6] float64
 
         Args:
-            params: raw parameters.
-            index: of the view.
-            sh_degree: bands to use.
             divisor: of the view's width and height, rounded up; the field of view stays.
 
         Raises:

@@ -10,12 +10,13 @@ optimizer per key. Every step it calls, in this order,
 
 `info` is the dict that `rasterization()` returns last. `step` counts from 0. A strategy is a dataclass of settings;
 everything that changes lives in `state`. What a step did to the Gaussians is returned, as a `DensificationStep`;
-gsplat's own strategies return nothing.
+gsplat's own strategies return nothing. `ForeignStrategy` lets a training run ask a strategy of other people as its own.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, runtime_checkable
 
@@ -36,15 +37,11 @@ Info: TypeAlias = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Draws:
-    """Where a change of the Gaussians takes its random numbers from.
+    """Where a change of the Gaussians takes its random numbers from."""
 
-    Attributes:
-        normals: given n, standard normal draws for the children of n split parents, on the CPU. -> [2, n, 3]
-        uniforms: given n, draws from [0, 1), on the CPU. -> [n] float64
-    """
-
+    # given n, standard normal draws for the children of n split parents, on the CPU. -> [2, n, 3]
     normals: Callable[[int], Tensor]
-    uniforms: Callable[[int], Tensor]
+    uniforms: Callable[[int], Tensor]  # given n, draws from [0, 1), on the CPU. -> [n] float64
 
     @classmethod
     def of(cls, generator: torch.Generator) -> Draws:
@@ -59,36 +56,22 @@ class Draws:
 
 @dataclass(frozen=True)
 class DensificationContext:
-    """The Gaussians at a step after which they may change, and what a change may ask for.
+    """The Gaussians at a step after which they may change, and what a change may ask for."""
 
-    Attributes:
-        params: raw parameters, replaced under their keys.
-        optimizers: one per key.
-        state: the strategy's.
-        step: just taken, from 0.
-        draws: random numbers.
-        passes: over the training views; None in a trainer that has none.
-        sh_degree: colour bands that are drawn.
-    """
-
-    params: Params
-    optimizers: Optimizers
-    state: State
-    step: int
-    draws: Draws
-    passes: Passes | None = None
-    sh_degree: int = MAX_SH_DEGREE
+    params: Params  # raw parameters, replaced under their keys
+    optimizers: Optimizers  # one per key
+    state: State  # the strategy's
+    step: int  # just taken, from 0
+    draws: Draws  # random numbers
+    passes: Passes | None = None  # over the training views; None in a trainer that has none
+    sh_degree: int = MAX_SH_DEGREE  # colour bands that are drawn
 
     def __len__(self) -> int:
         return len(self.params["means"])
 
     @property
     def views(self) -> Passes:
-        """Return the passes over the training views.
-
-        Raises:
-            ValueError: the trainer has none.
-        """
+        """Return the passes over the training views; ValueError where the trainer has none."""
         if self.passes is None:
             raise ValueError("this strategy looks at the training views when it changes the Gaussians; give it passes")
         return self.passes
@@ -96,21 +79,13 @@ class DensificationContext:
 
 @dataclass(frozen=True)
 class DensificationStep:
-    """What density control did to the Gaussians after a step.
+    """What density control did to the Gaussians after a step."""
 
-    Attributes:
-        cloned: Gaussians that were copied.
-        split: Gaussians that two smaller ones replaced.
-        pruned: Gaussians that were removed.
-        reset: whether all opacities were lowered.
-        replaced: Gaussians that took the place of all there were.
-    """
-
-    cloned: int = 0
-    split: int = 0
-    pruned: int = 0
-    reset: bool = False
-    replaced: int = 0
+    cloned: int = 0  # Gaussians that were copied
+    split: int = 0  # Gaussians that two smaller ones replaced
+    pruned: int = 0  # Gaussians that were removed
+    reset: bool = False  # whether all opacities were lowered
+    replaced: int = 0  # Gaussians that took the place of all there were
 
     def record(self) -> dict[str, Any]:
         """Return what a record of metrics.jsonl says about it; what is rare is mentioned only where it happened."""
@@ -188,3 +163,89 @@ def dominant_counts(info: Info) -> Tensor:
             "that is, has the largest blending weight at"
         )
     return counts
+
+
+class ForeignStrategy:
+    """A strategy that collects and changes in one call, `step_post_backward`, as gsplat's do.
+
+    Where it draws random numbers with torch's global generator, they come from one in `state` that is saved with it, so
+    that a run that is resumed continues to the same bits. When it changes the Gaussians is not known beforehand; a
+    `DensificationStep` that it returns goes into the records.
+
+    Args:
+        strategy: follows `pop_fast.density.protocol.Strategy`. A method `regularizer` or `needs_dominance`, where it
+            has one, is called as those of `DensityControl` are.
+    """
+
+    def __init__(self, strategy: Strategy) -> None:
+        self.strategy = strategy
+        self.absgrad = bool(getattr(strategy, "absgrad", False))
+        self._info: Info | None = None
+        self._lends = True
+
+    @property
+    def name(self) -> str:
+        return type(self.strategy).__name__
+
+    def check_sanity(self, params: Params, optimizers: Optimizers) -> None:
+        self.strategy.check_sanity(params, optimizers)
+
+    def initialize_state(self, scene_scale: float = 1.0, seed: int = 0, count: int = 0) -> State:
+        """Return the strategy's own state and, unless it has one, a generator for its random numbers."""
+        import torch
+
+        own = self.strategy.initialize_state(scene_scale=scene_scale)
+        self._lends = "generator" not in own
+        return {**own, "generator": torch.Generator().manual_seed(seed)} if self._lends else own
+
+    def needs_dominance(self, step: int) -> bool:
+        asked: Callable[[int], bool] | None = getattr(self.strategy, "needs_dominance", None)
+        return asked is not None and asked(step)
+
+    def changes_after(self, step: int) -> bool:
+        return True
+
+    def needs_passes(self, step: int) -> bool:
+        """Tell whether the change after this step looks at the training views: gsplat's protocol has none."""
+        return False
+
+    def regularizer(self, opacities: Tensor, state: State, step: int, info: Info) -> Tensor | None:
+        """Return the term that it adds to the loss, or None."""
+        term: Callable[..., Tensor | None] | None = getattr(self.strategy, "regularizer", None)
+        return None if term is None else term(opacities, state, step, info)
+
+    def step_pre_backward(self, params: Params, optimizers: Optimizers, state: State, step: int, info: Info) -> None:
+        self.strategy.step_pre_backward(params, optimizers, state, step, info)
+
+    def collect(self, params: Params, state: State, step: int, info: Info, packed: bool = False) -> None:
+        """Keep what the step's render returned for `change`, in which the strategy itself collects."""
+        self._info = info
+
+    def change(
+        self,
+        params: Params,
+        optimizers: Optimizers,
+        state: State,
+        step: int,
+        draws: Draws | None = None,
+        passes: Any = None,
+        sh_degree: int = MAX_SH_DEGREE,
+    ) -> DensificationStep | None:
+        """Call `step_post_backward`."""
+        info, self._info = self._info, None
+        if info is None:
+            raise ValueError("change needs the info of the step before it; call collect first")
+        with _drawing_from(state["generator"]) if self._lends else nullcontext():
+            found: Any = self.strategy.step_post_backward(params, optimizers, state, step, info)
+        return found if isinstance(found, DensificationStep) else None
+
+
+@contextmanager
+def _drawing_from(generator: torch.Generator) -> Iterator[None]:
+    """Let torch's global generator on the CPU be this one for a while."""
+    import torch
+
+    with torch.random.fork_rng(devices=[]):
+        torch.set_rng_state(generator.get_state())
+        yield
+        generator.set_state(torch.get_rng_state())

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.density.protocol import DensificationContext, Optimizers, Params, State
-from pop_fast.stages.density import Statistics, split_children
-from pop_fast.stages.selection import lowest_share
+from pop_fast.stages.density import Statistics, lowest_share, split_children
 from pop_ref.settings import SPLIT_CHILDREN
 
 
@@ -84,10 +83,6 @@ def split(
     then all first children, then all second children.
 
     Args:
-        params: raw parameters.
-        optimizers: one per key.
-        state: the strategy's state.
-        mask: the Gaussians to split. [N] bool
         normals: standard normal draws for the first and the second child of each, of any precision. [2, M, 3]
         revised_opacity: give the children `1 - sqrt(1 - o)`, so that two coincident ones equal the parent.
 
@@ -117,14 +112,7 @@ def reset_opacities(params: Params, optimizers: Optimizers, ceiling: float) -> N
 
 @torch.no_grad()
 def replace_rows(params: Params, optimizers: Optimizers, state: State, rows: Mapping[str, Tensor]) -> None:
-    """Let new Gaussians take the place of all there are, with Adam anew; per-Gaussian statistics are left with no rows.
-
-    Args:
-        params: raw parameters.
-        optimizers: one per key.
-        state: the strategy's state.
-        rows: every parameter of the new Gaussians.
-    """
+    """Let new Gaussians take the place of all there are, with Adam anew; statistics are left with no rows."""
     none = torch.zeros(len(params["means"]), dtype=torch.bool, device=params["means"].device)
     edit_rows(params, optimizers, state, keep=none, appended=rows)
     restart(params, optimizers)
@@ -148,12 +136,7 @@ def prune_marked(context: DensificationContext, mask: Tensor) -> int:
 
 
 def summed_over_views(context: DensificationContext, score: Callable[[int], Tensor]) -> Tensor:
-    """Add up what a score gives for every training view, in float64.
-
-    Args:
-        context: the Gaussians, and what a step may ask for.
-        score: of a view by its index, any shape.
-    """
+    """Add up what a score gives for every training view, in float64."""
     total = score(0).to(torch.float64)
     for index in range(1, context.views.n_views):
         total += score(index)
@@ -168,13 +151,8 @@ def prune_lowest(context: DensificationContext, scores: Tensor, share: float) ->
 def window(state: State) -> Statistics:
     """Return what the window has collected."""
     blurred, none = state.get("blurred"), torch.zeros_like(state["count"], dtype=torch.bool)
-    return Statistics(
-        grad_sum=state["grad2d"],
-        n_visible=state["count"],
-        n_views=state["views"],
-        dominant_sum=none,
-        blurred=none if blurred is None else blurred,
-    )
+    flags = none if blurred is None else blurred
+    return Statistics(state["grad2d"], state["count"], state["views"], dominant_sum=none, blurred=flags)
 
 
 def clear(state: State) -> None:

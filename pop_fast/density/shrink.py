@@ -11,7 +11,7 @@ from torch import Tensor
 from pop_fast.density.passes import Passes
 from pop_fast.errors import PopError
 from pop_fast.stages.covariance import opacities_from_logits
-from pop_fast.stages.selection import least_mass
+from pop_fast.stages.density import least_mass
 
 Score = Literal["contributions", "dominance", "sensitivity", "visibility"]
 # encodings that a search for a size makes, at most
@@ -21,11 +21,7 @@ _CLOSE: Final = 0.98
 
 
 def opaque_enough(params: Mapping[str, Tensor], min_opacity: float) -> Tensor:
-    """Tell which Gaussians have an opacity of at least `min_opacity`. [N] bool
-
-    Raises:
-        PopError: `min_opacity` lies outside [0, 1].
-    """
+    """Tell which Gaussians have an opacity of at least `min_opacity`; PopError outside [0, 1]. [N] bool"""
     if not 0.0 <= min_opacity <= 1.0:
         raise PopError(f"--min-opacity {min_opacity:g} must be in [0, 1]")
     return opacities_from_logits(params["opacities"]) >= min_opacity
@@ -61,9 +57,6 @@ def view_scores(score: Score, passes: Passes, params: Mapping[str, Tensor], sh_d
     Args:
         score: "contributions" adds the blending weights over all pixels, "dominance" counts the pixels where it has the
             largest, "sensitivity" is Speedy-Splat's; "visibility" needs no view.
-        passes: over the views.
-        params: raw parameters.
-        sh_degree: bands to use.
 
     Returns:
         Not negative. [N] float64
@@ -108,7 +101,6 @@ def best_within(scores: Tensor, most: int, size_of: Callable[[Tensor], int]) -> 
 
     Args:
         scores: [N]
-        most: bytes.
         size_of: the bytes of a file with the Gaussians that are marked. [N] bool -> int
 
     Raises:

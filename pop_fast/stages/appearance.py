@@ -28,10 +28,7 @@ def expose(image: Tensor, exposure: Tensor) -> Tensor:
 
 
 def centred_exposures(exposures: Tensor) -> Tensor:
-    """See `pop_ref.appearance.centred_exposures`.
-
-    Optimizations: none.
-    """
+    """See `pop_ref.appearance.centred_exposures`."""
     return exposures - (exposures.mean(0) - torch.eye(3, 4, dtype=exposures.dtype))
 
 
@@ -49,20 +46,14 @@ def color_correct(image: Tensor, target: Tensor) -> Tensor:
 
 
 def background_at(step: int, seed: int) -> Tensor:
-    """See `pop_ref.appearance.background_at`. float64 [3]
-
-    Optimizations: none.
-    """
+    """See `pop_ref.appearance.background_at`. float64 [3]"""
     start = _mixed(seed)
     words = [_mixed((start + (3 * step + channel + 1) * _GOLDEN) & _WORD) for channel in range(3)]
     return torch.tensor([(word >> 11) * 2.0**-53 for word in words], dtype=torch.float64)
 
 
 def over_background(photo: Tensor, alpha: Tensor, was: Tensor, now: Tensor) -> Tensor:
-    """See `pop_ref.appearance.over_background`.
-
-    Optimizations: none.
-    """
+    """See `pop_ref.appearance.over_background`."""
     return photo + (1.0 - alpha)[:, :, None] * (now - was)
 
 
@@ -77,14 +68,14 @@ _SMALL = 1e-2
 
 
 def rotmat_from_vector(vector: Tensor) -> Tensor:
-    """See `pop_ref.refinement.rotmat_from_vector`. Optimizations: none."""
+    """See `pop_ref.refinement.rotmat_from_vector`."""
     a, b, _, _ = _coefficients(float(vector.double() @ vector.double()))
     K = _cross(vector)
     return torch.eye(3, dtype=vector.dtype) + a * K + b * (K @ K)
 
 
 def rotmat_from_vector_vjp(vector: Tensor, v_rotmat: Tensor) -> Tensor:
-    """See `pop_ref.refinement.rotmat_from_vector_vjp`. Optimizations: none."""
+    """See `pop_ref.refinement.rotmat_from_vector_vjp`."""
     a, b, a_slope, b_slope = _coefficients(float(vector.double() @ vector.double()))
     K = _cross(vector)
     v_K = a * v_rotmat + b * (v_rotmat @ K.T + K.T @ v_rotmat)
@@ -94,15 +85,12 @@ def rotmat_from_vector_vjp(vector: Tensor, v_rotmat: Tensor) -> Tensor:
 
 
 def refined_viewmat(viewmat: Tensor, correction: Tensor) -> Tensor:
-    """See `pop_ref.refinement.refined_viewmat`; differentiable in both.
-
-    Optimizations: none.
-    """
+    """See `pop_ref.refinement.refined_viewmat`; differentiable in both."""
     return _Refined.apply(viewmat, correction)
 
 
 def refined_viewmat_vjp(viewmat: Tensor, correction: Tensor, v_refined: Tensor) -> tuple[Tensor, Tensor]:
-    """See `pop_ref.refinement.refined_viewmat_vjp`. Optimizations: none."""
+    """See `pop_ref.refinement.refined_viewmat_vjp`."""
     v_viewmat = torch.zeros_like(viewmat)
     v_viewmat[:3] = rotmat_from_vector(correction[:3]).T @ v_refined[:3]
     v_motion = v_refined[:3] @ viewmat.T

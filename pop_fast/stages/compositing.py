@@ -1,4 +1,4 @@
-"""Blend splats into an image, differentiably, by `pop_fast.stages.blend.blend`, and count what each dominates (D8).
+"""Blend splats into an image, differentiably, by `pop_fast.stages.blend`, and count what each dominates (D8).
 
 Meaning: `pop_ref.compositing`, `pop_ref.dominance`.
 """
@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pop_fast.stages.blend.blend import Blender, GroupBlend
-from pop_fast.stages.blend.tile_groups import (
+from pop_fast.stages.blend import Blender, GroupBlend
+from pop_fast.stages.tile_groups import (
     BLOCK,
     Entries,
     PackedLists,
@@ -28,25 +28,16 @@ from pop_ref.constants import PAPER, Profile
 
 @dataclass(frozen=True)
 class Composite:
-    """A blended view, over black.
+    """A blended view, over black."""
 
-    Attributes:
-        image: weighted colours. [H, W, D]
-        alphas: sum of weights, 1 - T_final. [H, W]
-        dominant_ids: -1 where none was blended. [H, W] int64, or None when not asked for
-        dominant_weights: [H, W], or None when not asked for
-        n_blended: [H, W] int32, or None when not asked for
-        n_traversed: list entries visited, the terminating one included. [H, W] int32, or None when not asked for
-        n_pairs: (entry, pixel) pairs evaluated, None where nobody counts them.
-    """
-
-    image: Tensor
-    alphas: Tensor
-    dominant_ids: Tensor | None
-    dominant_weights: Tensor | None
-    n_blended: Tensor | None
+    image: Tensor  # weighted colours. [H, W, D]
+    alphas: Tensor  # sum of weights, 1 - T_final. [H, W]
+    dominant_ids: Tensor | None  # -1 where none was blended. [H, W] int64, or None when not asked for
+    dominant_weights: Tensor | None  # [H, W], or None when not asked for
+    n_blended: Tensor | None  # [H, W] int32, or None when not asked for
+    # list entries visited, the terminating one included. [H, W] int32, or None when not asked for
     n_traversed: Tensor | None
-    n_pairs: int | None
+    n_pairs: int | None  # (entry, pixel) pairs evaluated, None where nobody counts them
 
 
 def composite(
@@ -66,25 +57,14 @@ def composite(
 ) -> Composite:
     """Blend every tile's list front to back, over black. See `pop_ref.compositing.composite`.
 
-    Optimizations: see `pop_fast.stages.blend.blend`; what is kept for the transpose is the light of every pixel
+    Optimizations: see `pop_fast.stages.blend`; what is kept for the transpose is the light of every pixel
     before every eighth entry.
 
     Args:
-        means2d: screen centres, px. [N, 2]
-        conics: inverse screen covariances, px^-2. [N, 3]
-        opacities: [N]
-        colors: any number of channels. [N, D]
-        lists: what each tile blends.
-        width: px.
-        height: px.
-        profile: constants and strictness.
         dominance: also find dominant ids.
         counts: also count blended and traversed entries.
         absgrad_sink: [N, 2], to which the transpose adds the sum over pixels of |dL/dmeans2d|.
         function: what blends, from the four tensors and `BlendOptions`; None takes torch's.
-
-    Returns:
-        The blended view; `image` and `alphas` are differentiable.
     """
     inputs = (means2d, conics, opacities, colors)
     keep = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)

@@ -11,17 +11,17 @@ from pop_fast.stages.types import columns, from_columns, sum_of_products
 
 
 def scales_from_log_scales(log_scales: Tensor) -> Tensor:
-    """See `pop_ref.activations.scales_from_log_scales`. Optimizations: none."""
+    """See `pop_ref.activations.scales_from_log_scales`."""
     return torch.exp(log_scales)
 
 
 def scales_from_log_scales_vjp(log_scales: Tensor, v_scales: Tensor) -> Tensor:
-    """See `pop_ref.activations.scales_from_log_scales_vjp`. Optimizations: none."""
+    """See `pop_ref.activations.scales_from_log_scales_vjp`."""
     return torch.exp(log_scales) * v_scales
 
 
 def opacities_from_logits(logit_opacities: Tensor) -> Tensor:
-    """See `pop_ref.activations.opacities_from_logits`. Optimizations: none.
+    """See `pop_ref.activations.opacities_from_logits`.
 
     Differentiable; its slope is that of `opacities_from_logits_vjp`, where torch's own sigmoid has none in float32 from
     logits of 17 on, so that an opacity which came there could not leave again.
@@ -30,7 +30,7 @@ def opacities_from_logits(logit_opacities: Tensor) -> Tensor:
 
 
 def opacities_from_logits_vjp(logit_opacities: Tensor, v_opacities: Tensor) -> Tensor:
-    """See `pop_ref.activations.opacities_from_logits_vjp`. Optimizations: none."""
+    """See `pop_ref.activations.opacities_from_logits_vjp`."""
     # 1 - o is the opacity of the negated logit: no cancellation where o is near 1
     return torch.sigmoid(logit_opacities) * torch.sigmoid(-logit_opacities) * v_opacities
 
@@ -48,30 +48,24 @@ class _Opacities(torch.autograd.Function):
 
 
 def unit_quats_from_quats(quats: Tensor) -> Tensor:
-    """See `pop_ref.activations.unit_quats_from_quats`. Optimizations: none."""
+    """See `pop_ref.activations.unit_quats_from_quats`."""
     return quats / quats.norm(dim=-1, keepdim=True)
 
 
 def unit_quats_from_quats_vjp(quats: Tensor, v_unit_quats: Tensor) -> Tensor:
-    """See `pop_ref.activations.unit_quats_from_quats_vjp`. Optimizations: none."""
+    """See `pop_ref.activations.unit_quats_from_quats_vjp`."""
     norms = quats.norm(dim=-1, keepdim=True)
     unit = quats / norms
     return (v_unit_quats - unit * (unit * v_unit_quats).sum(-1, keepdim=True)) / norms
 
 
 def rotmats_from_quats(quats: Tensor) -> Tensor:
-    """See `pop_ref.covariance.rotmats_from_quats`.
-
-    Optimizations: nine component rows instead of N small matrices.
-    """
+    """See `pop_ref.covariance.rotmats_from_quats`. Optimizations: nine component rows instead of N small matrices."""
     return from_columns(_rotation_entries(*_unit_columns(quats)[0]), (3, 3))
 
 
 def rotmats_from_quats_vjp(quats: Tensor, v_rotmats: Tensor) -> Tensor:
-    """See `pop_ref.covariance.rotmats_from_quats_vjp`.
-
-    Optimizations: component rows.
-    """
+    """See `pop_ref.covariance.rotmats_from_quats_vjp`. Optimizations: component rows."""
     return _quats_vjp(*_unit_columns(quats), columns(v_rotmats))
 
 
@@ -87,10 +81,7 @@ def covars_from_quats_scales(quats: Tensor, scales: Tensor) -> Tensor:
 
 
 def covars_from_quats_scales_vjp(quats: Tensor, scales: Tensor, v_covars: Tensor) -> tuple[Tensor, Tensor]:
-    """See `pop_ref.covariance.covars_from_quats_scales_vjp`.
-
-    Optimizations: component rows.
-    """
+    """See `pop_ref.covariance.covars_from_quats_scales_vjp`. Optimizations: component rows."""
     unit, norms = _unit_columns(quats)
     r = _rotation_entries(*unit)
     m = _scaled_rotation(r, scales)

@@ -30,10 +30,7 @@ def sh_basis(dirs: Tensor, degree: int) -> Tensor:
 
 
 def sh_basis_vjp(dirs: Tensor, degree: int, v_basis: Tensor) -> Tensor:
-    """See `pop_ref.harmonics.sh_basis_vjp`.
-
-    Optimizations: component rows; only the active bands are touched.
-    """
+    """See `pop_ref.harmonics.sh_basis_vjp`. Optimizations: component rows; only the active bands are touched."""
     x, y, z = columns(dirs)
     v = columns(v_basis)
     _n_sh(degree)
@@ -85,23 +82,14 @@ def lower_degree(sh: Tensor, dirs: Tensor, weights: Tensor, degree: int, uniform
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Harmonics evaluated, with what the transpose needs, all component-major.
+    """Harmonics evaluated, with what the transpose needs, all component-major."""
 
-    Attributes:
-        degree: active bands.
-        rows: active coefficients. [n_sh, 3, N]
-        basis: [n_sh, N]
-        unit: unit directions. [3, N]
-        norms: of the directions given. [N]
-        unclamped: colours before the clamp at 0. [3, N]
-    """
-
-    degree: int
-    rows: Tensor
-    basis: Tensor
-    unit: Tensor
-    norms: Tensor
-    unclamped: Tensor
+    degree: int  # active bands
+    rows: Tensor  # active coefficients. [n_sh, 3, N]
+    basis: Tensor  # [n_sh, N]
+    unit: Tensor  # unit directions. [3, N]
+    norms: Tensor  # of the directions given. [N]
+    unclamped: Tensor  # colours before the clamp at 0. [3, N]
 
 
 def evaluate_sh(sh: Tensor, dirs: Tensor, degree: int) -> Evaluation:

@@ -16,7 +16,7 @@ from pop_ref.constants import PAPER, Profile
 
 
 def camera_center(viewmat: Tensor) -> Tensor:
-    """See `pop_ref.camera.camera_center`. Optimizations: none."""
+    """See `pop_ref.camera.camera_center`."""
     return -viewmat[:3, :3].T @ viewmat[:3, 3]
 
 
@@ -26,7 +26,7 @@ def view_dirs(means: Tensor, viewmat: Tensor) -> Tensor:
 
 
 def view_dirs_vjp(means: Tensor, viewmat: Tensor, v_dirs: Tensor) -> tuple[Tensor, Tensor]:
-    """See `pop_ref.camera.view_dirs_vjp`. Optimizations: none."""
+    """See `pop_ref.camera.view_dirs_vjp`."""
     v_center = -v_dirs.sum(0)
     v_viewmat = torch.zeros_like(viewmat)
     v_viewmat[:3, :3] = -torch.outer(viewmat[:3, 3], v_center)
@@ -75,7 +75,7 @@ def covars_cam_from_covars_vjp(
 
 
 def in_front(depths: Tensor, profile: Profile = PAPER) -> Tensor:
-    """See `pop_ref.camera.in_front` (D1). Optimizations: none."""
+    """See `pop_ref.camera.in_front` (D1)."""
     near = depths > profile.near_plane if profile.near_inclusive else depths >= profile.near_plane
     return near & (depths <= profile.far_plane)
 
@@ -209,7 +209,7 @@ def low_pass(covars2d: Tensor, eps2d: float) -> Tensor:
 
 
 def low_pass_vjp(covars2d: Tensor, eps2d: float, v_blurred: Tensor) -> Tensor:
-    """See `pop_ref.footprint.low_pass_vjp`. Optimizations: none."""
+    """See `pop_ref.footprint.low_pass_vjp`."""
     return v_blurred
 
 
@@ -256,10 +256,7 @@ def conics_from_covars2d_vjp(covars2d: Tensor, v_conics: Tensor) -> Tensor:
 
 
 def radii_from_covars2d(covars2d: Tensor, opacities: Tensor, profile: Profile = PAPER) -> Tensor:
-    """See `pop_ref.footprint.radii_from_covars2d` (D2).
-
-    Optimizations: component rows, no branches; int32.
-    """
+    """See `pop_ref.footprint.radii_from_covars2d` (D2). Optimizations: component rows, no branches; int32."""
     xx, xy, _, yy = columns(covars2d)
     det = xx * yy - xy * xy
     if profile.extent == "square":

@@ -7,7 +7,7 @@ recorded for the hundred elementwise operations in between.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -43,33 +43,26 @@ from pop_ref.constants import PAPER, Profile
 
 @dataclass(frozen=True)
 class Splats:
-    """Gaussians as one camera sees them, one row each; see `pop_ref.records.Splats`.
+    """Gaussians as one camera sees them, one row each; see `pop_ref.records.Splats`."""
 
-    Attributes:
-        means2d: screen centres, px. [N, 2]
-        depths: camera z, world units. [N]
-        conics: inverse screen covariances (xx, xy, yy), px^-2. [N, 3]
-        opacities: what blends, after the antialiasing factor if any. [N]
-        radii: extents in px; both 0 where culled. [N, 2] int32
-        compensations: the antialiasing factor, None in classic mode. [N]
-        colors: any number of channels, where what takes the splats reads them. [N, D]
-    """
+    means2d: Tensor  # screen centres, px. [N, 2]
+    depths: Tensor  # camera z, world units. [N]
+    conics: Tensor  # inverse screen covariances (xx, xy, yy), px^-2. [N, 3]
+    opacities: Tensor  # what blends, after the antialiasing factor if any. [N]
+    radii: Tensor  # extents in px; both 0 where culled. [N, 2] int32
+    compensations: Tensor | None = None  # the antialiasing factor, None in classic mode. [N]
+    colors: Tensor | None = None  # any number of channels, where what takes the splats reads them. [N, D]
 
-    means2d: Tensor
-    depths: Tensor
-    conics: Tensor
-    opacities: Tensor
-    radii: Tensor
-    compensations: Tensor | None = None
-    colors: Tensor | None = None
+
+class Shapes(NamedTuple):
+    """Rotations [N, 4] and sizes [N, 3] as they are, for backends that make covariances where they project."""
+
+    quats: Tensor
+    scales: Tensor
 
 
 def colors_of(splats: Splats) -> Tensor:
-    """Return the colours of splats that have some. [N, D]
-
-    Raises:
-        ValueError: they have none.
-    """
+    """Return the colours of splats; ValueError where they have none. [N, D]"""
     if splats.colors is None:
         raise ValueError("the splats have no colours")
     return splats.colors
@@ -77,23 +70,14 @@ def colors_of(splats: Splats) -> Tensor:
 
 @dataclass(frozen=True)
 class ProjectionSettings:
-    """What a projection needs of a camera.
+    """What a projection needs of a camera."""
 
-    Attributes:
-        K: intrinsics, px. [3, 3]
-        width: px.
-        height: px.
-        profile: near and far plane, clamp, low-pass, extents.
-        antialiased: scale opacities by the antialiasing factor.
-        radius_clip: px; splats whose two extents are both at most this are culled.
-    """
-
-    K: Tensor
-    width: int
-    height: int
-    profile: Profile = PAPER
-    antialiased: bool = False
-    radius_clip: float = 0.0
+    K: Tensor  # intrinsics, px. [3, 3]
+    width: int  # px
+    height: int  # px
+    profile: Profile = PAPER  # near and far plane, clamp, low-pass, extents
+    antialiased: bool = False  # scale opacities by the antialiasing factor
+    radius_clip: float = 0.0  # px; splats whose two extents are both at most this are culled
 
 
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:
@@ -102,17 +86,11 @@ def covariances(quats: Tensor, scales: Tensor) -> Tensor:
 
 
 def project(means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, view: ProjectionSettings) -> Splats:
-    """Project Gaussians; see `pop_ref.splatting.project`.
+    """Project Gaussians; see `pop_ref.splatting.project`. Everything but `radii` is differentiable.
 
     Args:
-        means: centres, world units. [N, 3]
         covars: covariances, world units^2. [N, 3, 3]
-        opacities: in [0, 1]. [N]
-        viewmat: world -> camera. [4, 4]
         view: the rest of the camera.
-
-    Returns:
-        The splats; everything but `radii` is differentiable.
     """
     means2d, depths, conics, effective_opacities, radii, factors = _Projection.apply(
         means, covars, opacities, viewmat, view

@@ -9,14 +9,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from pop_fast.stages.chord import DominantPoints, dominant_points
 from pop_fast.stages.compositing import Composite, composite
-from pop_fast.stages.contributions import Contributions, contributions, fisher_blocks, screen_moments, sensitivities
+from pop_fast.stages.contributions import (
+    Contributions,
+    DominantPoints,
+    contributions,
+    dominant_points,
+    fisher_blocks,
+    screen_moments,
+    sensitivities,
+)
 from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of, colors_of_view, covariances, project
 from pop_fast.stages.tiles import TileLists, tile_lists
 from pop_fast.stages.types import Camera, Gaussians
@@ -25,64 +32,24 @@ from pop_ref.constants import Profile
 
 @dataclass(frozen=True)
 class Seen:
-    """A view before its sums.
+    """A view before its sums."""
 
-    Attributes:
-        image: [H, W, 3]
-        dominant_ids: -1 where none. [H, W]
-        radii: [N, 2]
-        depths: [N]
-    """
-
-    image: Tensor
-    dominant_ids: Tensor
-    radii: Tensor
-    depths: Tensor
+    image: Tensor  # [H, W, 3]
+    dominant_ids: Tensor  # -1 where none. [H, W]
+    radii: Tensor  # [N, 2]
+    depths: Tensor  # [N]
 
 
 @dataclass(frozen=True)
 class PassInput:
-    """What a pass draws: Gaussians, a camera, the bands of their colours in use, and how.
+    """What a pass draws: Gaussians, a camera, the bands of their colours in use, and how."""
 
-    Attributes:
-        gaussians: activated.
-        camera: the view.
-        sh_degree: bands to use.
-        background: colour behind everything. [3]
-        profile: constants and strictness.
-        antialiased: scale opacities by the antialiasing factor.
-    """
-
-    gaussians: Gaussians
-    camera: Camera
-    sh_degree: int
-    background: Tensor
-    profile: Profile
-    antialiased: bool
-
-
-class ViewPass(Protocol):
-    """A shot that has been projected and listed."""
-
-    def seen(self) -> Seen:
-        """Draw it."""
-        ...
-
-    def contributions(self, pixel_map: Tensor | None) -> Contributions:
-        """As `pop_fast.stages.contributions.contributions`."""
-        ...
-
-    def sensitivities(self) -> Tensor:
-        """As `pop_fast.stages.contributions.sensitivities`."""
-        ...
-
-    def fisher_blocks(self) -> Tensor:
-        """As `pop_fast.stages.contributions.fisher_blocks`, of its own screen moments."""
-        ...
-
-    def dominant_points(self) -> DominantPoints:
-        """As `pop_fast.stages.chord.dominant_points`."""
-        ...
+    gaussians: Gaussians  # activated
+    camera: Camera  # the view
+    sh_degree: int  # bands to use
+    background: Tensor  # colour behind everything. [3]
+    profile: Profile  # constants and strictness
+    antialiased: bool  # scale opacities by the antialiasing factor
 
 
 SMALL_TILE, LARGE_TILE = 8, 16  # px
@@ -90,11 +57,7 @@ SMALL_TILE_BELOW = 14.0  # px, root mean square extent of the visible splats; se
 
 
 def torchs_tile(radii: Tensor) -> int:
-    """Choose the tile that torch blends the cheapest, px; the image does not depend on it.
-
-    Args:
-        radii: extents of the splats, px, 0 where culled. [N, 2]
-    """
+    """Choose the tile that torch blends the cheapest, px, by extents [N, 2], px; the image does not depend on it."""
     visible = (radii > 0).all(1)
     area = (radii * visible[:, None]).to(torch.float64).prod(1).sum() / visible.sum().clamp_min(1)
     return SMALL_TILE if math.sqrt(float(area)) < SMALL_TILE_BELOW else LARGE_TILE
@@ -110,18 +73,6 @@ class Stages:
     """Functions with the signatures and results of the torch path's, which are the defaults.
 
     It draws views as `pop_fast.api.backend.ViewStages` says.
-
-    Attributes:
-        covariances: as `pop_fast.stages.splatting.covariances`.
-        project: as `pop_fast.stages.splatting.project`.
-        colors_of_view: as `pop_fast.stages.splatting.colors_of_view`.
-        list_tiles: as `pop_fast.stages.tiles.tile_lists`.
-        composite: as `pop_fast.stages.compositing.composite`.
-        blend_tile: given the splats' extents, the tile to blend them in.
-        contributions: as `pop_fast.stages.contributions.contributions`.
-        sensitivities: as `pop_fast.stages.contributions.sensitivities`.
-        screen_moments: as `pop_fast.stages.contributions.screen_moments`.
-        dominant_points: as `pop_fast.stages.chord.dominant_points`.
     """
 
     covariances: Callable[..., Tensor] = covariances
@@ -129,7 +80,7 @@ class Stages:
     colors_of_view: Callable[..., Tensor] = colors_of_view
     list_tiles: Callable[..., TileLists] = tile_lists
     composite: Callable[..., Composite] = composite
-    blend_tile: Callable[[Tensor], int] = torchs_tile
+    blend_tile: Callable[[Tensor], int] = torchs_tile  # given the splats' extents, the tile to blend them in
     contributions: Callable[..., Contributions] = contributions
     sensitivities: Callable[..., Tensor] = sensitivities
     screen_moments: Callable[..., Tensor] = screen_moments
@@ -185,40 +136,24 @@ class Stages:
     def visible_lists(
         self, rows: Splats, settings: ProjectionSettings, tile_size: int | None, exact: bool = True
     ) -> TileLists:
-        """List rows in tiles of that size, None for the cheapest.
-
-        Args:
-            rows: of one view.
-            settings: of the view.
-            tile_size: px, or None.
-            exact: leave out entries that reach no pixel.
-        """
+        """List rows in tiles of that size, None for the cheapest, if `exact` without entries that reach no pixel."""
         shape = {"conics": rows.conics.detach(), "opacities": rows.opacities.detach()} if exact else {}
         size = self.blend_tile(rows.radii) if tile_size is None else tile_size
         place = (rows.means2d.detach(), rows.radii, rows.depths.detach(), settings.width, settings.height)
         return self.list_tiles(*place, size, settings.profile, **shape)
 
     def tile_lists(self, rows: Splats, settings: ProjectionSettings, tile_size: int) -> TileLists:
-        """List every tile's rows by their extents alone."""
         # torch's, whatever blends: what meta shows is the same of all backends on the CPU
         place = (rows.means2d.detach(), rows.radii, rows.depths.detach(), settings.width, settings.height)
         return tile_lists(*place, tile_size, settings.profile)
 
     def counts_entries(self, tile_size: int) -> bool:
-        """Visited entries are counted with tiles of any size."""
         return True
 
 
 @dataclass(frozen=True)
 class StagesView:
-    """A shot that has been projected and listed.
-
-    Attributes:
-        shot: what is drawn.
-        stages: of the backend.
-        splats: with colours.
-        lists: without the entries that reach no pixel.
-    """
+    """A shot that has been projected and listed: splats with colours, and lists without entries that reach no pixel."""
 
     shot: PassInput
     stages: Stages
@@ -226,7 +161,6 @@ class StagesView:
     lists: TileLists
 
     def seen(self) -> Seen:
-        """Draw it."""
         s, camera, background = self.splats, self.shot.camera, self.shot.background
         blend = self.stages.composite(
             *(s.means2d, s.conics, s.opacities, colors_of(s), self.lists, camera.width, camera.height),
@@ -254,7 +188,7 @@ class StagesView:
         return fisher_blocks(shot.gaussians, shot.camera, self._moments(), shot.sh_degree, shot.profile, **chain)
 
     def dominant_points(self) -> DominantPoints:
-        """As `pop_fast.stages.chord.dominant_points`."""
+        """As `pop_fast.stages.contributions.dominant_points`."""
         shot, size = self.shot, self.lists.tile_size
         return self.stages.dominant_points(self.splats, self.lists, shot.gaussians, shot.camera, size, shot.profile)
 

@@ -24,21 +24,13 @@ _RADIX = 1 << 15  # integers from which torch sorts by digits, up to six times f
 
 @dataclass(frozen=True)
 class TileLists:
-    """The lists of all tiles, one after the other.
+    """The lists of all tiles, one after the other."""
 
-    Attributes:
-        ids: row of the splat of every entry; front to back within a tile, tiles in row-major order. [I] int64
-        offsets: where each tile's list begins, and the end of the last one. [tiles_x * tiles_y + 1] int64
-        tile_size: px.
-        tiles_x: tiles in a row.
-        tiles_y: rows of tiles.
-    """
-
-    ids: Tensor
-    offsets: Tensor
-    tile_size: int
-    tiles_x: int
-    tiles_y: int
+    ids: Tensor  # row of the splat of every entry; front to back within a tile, tiles in row-major order. [I] int64
+    offsets: Tensor  # where each tile's list begins, and the end of the last one. [tiles_x * tiles_y + 1] int64
+    tile_size: int  # px
+    tiles_x: int  # tiles in a row
+    tiles_y: int  # rows of tiles
 
     @classmethod
     def of(cls, lists: Sequence[Sequence[int]], width: int, height: int, tile_size: int) -> TileLists:
@@ -59,7 +51,7 @@ class TileLists:
 
 
 def grid_size(width: int, height: int, tile_size: int) -> tuple[int, int]:
-    """See `pop_ref.tiles.grid_size`. Optimizations: none."""
+    """See `pop_ref.tiles.grid_size`."""
     return -(-width // tile_size), -(-height // tile_size)
 
 
@@ -96,10 +88,8 @@ def tile_lists(
     """
     tiles_x, tiles_y = grid_size(width, height, tile_size)
     rects = tile_rects(means2d, radii, width, height, tile_size, profile)
-    x0, y0, x1, y1 = columns(rects)
-    rows = ((x1 > x0) & (y1 > y0)).nonzero().squeeze(1)
-    rows = rows.index_select(0, depth_order(depths.index_select(0, rows)))
-    left, top, right, bottom = (edge.index_select(0, rows) for edge in (x0, y0, x1, y1))
+    rows = listed_rows(rects, depths)
+    left, top, right, bottom = (edge.index_select(0, rows) for edge in columns(rects))
     columns_of_tiles = right - left
     counts = columns_of_tiles * (bottom - top)
     # entry e is the k-th tile of its splat's rectangle
@@ -145,6 +135,13 @@ def _span(center: Tensor, radius: Tensor, n_tiles: int, tile_size: int, profile:
         first = torch.floor((center - radius) / tile_size)
         last = torch.ceil((center + radius) / tile_size)
     return first.clamp(0, n_tiles), last.clamp(0, n_tiles)
+
+
+def listed_rows(rects: Tensor, depths: Tensor) -> Tensor:
+    """Return the rows of the splats whose rectangles [N, 4] hold tiles, front to back. [M] int64"""
+    x0, y0, x1, y1 = columns(rects)
+    rows = ((x1 > x0) & (y1 > y0)).nonzero().squeeze(1)
+    return rows.index_select(0, depth_order(depths.index_select(0, rows)))
 
 
 def depth_order(depths: Tensor) -> Tensor:
@@ -193,7 +190,7 @@ def _sigma_and_size(a: Tensor, b: Tensor, c: Tensor, dx: Tensor, dy: Tensor) -> 
 def snug_box(
     mean2d: Tensor, conic: Tensor, opacity: float, profile: Profile = PAPER
 ) -> tuple[float, float, float, float] | None:
-    """See `pop_ref.tight_tiles.snug_box`. Optimizations: none."""
+    """See `pop_ref.tight_tiles.snug_box`."""
     if opacity < profile.alpha_floor:
         return None
     t = 2.0 * math.log(opacity / profile.alpha_floor)
@@ -235,8 +232,7 @@ def tight_tile_lists(
     """
     tiles_x, tiles_y = grid_size(width, height, tile_size)
     rects = tile_rects(means2d, radii, width, height, tile_size, profile)
-    listed = ((rects[:, 2] > rects[:, 0]) & (rects[:, 3] > rects[:, 1])).nonzero().squeeze(1)
-    rows = listed.index_select(0, depth_order(depths.index_select(0, listed)))
+    rows = listed_rows(rects, depths)
     means2d, conics, opacities, rects = (t.index_select(0, rows) for t in (means2d, conics, opacities, rects))
     splat, x, y = _met_tiles(means2d, conics, opacities, rects, tile_size, profile)
     tile = (y * tiles_x + x).to(torch.int32)

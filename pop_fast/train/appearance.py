@@ -20,12 +20,7 @@ from pop_fast.train.views import ViewTensors
 
 
 class Appearance:
-    """Exposures and corrections of the training views, each with its Adam.
-
-    Args:
-        config: says what is learned, and at which rates.
-        views: to train on.
-    """
+    """Exposures and corrections of the training views, each with its Adam."""
 
     def __init__(self, config: TrainConfig, views: Sequence[ViewTensors]) -> None:
         self._config = config
@@ -39,7 +34,7 @@ class Appearance:
         self._viewmats = torch.cat([view.viewmat for view in views])
 
     def _photo(self, index: int) -> int:
-        # the same photograph shrunk is as many places further on; see `pop_fast.train.coarse`
+        # the same photograph shrunk is as many places further on; see `pop_fast.train.views`
         return index % len(self._viewmats)
 
     def seen_from(self, view: ViewTensors, index: int) -> ViewTensors:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from pop_fast.api.registry import get_backend
+from pop_fast.api.backend import get_backend
 from pop_fast.errors import PopError
 from pop_fast.io.heartbeat import duration
 from pop_fast.train.choose import on_gpu
@@ -66,19 +66,15 @@ _PIXEL_BYTES: Final = 42
 
 @dataclass(frozen=True)
 class Speed:
-    """How fast this machine takes steps of a run.
+    """How fast this machine takes steps of a run."""
 
-    Attributes:
-        few, many: Gaussians that were trained.
-        seconds_few, seconds_many: a step with so many took.
-        took: s, all of the measurement.
-    """
-
+    # few, many: Gaussians that were trained
     few: int
     many: int
+    # seconds_few, seconds_many: a step with so many took
     seconds_few: float
     seconds_many: float
-    took: float = 0.0
+    took: float = 0.0  # s, all of the measurement
 
     def seconds_a_step(self, gaussians: float) -> float:
         """Give the time of a step with so many Gaussians, never less than with the fewest."""
@@ -88,31 +84,17 @@ class Speed:
 
 @dataclass(frozen=True)
 class Choice:
-    """What was chosen.
+    """What was chosen."""
 
-    Attributes:
-        scaler: of the paper's schedule.
-        gaussians: expected at the end.
-        seconds: expected of training and measuring.
-        memory_bytes: expected of the process.
-        why: what kept the schedule shorter than the minutes allow; None where that was nothing.
-    """
-
-    scaler: float
-    gaussians: float
-    seconds: float
-    memory_bytes: float
-    why: str | None = None
+    scaler: float  # of the paper's schedule
+    gaussians: float  # expected at the end
+    seconds: float  # expected of training and measuring
+    memory_bytes: float  # expected of the process
+    why: str | None = None  # what kept the schedule shorter than the minutes allow; None where that was nothing
 
 
 def factor_for(sizes: Sequence[tuple[int, int]], gpu: bool, minutes: float) -> int:
-    """Choose the whole number that photographs are shrunk by.
-
-    Args:
-        sizes: width and height of the photographs, px; of none it is 1.
-        gpu: a GPU trains.
-        minutes: that the run may take.
-    """
+    """Choose the whole number that photographs are shrunk by, of whose sizes, px, there may be none."""
     side = SIDES["gpu" if gpu else "cpu" if minutes >= SOON else "cpu, soon"]
     times = max([1.0, *(max(size) / side for size in sizes)])
     # f^2 + f = times^2 where the ratios to both neighbours are equal
@@ -125,11 +107,7 @@ def expected_gaussians(method: str, first: int, pixels: float, photographs: int,
     With POP what grows follows the size of one photograph, without the prior that of all of them together.
 
     Args:
-        method: of density control; those that prune at their end are foretold as they are before.
-        first: Gaussians at the start.
         pixels: of a photograph as it is trained on.
-        photographs: to train on.
-        scaler: of the paper's schedule.
     """
     if method == "pop":
         grown = _POP_GROWS * pixels * scaler**_POP_POWER
@@ -155,12 +133,8 @@ def choose_length(
     """Choose as much of the paper's schedule as the minutes allow, and as few photographs bear.
 
     Args:
-        config: the settings; the paper's steps are read.
-        speed: of this machine.
         minutes: that training, measuring and the report may take.
-        pixels: of a photograph.
         photographs: there are, with those held out.
-        held_out: views that are measured.
     """
     steps = TrainConfig.of(method=config.method).max_steps
 
@@ -214,15 +188,10 @@ TERMS: Final = ("depth_lambda", "exposure")
 
 @dataclass(frozen=True)
 class Terms:
-    """Terms of the loss that were chosen.
+    """Terms of the loss that were chosen."""
 
-    Attributes:
-        settings: by name, those that nobody said.
-        why: a sentence for each that was chosen, or that could not be.
-    """
-
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    why: tuple[str, ...] = ()
+    settings: Mapping[str, Any] = field(default_factory=dict)  # by name, those that nobody said
+    why: tuple[str, ...] = ()  # a sentence for each that was chosen, or that could not be
 
 
 def choose_terms(capture: Capture, config: TrainConfig, stops: float | None) -> Terms:
@@ -328,7 +297,6 @@ def measure_speed(config: TrainConfig, capture: Capture) -> Speed:
     The many Gaussians are as many as the whole schedule has on average.
 
     Args:
-        config: its settings, with the backend settled.
         capture: loaded at the size that is trained on.
 
     Raises:
@@ -384,11 +352,7 @@ def _seconds_a_step(config: TrainConfig, capture: Capture, initial: Mapping[str,
 
 
 def check_minutes(minutes: float | None, config: TrainConfig, automatic: bool) -> None:
-    """Refuse minutes that cannot be, or that contradict a schedule that was said.
-
-    Raises:
-        PopError: says which option to leave out.
-    """
+    """Refuse, by PopError, minutes that cannot be or that contradict a schedule that was said."""
     if minutes is None:
         return
     if not 0.0 < minutes < math.inf:

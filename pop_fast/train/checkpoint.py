@@ -2,18 +2,27 @@
 
 The file is a dict that `torch.load(weights_only=True)` reads, so loading one cannot run code. `splats` and `step` are
 gsplat's keys: its trainer evaluates these files as they are. What is read is checked first, bit by bit against its
-checksums and entry by entry (`checkpoint_checks`), so that a damaged or forged file ends in a sentence.
+checksums and entry by entry, so that a damaged or forged file ends in a sentence.
+
+torch's fused Adam takes the addresses of a parameter and its moments but the length of the first alone: with a moment
+of another shape it writes where it must not. So nothing of a file reaches a run unchecked. A file can also hold tensors
+that are views of one another, or one number that claims to be a billion.
+
+What is refused is what no run can have written. Parameters and first moments are finite, because a run that loses that
+stops before it saves. Second moments and sums of gradients are at least 0, and may be infinite: the square of a large
+gradient overflows while the parameter that it is for continues.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 import torch
@@ -26,25 +35,15 @@ from pop_fast.density.protocol import State
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.read_back import read_torch_file
-from pop_fast.train.checkpoint_checks import check_content, check_splats, shown
 from pop_fast.train.config import TrainConfig, first_difference
-from pop_fast.train.model import KEYS, make_optimizers
+from pop_fast.train.model import KEYS, first_non_finite, first_unusable, make_optimizers
 
 FORMAT = 1
 _NAME = re.compile(r"ckpt_(\d+)_rank0\.pt")
 _DAMAGED = "remove the file to continue from the one before it"
 _NEEDED = (
-    "format",
-    "step",
-    "splats",
-    "optimizers",
-    "strategy",
-    "view_order",
-    "config",
-    "capture",
-    "metrics_bytes",
-    "seconds",
-    "threads",
+    *("format", "step", "splats", "optimizers", "strategy", "view_order", "config", "capture"),
+    *("metrics_bytes", "seconds", "threads"),
 )
 
 
@@ -154,13 +153,7 @@ def check_fits(
     """Check that a checkpoint belongs to a run.
 
     Args:
-        path: of the checkpoint.
-        content: what it holds, checked.
-        config: the run's settings.
-        fingerprint: of the run's capture.
         threads: of one operation; None where the bits of the steps do not depend on it.
-        n_views: how many the run trains on.
-        known: what the state of the run's strategy holds.
 
     Raises:
         PopError: it belongs to other settings or another capture, or cannot be of this run; names what differs.
@@ -184,10 +177,8 @@ def check_fits(
     last, order = config.max_steps - 1, content["view_order"]["order"]
     odd = sorted(set(known) ^ content["strategy"].keys())
     learned = {name: len(found["value"]) for name, found in content["appearance"].items()}
-    expected = {
-        **({"exposures": n_views} if config.exposure else {}),
-        **({"cameras": n_views} if config.refine_cameras else {}),
-    }
+    asked = {"exposures": config.exposure, "cameras": config.refine_cameras}
+    expected = {name: n_views for name, is_learned in asked.items() if is_learned}
     if content["step"] > last:
         raise PopError(f"{path}: step is {content['step']}; it must be at most {last}, the run's last: {_DAMAGED}")
     if len(order) not in (0, n_views):
@@ -270,3 +261,273 @@ def on_cpu(content: Any) -> Any:
     if isinstance(content, Mapping):
         return {key: on_cpu(value) for key, value in content.items()}
     return content.cpu() if isinstance(content, Tensor) else content
+
+
+_TAILS: Final = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3), "shN": (15, 3)}
+_FLOATS: Final = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+# one row a photograph: exposures, corrections of cameras
+_OF_PHOTOGRAPHS: Final = {"exposures": (3, 4), "cameras": (6,)}
+_MOMENTS: Final = ("step", "exp_avg", "exp_avg_sq")
+_LONGEST: Final = 40  # letters of a value that a message shows
+# a strategy's numbers with one row a Gaussian
+_ROWS: Final = {
+    "grad2d": torch.float32,
+    "count": torch.float32,
+    "radii": torch.float32,
+    "blurred": torch.bool,
+    "dominant_sum": torch.int64,
+}
+
+
+def check_splats(splats: Any, kind: torch.dtype | None = None) -> dict[str, Tensor]:
+    """Check the raw parameters of a checkpoint.
+
+    Args:
+        kind: the type that every tensor must have; None takes any floats, and 0, 3 or 8 in place of 15 coefficients.
+
+    Returns:
+        The tensors under `KEYS`, contiguous, of the type `kind` or else float32; others are left out.
+
+    Raises:
+        ValueError: a tensor is absent or not finite, or has another type or shape; names it.
+    """
+    found = _mapping(splats, "splats", KEYS, others=True)
+    n: int | None = None
+    checked: dict[str, Tensor] = {}
+    for key in KEYS:
+        name = f"splats.{key}"
+        value = _tensor(found[key], name)
+        if value.dtype not in (_FLOATS if kind is None else (kind,)):
+            wanted = "floats" if kind is None else str(kind)
+            raise ValueError(f"{name} is {value.dtype}; it must be a tensor of {wanted}")
+        n = len(value) if n is None and value.dim() > 0 else n
+        want = [n, *_TAILS[key]]
+        if key == "shN" and kind is None and value.dim() == 3 and value.shape[1] in (0, 3, 8):
+            want[1] = value.shape[1]
+        bands = " (or 0, 3 or 8 in place of 15)" if key == "shN" and kind is None else ""
+        own = _own(value, want, name, bands)
+        checked[key] = own.float() if kind is None else own
+    bad = first_non_finite(checked) if kind is None else first_unusable(checked)
+    if bad:
+        raise ValueError(f"splats.{bad[0]}{bad[1]} is {bad[2]}; every entry must be finite")
+    return checked
+
+
+def check_content(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Check all that a run continues from, except what only the run knows: its settings, its capture, its strategy.
+
+    Returns:
+        The same with tensors that are contiguous and share no memory.
+
+    Raises:
+        ValueError: names the entry, what it is and what it must be.
+    """
+    step = _whole(content["step"], "step")
+    splats = check_splats(content["splats"], torch.float32)
+    packed = _mapping(content["optimizers"], "optimizers", KEYS)
+    # files of older versions do not have processor time
+    seconds = {"cpu": None, **_mapping(content["seconds"], "seconds")}
+    _mapping(seconds, "seconds", ("train", "total", "cpu"))
+    config = _mapping(content["config"], "config")
+    _check_words(config, content["capture"])
+    # where the settings do not name it, a step has one view
+    drawn = (step + 1) * _whole(config.get("batch_size", 1), "config.batch_size", least=1)
+    _whole(content["metrics_bytes"], "metrics_bytes")
+    _whole(content["threads"], "threads", least=1)
+    checked = {
+        **content,
+        "splats": splats,
+        "optimizers": {key: _moments(packed[key], f"optimizers.{key}", splats[key], step + 1) for key in KEYS},
+        "strategy": _strategy(content["strategy"], list(splats["shN"].shape), drawn),
+        "view_order": _view_order(content["view_order"]),
+        "appearance": _appearance(content.get("appearance", {}), step + 1),
+        "seconds": {
+            key: None if key == "cpu" and value is None else _number(value, f"seconds.{key}")
+            for key, value in seconds.items()
+        },
+    }
+    tensors = {name: checked[name] for name in ("splats", "optimizers", "strategy", "view_order", "appearance")}
+    _check_apart(tensors, "", {})
+    return checked
+
+
+def _appearance(packed: Any, taken: int) -> dict[str, dict[str, Tensor]]:
+    """Check what was learned of the photographs; files of older versions have none."""
+    checked: dict[str, dict[str, Tensor]] = {}
+    for key, found in _mapping(packed, "appearance").items():
+        if key not in _OF_PHOTOGRAPHS:
+            raise ValueError(f"appearance.{shown(key)} is unknown; it must hold {', '.join(_OF_PHOTOGRAPHS)}")
+        name = f"appearance.{key}"
+        moments = dict(_mapping(found, name, ("value", *_MOMENTS)))
+        value = _tensor(moments.pop("value"), f"{name}.value", torch.float32)
+        own = _own(value, [*value.shape[:1], *_OF_PHOTOGRAPHS[key]], f"{name}.value")
+        bad = first_non_finite({f"{name}.value": own})
+        if bad:
+            raise ValueError(f"{bad[0]}{bad[1]} is {bad[2]}; every entry must be finite")
+        checked[key] = {"value": own, **_moments(moments, name, own, taken)}
+    return checked
+
+
+def _moments(packed: Any, name: str, param: Tensor, taken: int) -> dict[str, Tensor]:
+    found = _mapping(packed, name, _MOMENTS)
+    like = list(param.shape)
+    checked = {"step": _own(_tensor(found["step"], f"{name}.step", torch.float32), [], f"{name}.step")}
+    counted = float(checked["step"])
+    if not (0 <= counted <= taken and counted.is_integer()):
+        most = f"a whole number of updates, at most {taken}, the steps taken"
+        raise ValueError(f"{name}.step is {checked['step'].item():g}; it must be {most}")
+    for key in _MOMENTS[1:]:
+        checked[key] = _own(_tensor(found[key], f"{name}.{key}", torch.float32), like, f"{name}.{key}")
+    bad = first_non_finite({"exp_avg": checked["exp_avg"]})
+    if bad:
+        raise ValueError(f"{name}.exp_avg{bad[1]} is {bad[2]}; every entry must be finite")
+    _check_not_negative(checked["exp_avg_sq"], f"{name}.exp_avg_sq")
+    return checked
+
+
+def _strategy(packed: Any, sh_rest: list[int], drawn: int) -> dict[str, Any]:
+    found = _mapping(packed, "strategy", ("generator",), others=True)
+    checked = {**found, "generator": _generator(found["generator"], "strategy.generator")}
+    if "views" in found:
+        _whole(found["views"], "strategy.views", most=drawn)
+    if "scene_scale" in found:
+        checked["scene_scale"] = _number(found["scene_scale"], "strategy.scene_scale")
+    for key in _ROWS.keys() & found.keys():
+        if found[key] is not None:
+            checked[key] = _own(_tensor(found[key], f"strategy.{key}", _ROWS[key]), sh_rest[:1], f"strategy.{key}")
+            if checked[key].dtype != torch.bool:
+                _check_not_negative(checked[key], f"strategy.{key}")
+    for key in found.keys() - _ROWS.keys() - {"generator", "views", "scene_scale", "sh_rest_sum"}:
+        # of a strategy of other people
+        name = shown(key).strip("'")
+        checked[key] = _plain(found[key], f"strategy.{name}")
+    if found.get("sh_rest_sum") is not None:
+        waiting = _tensor(found["sh_rest_sum"], "strategy.sh_rest_sum", torch.float32)
+        checked["sh_rest_sum"] = _own(waiting, sh_rest, "strategy.sh_rest_sum")
+    if (found.get("grad2d") is None) != (found.get("count") is None):
+        raise ValueError("strategy.grad2d and strategy.count must both be tensors or both be None")
+    return checked
+
+
+def _plain(value: Any, name: str) -> Any:
+    """Check that a value is a plain one or a tensor of plain memory on the CPU."""
+    if isinstance(value, (str, int, float, bool, type(None))):
+        return value
+    if not isinstance(value, Tensor):
+        raise ValueError(f"{name} is {shown(value)}; it must be a plain value or a tensor")
+    found = _tensor(value, name)
+    return _own(found, list(found.shape), name)
+
+
+def _view_order(packed: Any) -> dict[str, Any]:
+    found = _mapping(packed, "view_order", ("generator", "order", "position"))
+    order = found["order"]
+    if not isinstance(order, list) or not all(type(view) is int for view in order):
+        raise ValueError(f"view_order.order is {shown(order)}; it must be a list of whole numbers")
+    if sorted(order) != list(range(len(order))):
+        raise ValueError("view_order.order must hold every view once")
+    position = _whole(found["position"], "view_order.position", most=len(order))
+    return {"generator": _generator(found["generator"], "view_order.generator"), "order": order, "position": position}
+
+
+def _generator(value: Any, name: str) -> Tensor:
+    fresh = torch.Generator()
+    state = _own(_tensor(value, name, torch.uint8), list(fresh.get_state().shape), name)
+    try:
+        fresh.set_state(state)
+    except RuntimeError as error:
+        raise ValueError(f"{name} is not the state of a random generator") from error
+    return state
+
+
+def _check_words(config: Mapping[Any, Any], capture: Any) -> None:
+    """Check what is compared with a run's settings and capture: only plain values can be compared and shown."""
+    plain = (str, int, float, bool, type(None))
+    for key, value in config.items():
+        values = value if isinstance(value, (list, tuple)) else [value]
+        if type(key) is not str or not all(type(item) in plain for item in values):
+            raise ValueError(f"config.{shown(key)} is {shown(value)}; it must be a plain value")
+    for key, value in _mapping(capture, "capture").items():
+        if type(key) is not str or type(value) is not str:
+            raise ValueError(f"capture.{shown(key)} is {shown(value)}; it must be a text")
+
+
+def _mapping(value: Any, name: str, keys: tuple[str, ...] | None = None, others: bool = False) -> Mapping[Any, Any]:
+    """Return a value that is a dict with these keys (None: any), and no others unless they are allowed."""
+    if not isinstance(value, dict):
+        raise ValueError(f"{name} is {shown(value)}; it must be a dict")
+    for key in keys or ():
+        if key not in value:
+            raise ValueError(f"has no {name}.{key}")
+    odd = [] if keys is None or others else [key for key in value if key not in keys]
+    if odd:
+        raise ValueError(f"{name}.{shown(odd[0])} is unknown; it must hold {', '.join(keys or ())}")
+    return value
+
+
+def _tensor(value: Any, name: str, kind: torch.dtype | None = None) -> Tensor:
+    """Return a value that is a tensor of plain memory on the CPU, of the type `kind` (None: any)."""
+    wanted = "a tensor of floats" if kind is None else f"a tensor of {str(kind).removeprefix('torch.')}"
+    if type(value) not in (Tensor, Parameter):
+        raise ValueError(f"{name} is {shown(value)}; it must be {wanted}")
+    if value.layout != torch.strided or value.is_nested or value.is_quantized or value.device.type != "cpu":
+        raise ValueError(f"{name} is not a plain array of numbers on the CPU; it must be {wanted}")
+    if kind not in (None, value.dtype):
+        raise ValueError(f"{name} is {value.dtype}; it must be {wanted}")
+    return value.detach()
+
+
+def _own(value: Tensor, shape: list[Any], name: str, hint: str = "") -> Tensor:
+    """Return a tensor that has this shape, copied where it is a view of other numbers than its own."""
+    if list(value.shape) != shape:
+        raise ValueError(f"{name} has shape {list(value.shape)}; it must be {str(shape).replace('None', 'N')}{hint}")
+    size, held = value.numel() * value.element_size(), value.untyped_storage().nbytes()
+    if size > held:
+        raise ValueError(f"{name} has {size} bytes, of which the file holds {held}; it must hold every number")
+    if value.dtype == torch.bool and size and value.contiguous().view(torch.uint8).max() > 1:
+        raise ValueError(f"{name} holds what is neither true nor false")
+    if size == held and value.is_contiguous() and not value.is_neg():
+        return value
+    return torch.empty(shape, dtype=value.dtype).copy_(value)
+
+
+def _check_apart(value: Any, name: str, seen: dict[int, str]) -> None:
+    """Raise ValueError when two tensors share memory: a change of one would change the other."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            _check_apart(item, f"{name}.{key}" if name else str(key), seen)
+    elif isinstance(value, Tensor) and value.numel() > 0:
+        other = seen.setdefault(value.untyped_storage().data_ptr(), name)
+        if other != name:
+            raise ValueError(f"{name} and {other} are the same memory; each must have its own")
+
+
+def _check_not_negative(value: Tensor, name: str) -> None:
+    # the smallest of numbers with a NaN among them is NaN, which is not >= 0 either
+    if value.numel() == 0 or value.min() >= 0:
+        return
+    index = [int(i) for i in torch.nonzero(~(value >= 0))[0]]
+    raise ValueError(f"{name}{index} is {value[tuple(index)].item()}; every entry must be at least 0")
+
+
+def _whole(value: Any, name: str, least: int = 0, most: int = 2**53) -> int:
+    if type(value) is not int or not least <= value <= most:
+        limit = f"at least {least}" if most == 2**53 else f"from {least} to {most}"
+        raise ValueError(f"{name} is {shown(value)}; it must be a whole number, {limit}")
+    return value
+
+
+def _number(value: Any, name: str) -> float:
+    if type(value) not in (int, float) or not 0 <= value < math.inf:
+        raise ValueError(f"{name} is {shown(value)}; it must be a finite number, at least 0")
+    return value
+
+
+def shown(value: Any) -> str:
+    """Show a plain value, shortened, or tell the kind of any other."""
+    if isinstance(value, int) and abs(value) > 2**63:
+        return "a number beyond 2^63"
+    if isinstance(value, (str, int, float, type(None))):
+        text = repr(value)
+        return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+    return type(value).__name__

@@ -8,8 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pop_fast.api.backend import Backend
-from pop_fast.api.registry import by_speed, get_backend
+from pop_fast.api.backend import Backend, by_speed, get_backend
 from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.steps import why_not_trained
@@ -19,10 +18,6 @@ def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConf
     """Settle backend "auto": the fastest that can run here and knows the settings, a GPU's before a CPU's.
 
     A resumed run keeps the backend that it was begun with.
-
-    Args:
-        config: the settings as given.
-        resume: continue with the run in `config.result_dir`, if there is one.
 
     Returns:
         The settings with a backend's name, and one line that says which and why.
@@ -75,7 +70,6 @@ def check_gpus(config: TrainConfig, processes: int = 1) -> str | None:
     """Settle which GPUs of this machine a run uses.
 
     Args:
-        config: with a backend's name.
         processes: that train together, of which LOCAL_WORLD_SIZE run here where a launcher says so.
 
     Returns:

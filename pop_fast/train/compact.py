@@ -24,12 +24,11 @@ from torch import Tensor
 from pop_fast.density import shrink
 from pop_fast.density.passes import Passes
 from pop_fast.stages.harmonics import lower_degree
+from pop_fast.train.engines import renderer
 from pop_fast.train.environment import reproducible
 from pop_fast.train.evaluate import evaluate
-from pop_fast.train.gpu_proxy import renderer
 from pop_fast.train.presets import QUICK_RATES
-from pop_fast.train.refining import refining
-from pop_fast.train.schedule import segment_end
+from pop_fast.train.schedule import refining, segment_end
 from pop_fast.train.training_run import TrainingRun
 from pop_fast.train.views import ViewTensors, evenly, render_view
 from pop_ref.settings import LearningRates
@@ -78,15 +77,10 @@ class Coding(Protocol):
 
 @dataclass(frozen=True)
 class Compact:
-    """A splat that fits.
+    """A splat that fits."""
 
-    Attributes:
-        params: raw parameters, in the training frame.
-        level: of coarseness that it is written at.
-    """
-
-    params: dict[str, Tensor]
-    level: int = 0
+    params: dict[str, Tensor]  # raw parameters, in the training frame
+    level: int = 0  # of coarseness that it is written at
 
     @property
     def degree(self) -> int:
@@ -96,17 +90,11 @@ class Compact:
 
 @dataclass(frozen=True)
 class _Trial:
-    """A way to fit, tuned for a few steps.
+    """A way to fit, tuned for a few steps."""
 
-    Attributes:
-        compact: what came out.
-        scores: of its Gaussians. [N]
-        psnr: of what is read back, in training views.
-    """
-
-    compact: Compact
-    scores: Tensor
-    psnr: float
+    compact: Compact  # what came out
+    scores: Tensor  # of its Gaussians. [N]
+    psnr: float  # of what is read back, in training views
 
 
 def degree_of(params: Params) -> int:
@@ -122,10 +110,6 @@ class Tuner:
         held_out: views that nothing here trains on or chooses by.
 
     Args:
-        params: raw parameters, whole.
-        sh_degree: highest active colour band.
-        config: how it was trained.
-        capture: in the frame of the parameters.
         learned: what the run has learned of its photographs, as a checkpoint holds it.
         steps: that what is kept is trained for; 0 trains nothing.
         report: is called with the steps taken so far, those planned, and the seconds that all of them will take, None
@@ -158,11 +142,7 @@ class Tuner:
         self._planned = self._taken + steps
 
     def tuned(self, params: Params, steps: int) -> dict[str, Tensor]:
-        """Return parameters after so many steps, which leave nothing behind.
-
-        Raises:
-            PopError: a number is no longer finite.
-        """
+        """Return parameters after steps that leave nothing behind; PopError where a number is no longer finite."""
         if steps == 0 or len(params["means"]) == 0:
             return dict(params)
         with reproducible(self.config.threads):
@@ -241,12 +221,6 @@ class Tuner:
 def with_pictures(capture: Capture, params: Params, config: TrainConfig, sh_degree: int) -> tuple[Capture, TrainConfig]:
     """Put pictures of a splat in the place of a capture's photographs, which show what it has lost.
 
-    Args:
-        capture: in the frame of the parameters.
-        params: raw parameters.
-        config: how they are drawn.
-        sh_degree: highest active colour band.
-
     Returns:
         The capture, and settings that learn nothing of single photographs.
     """
@@ -272,12 +246,6 @@ def tuned_to_the_end(tuner: Tuner) -> dict[str, Tensor]:
 
 def within(tuner: Tuner, score: Callable[[Params], Tensor], most: int, coding: Coding) -> Compact:
     """Fit a splat into so many bytes.
-
-    Args:
-        tuner: has the splat and its photographs.
-        score: gives the scores of Gaussians, of which those of the highest stay. -> [N]
-        most: bytes.
-        coding: of the file.
 
     Returns:
         What `coding.write` makes at most so many bytes of, no worse in training views than fewer Gaussians alone.

@@ -27,9 +27,6 @@ def reproducible(threads: int = 0) -> Iterator[None]:
     Denormals are flushed to zero because the moments of Gaussians that no view sees decay into them, and stay there,
     and arithmetic on them is slow. The flag belongs to a thread and is inherited when a thread is born, so torch's pool
     of threads is dismissed after setting it; the next operation makes a new one.
-
-    Args:
-        threads: threads of one operation; 0 takes all cores.
     """
     before = torch.get_num_threads()
     # `use_deterministic_algorithms` says the same to torch's compiler too, and imports it for that: 0.6 s

@@ -1,27 +1,32 @@
-"""Measure held-out views (PSNR, SSIM and, with weights at hand, LPIPS), and keep what the report shows of them."""
+"""Measure held-out views (PSNR, SSIM and, with weights at hand, LPIPS), and keep what the report shows of them.
+
+Also measured is what a splat weighs in every file format, and how well it shows the views when it comes back from one.
+"""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from pop_fast.data import apply_similarity, to_capture_frame
+from pop_fast.errors import PopError
+from pop_fast.io.formats import decoded, encoded, format_names
 from pop_fast.io.images import write_png
 from pop_fast.io.pictures import error_magnitude, error_picture, id_colors
 from pop_fast.stages.appearance import color_correct
-from pop_fast.stages.losses import ssim
-from pop_fast.stages.ssim import WINDOW_SIZE
+from pop_fast.stages.losses import WINDOW_SIZE, ssim
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.lpips import LPIPS, VARIANTS
 from pop_fast.train.results import ResultFolder
 from pop_fast.train.signals import heard
-from pop_fast.train.views import Rendered, ViewTensors, render_view
+from pop_fast.train.views import Rendered, ViewTensors, evenly, render_view
 
 NO_LPIPS = "no weights were given (lpips_vgg, lpips_alex)"
 ALPHA_FLOOR = 1.0 / 255.0
@@ -133,14 +138,8 @@ def evaluate(
     """Render and measure views.
 
     Args:
-        backend: what renders.
-        params: raw parameters.
-        views: held-out views.
         config: background, profile and the like; with `exposure` PSNR is also measured after fitting colours.
-        sh_degree: highest active colour band.
-        nets: LPIPS networks.
         folder: where pictures of the first `config.max_renders` views go; None keeps none.
-        step: in the pictures' names.
 
     Returns:
         Averages over the views; Gaussians per pixel; seconds per rendered view; `per_view` metrics by name.
@@ -186,12 +185,56 @@ def _keep_pictures(
     # of a large view, a second or more within OpenCV
     heard(write_png, folder.path / "renders" / f"val_{name}.png", np.concatenate([render, photo, error], axis=1))
     write_png(folder.path / "renders" / f"dominant_{name}.png", id_colors(ids))
-    folder.write_arrays(
-        f"val_{name}",
-        name=view.name,
-        render=render,
-        photo=photo,
-        dominant_ids=ids.astype(np.int32),
-        psnr=metrics.psnr,
-        ssim=metrics.ssim,
-    )
+    arrays = {"name": view.name, "render": render, "photo": photo, "dominant_ids": ids.astype(np.int32)}
+    folder.write_arrays(f"val_{name}", **arrays, psnr=metrics.psnr, ssim=metrics.ssim)
+
+
+# held-out views that are rendered for every format, at most; of more, an even selection
+_MOST_VIEWS: Final = 4
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """A splat in a format."""
+
+    format: str  # its name
+    bytes: int  # of the file
+    num_gaussians: int  # in it
+    psnr: float | None  # mean over some held-out views after a round trip, dB; None where there is none
+    views: int  # how many these are
+
+    def entry(self) -> dict[str, Any]:
+        """Return what the statistics hold of it."""
+        return asdict(self)
+
+
+def measure_encodings(
+    backend: Any,
+    params: Mapping[str, Tensor],
+    views: Sequence[ViewTensors],
+    config: TrainConfig,
+    sh_degree: int,
+    world_transform: np.ndarray,
+) -> Iterator[Encoding]:
+    """Write a splat in every format, in the capture's own frame, read it back and measure it in the training frame.
+
+    A format that cannot hold the splat is left out.
+
+    Args:
+        params: raw parameters, in the training frame.
+        world_transform: the training frame from the capture's. [4, 4]
+
+    Yields:
+        One format after the other, as soon as it is measured.
+    """
+    some = evenly(views, _MOST_VIEWS)
+    plain = {name: value.detach().cpu() for name, value in params.items()}
+    own = to_capture_frame(plain, world_transform)
+    for name in format_names():
+        try:
+            data = encoded(name, own, config.antialiased)
+        except PopError:
+            continue
+        back = apply_similarity(decoded(name, data)[0], world_transform)
+        psnr = evaluate(backend, back, some, config, sh_degree)["psnr"] if some else None
+        yield Encoding(name, len(data), len(own["means"]), psnr, len(some))

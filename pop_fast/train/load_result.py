@@ -26,23 +26,14 @@ RECORD = "capture.json"
 
 @dataclass(frozen=True, kw_only=True)
 class Splat:
-    """Gaussians and what is known about them.
+    """Gaussians and what is known about them."""
 
-    Attributes:
-        path: the checkpoint or PLY that was read.
-        params: raw parameters.
-        config: the settings they were trained with; the defaults for a lone file.
-        step: the last step taken, from 0; None for a lone PLY.
-        folder: the result folder it belongs to, if any.
-        frame: the world it is in, where its file or its run says it.
-    """
-
-    path: Path
-    params: dict[str, Tensor]
-    config: TrainConfig
-    step: int | None = None
-    folder: Path | None = None
-    frame: Frame | None = None
+    path: Path  # the checkpoint or PLY that was read
+    params: dict[str, Tensor]  # raw parameters
+    config: TrainConfig  # the settings they were trained with; the defaults for a lone file
+    step: int | None = None  # the last step taken, from 0; None for a lone PLY
+    folder: Path | None = None  # the result folder it belongs to, if any
+    frame: Frame | None = None  # the world it is in, where its file or its run says it
 
     @property
     def sh_degree(self) -> int:
@@ -88,17 +79,20 @@ class CaptureRecord:
     chosen: list[str] = field(default_factory=list)
 
 
+def how_to_load(config: TrainConfig, record: CaptureRecord) -> dict[str, Any]:
+    """Return what `load_capture` is told of a run's capture, but for progress and which photographs are read."""
+    of_run = ("factor", "normalize", "background", "resize", "seed", "test_every")
+    own = {name: getattr(record, name) for name in ("masks", "missing", "source", "images")}
+    return {**own, **{name: getattr(config, name) for name in of_run}}
+
+
 def record_text(record: CaptureRecord) -> str:
     """Return what capture.json holds."""
     return json.dumps(asdict(record), indent=2) + "\n"
 
 
 def read_record(folder: Path | None) -> CaptureRecord | None:
-    """Read capture.json, or None where there is none.
-
-    Raises:
-        PopError: it is damaged; names it.
-    """
+    """Read capture.json, or None where there is none; PopError where it is damaged."""
     path = folder / RECORD if folder else None
     if path is None or not path.is_file():
         return None
@@ -182,12 +176,6 @@ def open_capture(
 ) -> tuple[Capture, TrainConfig]:
     """Load the capture that a splat shows, and give the settings to look at it with.
 
-    Args:
-        splat: what is looked at.
-        options: which photographs and cameras.
-        progress: is called with (stage, done, total).
-        photographs: which are read; see `pop_fast.data.load_capture`.
-
     Raises:
         PopError: no capture is known, or it cannot be read.
     """
@@ -199,32 +187,18 @@ def open_capture(
         raise PopError(f"{splat.path}: nothing says which capture it shows; give --capture DIR")
     if options.capture is None and not Path(data).is_dir():
         raise PopError(f"{splat.path}: was trained on {data}, which is not there; give --capture DIR")
-    changes: dict[str, Any] = {"data": data}
-    if options.factor is not None:
-        changes["factor"] = options.factor
-    if options.test_every is not None:
-        changes["test_every"] = options.test_every
-    said = frame_of_splat(splat, options)
-    changes["normalize"] = said == "training"
-    if said is None:
+    asked = {"factor": options.factor, "test_every": options.test_every}
+    changes: dict[str, Any] = {"data": data, **{name: value for name, value in asked.items() if value is not None}}
+    frame = frame_of_splat(splat, options)
+    changes["normalize"] = frame == "training"
+    if frame is None:
         taken = "says nothing of its world, and is taken to be in the capture's own"
         print(f"note: {splat.path}: {taken}; that of gsplat's trainer needs --training-frame", file=sys.stderr)
     config = _in_frame(replace(splat.config, **changes), splat)
-    capture = load_capture(
-        data,
-        factor=config.factor,
-        normalize=config.normalize,
-        masks=record.masks,
-        missing=options.missing or record.missing,
-        background=config.background,
-        progress=progress,
-        source=record.source if options.capture is None else "auto",
-        images=options.images or record.images,
-        resize=config.resize,
-        seed=config.seed,
-        photographs=photographs,
-        test_every=config.test_every,
-    )
+    source = record.source if options.capture is None else "auto"
+    said = {"missing": options.missing or record.missing, "images": options.images or record.images, "source": source}
+    given = how_to_load(config, replace(record, **said))
+    capture = load_capture(data, **given, progress=progress, photographs=photographs)
     if config.normalize:
         _check_same_frame(splat, capture)
     return capture, config
@@ -258,11 +232,7 @@ def frame_of_splat(splat: Splat, options: CaptureOptions) -> Literal["capture", 
 
 
 def _check_same_frame(splat: Splat, capture: Capture) -> None:
-    """Refuse a capture that is not normalized as the one that the splat was trained on.
-
-    Raises:
-        PopError: its training frame is another one.
-    """
+    """Refuse, by PopError, a capture that is not normalized as the one that the splat was trained on."""
     if splat.frame is None or splat.frame.transform is None:
         return
     theirs, ours = np.array(splat.frame.transform), capture.world_transform
@@ -276,11 +246,6 @@ def _check_same_frame(splat: Splat, capture: Capture) -> None:
 
 def paths_read(splat: Splat, root: Path, capture: Capture) -> list[Path]:
     """List what the rendering of a splat reads: it, its result folder, the capture and where its photographs lie.
-
-    Args:
-        splat: what is rendered.
-        root: the capture's folder.
-        capture: the capture.
 
     Returns:
         Files and folders; no output may take the place of one.

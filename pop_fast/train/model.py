@@ -33,9 +33,6 @@ def make_optimizers(params: Mapping[str, Parameter]) -> dict[str, Adam]:
     """Make one dense Adam a parameter, its moments zero, the counter of updates on the CPU.
 
     `adam_step` sets its rate and the decay of its moments.
-
-    Args:
-        params: raw parameters by name.
     """
     made: dict[str, Adam] = {
         key: _Moments([param], lr=0.0, betas=BETAS, eps=EPS, fused=True) for key, param in params.items()
@@ -55,10 +52,6 @@ def adam_step(
     moments Adam would not move it.
 
     Args:
-        params: raw parameters with gradients.
-        optimizers: one per key.
-        updates: of all steps.
-        step: counts from 0.
         state: holds the gradients that wait for an update, under "sh_rest_sum".
     """
     rates, numbers = updates.rates[step].tolist(), updates.numbers[step].tolist()
@@ -106,11 +99,7 @@ def first_unusable(params: Mapping[str, Tensor]) -> tuple[str, list[int], float]
 
 
 def require_usable(params: Mapping[str, Tensor], when: str) -> None:
-    """Check that raw parameters can be rendered.
-
-    Raises:
-        PopError: they cannot; names the first number, and says what to do.
-    """
+    """Raise PopError, which names the first number and says what to do, where raw parameters cannot be rendered."""
     if found := first_unusable(params):
         name, index, value = found
         raise PopError(

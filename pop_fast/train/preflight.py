@@ -8,9 +8,9 @@ from typing import Any, Final
 
 from torch import Tensor
 
+from pop_fast.api.backends import FAST
 from pop_fast.api.checks import Checks
 from pop_fast.errors import PopError
-from pop_fast.stages.backend import FAST
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.evaluate import too_small
 from pop_fast.train.model import first_unusable
@@ -30,9 +30,6 @@ def check_views(config: TrainConfig, name: str, train: Sequence[ViewTensors], te
     """Check the cameras of all views, and that each photograph can be compared as the settings ask.
 
     Args:
-        config: `ssim_padding` is read.
-        name: the capture's.
-        train: views to train on.
         test: held-out views, which are always measured by whole windows.
 
     Raises:
@@ -53,15 +50,7 @@ def check_views(config: TrainConfig, name: str, train: Sequence[ViewTensors], te
 
 
 def check_start(name: str, initial: Mapping[str, Tensor]) -> None:
-    """Check that the first Gaussians can be rendered.
-
-    Args:
-        name: the capture's.
-        initial: raw parameters.
-
-    Raises:
-        PopError: an entry is not finite, or a scale is too large for a float; names it and what to do.
-    """
+    """Raise PopError, which names a number and says what to do, where the first Gaussians cannot be rendered."""
     found = first_unusable(initial)
     if found:
         key, index, value = found
@@ -72,16 +61,7 @@ def check_start(name: str, initial: Mapping[str, Tensor]) -> None:
 
 
 def facts(config: TrainConfig, views: Sequence[ViewTensors]) -> dict[str, Any]:
-    """Return what a run's statistics say of its settings.
-
-    Args:
-        config: the settings.
-        views: the training views.
-
-    Returns:
-        method, preset, seed, lambda_pop, theta_blur_pixels (share of the smallest and of the largest view, px),
-        blur_min_pixels (px), blur_events (densification steps that look at blur).
-    """
+    """Return what a run's statistics say of its settings; blur pixels are of the smallest and the largest view."""
     plan = config.strategy
     sizes = [view.kept_pixels for view in views]
     return {
@@ -96,12 +76,7 @@ def facts(config: TrainConfig, views: Sequence[ViewTensors]) -> dict[str, Any]:
 
 
 def find_warnings(config: TrainConfig, views: Sequence[ViewTensors]) -> Iterator[str]:
-    """Say, in one sentence each, what will not do as it is set, and which option fixes it.
-
-    Args:
-        config: the settings.
-        views: the training views.
-    """
+    """Say, in one sentence each, what will not do as it is set, and which option fixes it."""
     plan = config.strategy
     smallest = min(views, key=lambda view: view.kept_pixels)
     pixels = plan.theta_blur * smallest.kept_pixels

@@ -14,29 +14,34 @@ A default is the method's recipe (`pop_ref.recipes`), with the schedule multipli
                                                     "quick" has its own
     checkpoint_every, log_every                     no: they are about time, not about the schedule
 
-What the user sets is taken literally: neither a preset nor the scaler changes it.
+What the user sets is taken literally: neither a preset nor the scaler changes it. Settings go to
+plain JSON values and back (`to_plain`, `from_plain`), with errors that name the field.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+import types
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self
-
-from pop_fast.density import (
-    DensityControl,
-    GsplatStrategy,
-    Inria2023Strategy,
-    InriaStrategy,
-    MiniSplattingStrategy,
-    POPStrategy,
-    PupStrategy,
-    SpeedySplatStrategy,
-    TamingStrategy,
+from functools import cache
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Final,
+    Literal,
+    NamedTuple,
+    Self,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
 )
+
+from pop_fast import density
+from pop_fast.density import DensityControl
 from pop_fast.errors import PopError
-from pop_fast.train.jsonable import from_plain, to_plain
 from pop_ref.recipes import BASELINES, RECIPES, Recipe
 from pop_ref.registry import Registry
 from pop_ref.settings import DensityConfig, LearningRates, PopTerm, UpdateRules
@@ -46,31 +51,25 @@ if TYPE_CHECKING:
 
 
 class Method(NamedTuple):
-    """A method that can be trained.
+    """A method that can be trained."""
 
-    Attributes:
-        strategy: density control, with the method's defaults.
-        recipe: that the rest of its defaults are from.
-        title: what tables and pages call it.
-    """
-
-    strategy: type[DensityControl]
-    recipe: Recipe
-    title: str
+    strategy: type[DensityControl]  # density control, with the method's defaults
+    recipe: Recipe  # that the rest of its defaults are from
+    title: str  # what tables and pages call it
 
 
 METHODS: Final[Registry[Method]] = Registry(
     "method",
     "pop_splatting.methods",
     {
-        "pop": Method(POPStrategy, RECIPES["POP"], "POP"),
-        "gsplat": Method(GsplatStrategy, RECIPES["gsplat"], "gsplat (default strategy)"),
-        "3dgs": Method(InriaStrategy, RECIPES["3DGS"], "3DGS (Inria)"),
-        "3dgs-2023": Method(Inria2023Strategy, RECIPES["3DGS 2023"], "3DGS (Inria, 2023)"),
-        "pup": Method(PupStrategy, BASELINES["PUP-3DGS"], "PUP-3DGS"),
-        "mini-splatting": Method(MiniSplattingStrategy, BASELINES["Mini-Splatting"], "Mini-Splatting"),
-        "taming": Method(TamingStrategy, BASELINES["Taming-3DGS"], "Taming-3DGS"),
-        "speedy-splat": Method(SpeedySplatStrategy, BASELINES["Speedy-Splat"], "Speedy-Splat"),
+        "pop": Method(density.POPStrategy, RECIPES["POP"], "POP"),
+        "gsplat": Method(density.GsplatStrategy, RECIPES["gsplat"], "gsplat (default strategy)"),
+        "3dgs": Method(density.InriaStrategy, RECIPES["3DGS"], "3DGS (Inria)"),
+        "3dgs-2023": Method(density.Inria2023Strategy, RECIPES["3DGS 2023"], "3DGS (Inria, 2023)"),
+        "pup": Method(density.PupStrategy, BASELINES["PUP-3DGS"], "PUP-3DGS"),
+        "mini-splatting": Method(density.MiniSplattingStrategy, BASELINES["Mini-Splatting"], "Mini-Splatting"),
+        "taming": Method(density.TamingStrategy, BASELINES["Taming-3DGS"], "Taming-3DGS"),
+        "speedy-splat": Method(density.SpeedySplatStrategy, BASELINES["Speedy-Splat"], "Speedy-Splat"),
     },
     needs=("strategy", "recipe", "title"),
     error=PopError,
@@ -257,19 +256,15 @@ def _quick(strategy: DensityControl) -> DensityControl:
 def values_of(recipe: Recipe) -> dict[str, Any]:
     """Return what a recipe says besides density control and the POP term, in the names of `TrainConfig`."""
     return {
-        "max_steps": recipe.max_steps,
-        "sh_interval": recipe.sh_interval,
+        **{name: getattr(recipe, name) for name in ("max_steps", "sh_interval")},
         "photometric": recipe.pixelwise,
         "photometric_divisor": 1.0 / recipe.pixel_scale,
-        "lambda_ssim": recipe.lambda_ssim,
-        "l2_stop_iter": recipe.l2_stop_iter,
+        **{name: getattr(recipe, name) for name in ("lambda_ssim", "l2_stop_iter")},
         "ssim_padding": recipe.padding,
         "d_ssim_halved": recipe.d_ssim_halved,
         "profile": recipe.profile.name,
         "lr": recipe.lr,
-        "depth_lambda": recipe.depth_lambda,
-        "opacity_reg": recipe.opacity_reg,
-        "scale_reg": recipe.scale_reg,
+        **{name: getattr(recipe, name) for name in ("depth_lambda", "opacity_reg", "scale_reg")},
     }
 
 
@@ -324,3 +319,77 @@ def laid_over(plain: dict[str, Any], given: Given) -> dict[str, Any]:
         else:
             merged[path] = value
     return merged
+
+
+T = TypeVar("T")
+# up to here a float holds every whole number
+_LARGEST = 2**53
+# compiling the annotations takes as long as all else
+_hints: Callable[[type], dict[str, Any]] = cache(get_type_hints)
+
+
+def to_plain(value: Any) -> Any:
+    """Turn nested dataclasses, dicts and tuples into dicts and lists."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {field.name: to_plain(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, dict):
+        return {name: to_plain(item) for name, item in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [to_plain(item) for item in value]
+    return value
+
+
+def from_plain(kind: type[T], plain: Any, where: str, skipped: tuple[str, ...] = ()) -> T:
+    """Build a dataclass from what `to_plain` made of it; absent fields keep their default.
+
+    Args:
+        skipped: fields that plain values cannot give.
+
+    Raises:
+        PopError: an unknown field, or a value of the wrong type; names it as `where.field`.
+    """
+    if not isinstance(plain, dict):
+        raise PopError(f"{where} is {_shown(plain)}; it must be an object of settings")
+    hints = {name: hint for name, hint in _hints(kind).items() if name not in skipped}
+    for name in plain:
+        if name not in hints:
+            raise PopError(f"{where}.{name} is not a setting; the settings are {', '.join(hints)}")
+    return kind(**{name: _value(hints[name], value, f"{where}.{name}") for name, value in plain.items()})
+
+
+def _value(hint: Any, value: Any, where: str) -> Any:
+    origin, args = get_origin(hint), get_args(hint)
+    if is_dataclass(hint) and isinstance(hint, type):
+        return from_plain(hint, value, where)
+    if origin is Literal:
+        if value not in args:
+            raise PopError(f"{where} is {_shown(value)}; it must be one of {', '.join(map(_shown, args))}")
+        return value
+    if origin in (Union, types.UnionType):
+        if value is None and type(None) in args:
+            return None
+        return _value(next(arg for arg in args if arg is not type(None)), value, where)
+    if origin is tuple:
+        if not isinstance(value, list):
+            raise PopError(f"{where} is {_shown(value)}; it must be a list")
+        any_length = len(args) == 2 and args[1] is Ellipsis
+        if not any_length and len(value) != len(args):
+            raise PopError(f"{where} has {len(value)} values; it must have {len(args)}")
+        kinds = [args[0]] * len(value) if any_length else args
+        return tuple(_value(k, item, f"{where}[{i}]") for i, (k, item) in enumerate(zip(kinds, value, strict=True)))
+    return _scalar(hint, value, where)
+
+
+def _scalar(hint: Any, value: Any, where: str) -> Any:
+    if isinstance(value, int) and abs(value) > _LARGEST:
+        raise PopError(f"{where} is a number beyond 2^53; no setting is as large")
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if not isinstance(value, hint) or (hint is not bool and isinstance(value, bool)):
+        names = {int: "a whole number", float: "a number", str: "a text", bool: "true or false"}
+        raise PopError(f"{where} is {_shown(value)}; it must be {names[hint]}")
+    return value
+
+
+def _shown(value: Any) -> str:
+    return f"'{value}'" if isinstance(value, str) else str(value)

@@ -20,8 +20,6 @@ from torch import Tensor
 
 from pop_fast.errors import PopError
 
-__all__ = ["ALONE", "Ranks", "TorchRanks", "join", "local_rank"]
-
 T = TypeVar("T")
 
 # what torchrun, and other launchers after it, tell a process of itself
@@ -31,15 +29,10 @@ _PATIENCE: Final = timedelta(days=2)
 
 
 class Ranks:
-    """One process that trains by itself; `TorchRanks` is one of several.
+    """One process that trains by itself; `TorchRanks` is one of several."""
 
-    Attributes:
-        rank: number of this process, from 0; the one that writes and prints is 0.
-        size: how many there are.
-    """
-
-    rank: int = 0
-    size: int = 1
+    rank: int = 0  # number of this process, from 0; the one that writes and prints is 0
+    size: int = 1  # how many there are
 
     @property
     def writes(self) -> bool:
@@ -52,19 +45,11 @@ class Ranks:
         return range(self.rank * share, (self.rank + 1) * share)
 
     def gather(self, mine: Sequence[Tensor]) -> list[Tensor]:
-        """Return the tensors of all views of a batch, in its order.
-
-        Args:
-            mine: of the views of this process; all are of one shape and type.
-        """
+        """Return the tensors of all views of a batch, in its order; all are of one shape and type."""
         return list(mine)
 
     def total(self, mine: Iterable[Tensor]) -> Tensor:
-        """Return the sum over all views of a batch, added one after the other in its order. [P]
-
-        Args:
-            mine: vectors of the views of this process. [P]
-        """
+        """Return the sum over all views' vectors of a batch, added one after the other in its order. [P]"""
         parts = iter(mine)
         total = next(parts).clone()
         for part in parts:
@@ -95,10 +80,6 @@ class Ranks:
     def require_same(self, params: Mapping[str, Tensor], step: int) -> None:
         """Compare what the processes hold, bit by bit.
 
-        Args:
-            params: raw parameters, on the CPU.
-            step: steps taken.
-
         Raises:
             PopError: they differ, as machines of different kinds or libraries may round otherwise.
         """
@@ -120,7 +101,6 @@ class TorchRanks(Ranks):
         self.rank, self.size = self._group.get_rank(), self._group.get_world_size()
 
     def gather(self, mine: Sequence[Tensor]) -> list[Tensor]:
-        """See `Ranks.gather`."""
         sent = torch.stack(list(mine))
         received = [torch.empty_like(sent) for _ in range(self.size)]
         self._together(lambda: self._group.all_gather(received, sent))
@@ -140,7 +120,6 @@ class TorchRanks(Ranks):
         return torch.cat(whole)[:length]
 
     def exchange(self, sent: Sequence[Tensor], received: Sequence[int]) -> list[Tensor]:
-        """See `Ranks.exchange`."""
         mine = torch.cat(list(sent))
         theirs = torch.empty((sum(received), *mine.shape[1:]), dtype=mine.dtype, device=mine.device)
         lengths = [len(rows) for rows in sent]
@@ -148,17 +127,14 @@ class TorchRanks(Ranks):
         return list(theirs.split(list(received)))
 
     def share(self, whole: Tensor, bounds: Sequence[int]) -> None:
-        """See `Ranks.share`."""
         for rank, (first, last) in enumerate(itertools.pairwise(bounds)):
             if first < last:
                 self._together(lambda rank=rank, rows=whole[first:last]: self._group.broadcast(rows, rank))
 
     def any(self, flag: bool) -> bool:
-        """See `Ranks.any`."""
         return any(bool(said) for said in self.gather([torch.tensor(flag)]))
 
     def require_same(self, params: Mapping[str, Tensor], step: int) -> None:
-        """See `Ranks.require_same`."""
         digest = hashlib.sha256()
         for value in params.values():
             digest.update(value.contiguous().numpy().data)
@@ -170,11 +146,9 @@ class TorchRanks(Ranks):
             )
 
     def wait(self) -> None:
-        """See `Ranks.wait`."""
         self._together(self._group.barrier)
 
     def leave(self) -> None:
-        """See `Ranks.leave`."""
         self._group.destroy_process_group()
 
     def _together(self, call: Callable[[], T]) -> T:
@@ -191,11 +165,7 @@ ALONE: Final = Ranks()
 
 
 def local_rank() -> int:
-    """Return which of the processes of this machine this one is, from 0: LOCAL_RANK, or RANK where nobody says it.
-
-    Raises:
-        PopError: it is no whole number.
-    """
+    """Return which process of this machine this is, from 0: LOCAL_RANK, else RANK; PopError where that is no number."""
     name = next((name for name in ("LOCAL_RANK", "RANK") if os.environ.get(name)), None)
     said = "0" if name is None else os.environ[name]
     if not (said.isascii() and said.isdigit()):

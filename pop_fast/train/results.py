@@ -37,18 +37,23 @@ from __future__ import annotations
 import json
 import math
 import os
+import shlex
 import shutil
-from collections.abc import Mapping
-from contextlib import suppress
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
+from pop_fast.density.protocol import DensificationStep
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import FolderLock, check_place, is_left_behind, write_atomically
-from pop_fast.io.read_back import read_json
+from pop_fast.io.read_back import parse_json, read_json
 from pop_fast.train.config import TrainConfig
+from pop_fast.train.steps import Phase, StepStats
 
 # cfg.json is the first to step aside and the first to be written anew: where it is, the new run has begun
 _OURS = (
@@ -98,11 +103,7 @@ class ResultFolder:
             self._lock.release()
 
     def hold(self) -> None:
-        """Lock the folder until `close`, where it is there already; `begin` locks one that it makes.
-
-        Raises:
-            PopError: another run is writing to it.
-        """
+        """Lock the folder until `close` where it is there, else by `begin`; PopError where another run writes to it."""
         if self.path.is_dir():
             self._lock.take()
 
@@ -119,8 +120,6 @@ class ResultFolder:
         """Write what a run has from its start, in place of earlier results: all of it, or the folder is as it was.
 
         Args:
-            config: the settings, for cfg.json.
-            beside: other texts, by file name.
             opacities: of the first Gaussians. [N]
             overwrite: earlier results go; without it nothing but a run without checkpoints may be there.
 
@@ -282,3 +281,149 @@ def _finite(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Steps of one phase, taken one after the other, and the densification step after the last of them."""
+
+    first: int  # number of the first step, from 0
+    phase: Phase  # what they did
+    views: list[str]  # name of the photograph of each step
+    stats: list[StepStats]  # of each step
+    densification: DensificationStep | None  # what density control did after the last, None where nothing was due
+    before: int  # Gaussians that were trained
+    after: int  # Gaussians after that
+    seconds: float  # that all of it took, by the clock
+    seconds_cpu: float  # of processor time, over all threads
+
+
+def record_of(
+    segment: Segment, step: int, config: TrainConfig, lr_means: float, seconds_before: float
+) -> dict[str, Any] | None:
+    """Make the record of a step, or None where none is due: every `log_every` steps there is one, and at every change.
+
+    What the engine has not measured is left out.
+
+    Args:
+        lr_means: learning rate of the means at that step, world units.
+        seconds_before: of training, before the segment.
+    """
+    place = step - segment.first
+    stats, last = segment.stats[place], place + 1 == len(segment.stats)
+    densification = segment.densification if last else None
+    if step % config.log_every != 0 and densification is None:
+        return None
+    halved = 0.5 if segment.phase.objective.d_ssim_halved else 1.0
+    measured = {
+        segment.phase.objective.pixelwise: stats.pixelwise,
+        "d_ssim": halved * (1.0 - stats.ssim),
+        "psnr": -10.0 * math.log10(stats.square) if stats.square != 0.0 else math.inf,
+        "n_blended": stats.n_blended,
+        "n_traversed": stats.n_traversed,
+    }
+    return {
+        "step": step,
+        "view": segment.views[place],
+        "loss": stats.objective + stats.pop,
+        **{name: value for name, value in measured.items() if not math.isnan(value)},
+        **({"pop": stats.pop} if segment.phase.pop or stats.pop != 0.0 else {}),
+        "num_gaussians": segment.before if densification is None else segment.after,
+        "sh_degree": segment.phase.sh_degree,
+        "lr_means": lr_means,
+        "it_per_s": len(segment.stats) / segment.seconds,
+        "seconds": seconds_before + segment.seconds * (place + 1) / len(segment.stats),
+        **({} if densification is None else densification.record()),
+    }
+
+
+class Stopwatch:
+    """Measures a piece of work from when it is made."""
+
+    def __init__(self) -> None:
+        self._clock, self._cpu = time.perf_counter(), time.process_time()
+
+    def read(self) -> tuple[float, float]:
+        """Give the seconds since: by the clock, and of the processor over all threads of this process."""
+        return time.perf_counter() - self._clock, time.process_time() - self._cpu
+
+
+@dataclass
+class Times:
+    """The times of a run, s."""
+
+    loading: float = 0.0  # of reading the capture and of compiling, by the clock
+    sfm: float = 0.0  # of searching for the capture's cameras before that, by the clock; 0 where they were there
+    train: float = 0.0  # of steps and density control, by the clock
+    cpu: float | None = 0.0  # of the same on the processor; None where a part of the run did not count it
+    _started: float = 0.0
+
+    def start(self) -> None:
+        """Begin to count the total."""
+        self._started = time.perf_counter()
+
+    @property
+    def total(self) -> float:
+        """All since the start, by the clock, and what the run took before it was stopped."""
+        return time.perf_counter() - self._started
+
+    @contextmanager
+    def is_loading(self) -> Iterator[None]:
+        """Count what is done meanwhile as loading."""
+        start = time.perf_counter()
+        yield
+        self.loading += time.perf_counter() - start
+
+    def add(self, train: float, cpu: float) -> None:
+        """Count some steps."""
+        self.train += train
+        if self.cpu is not None:
+            self.cpu += cpu
+
+    def facts(self, on_cpu: bool) -> dict[str, float]:
+        """Give what goes with `seconds` and `seconds_total`: processor time is that of a training on a CPU."""
+        counted = {"seconds_cpu": self.cpu} if on_cpu and self.cpu is not None else {}
+        searched = {"seconds_sfm": self.sfm} if self.sfm else {}
+        return {"seconds_loading": self.loading, **searched, **counted}
+
+    def state_dict(self) -> dict[str, float | None]:
+        """Give what a checkpoint keeps."""
+        return {"train": self.train, "total": self.total, "cpu": self.cpu}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from a checkpoint that `pop_fast.train.checkpoint` has let pass."""
+        self.train, self.cpu = state["train"], state["cpu"]
+        self._started -= state["total"]
+
+
+COMMANDS_FILE: Final = "commands.json"
+_FIX: Final = "remove the file: nothing but the report reads it"
+
+
+def commands_text(earlier: Path | None, words: Sequence[str]) -> str:
+    """Return what commands.json holds: what it held if a run is resumed, and a further command."""
+    before = read_commands(earlier) if earlier is not None else []
+    return json.dumps([*before, {"words": list(words), "folder": str(Path.cwd())}], indent=2) + "\n"
+
+
+def read_commands(folder: Path) -> list[dict[str, Any]]:
+    """Read the commands of a result folder and where they were given; PopError where commands.json is damaged."""
+    path = folder / COMMANDS_FILE
+    if not path.is_file():
+        return []
+    found = parse_json(path.read_text(encoding="utf-8", errors="replace"), f"{path}:", _FIX)
+    if not isinstance(found, list) or not all(_is_command(entry) for entry in found):
+        raise PopError(f"{path}: is not a list of commands, as 'pop train' writes it; {_FIX}")
+    return found
+
+
+def _is_command(entry: Any) -> bool:
+    if not isinstance(entry, dict) or not isinstance(entry.get("folder"), str):
+        return False
+    words = entry.get("words")
+    return isinstance(words, list) and all(isinstance(word, str) for word in words)
+
+
+def shell_line(words: Sequence[str]) -> str:
+    """Write a command as a shell reads it."""
+    return shlex.join(words)

@@ -1,15 +1,22 @@
-"""What depends on the step number: what a step does, how far steps go by themselves, Adam's updates, the view order."""
+"""What depends on the step number: what a step does, how far steps go by themselves, Adam's updates, the view order.
+
+`refining` gives the settings of a training that continues where another one has ended, on the Gaussians that there are.
+Objective, colour bands and rates are those of the last step. The number of Gaussians stays: density control is at rest,
+whatever the method. The rate of the positions begins at ten times its last value and decays to that again, because what
+the Gaussians are trained among has changed.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import fields, replace
+from typing import Any, Final
 
 import torch
 from torch import Tensor
 
 from pop_fast.density.control import DensityControl
-from pop_fast.density.foreign import ForeignStrategy
+from pop_fast.density.protocol import ForeignStrategy
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.steps import Phase, Updates
 from pop_ref.settings import BETAS, PARAMETERS, LearningRates, UpdateRules
@@ -27,7 +34,6 @@ def updates_of(
 
     Args:
         lr: the rates to begin with, and the decay of the second moments.
-        scene_scale: the unit of the means' rate, world units.
         max_steps: length of the run, over which the means' rate decays.
         rules: which parameters Adam moves at which step; None moves all at every step.
         edits: steps after which Gaussians are added or removed; those outside the run are left out.
@@ -56,12 +62,7 @@ def updates_of(
 
 
 def steady_updates(lr: Mapping[str, float], steps: int) -> Updates:
-    """Move every parameter at every step, at rates that stay the same.
-
-    Args:
-        lr: learning rate by parameter.
-        steps: length of the schedule.
-    """
+    """Move every parameter at every step, at rates that stay the same."""
     rates = torch.tensor([[lr[name] for name in PARAMETERS]], dtype=torch.float64).repeat(steps, 1)
     numbers = torch.arange(1, steps + 1, dtype=torch.int32)[:, None].repeat(1, len(PARAMETERS))
     return Updates(rates, numbers)
@@ -94,13 +95,7 @@ def active_sh_degree(step: int, interval: int, degree: int, start: int = 0) -> i
 
 
 def phase_at(config: TrainConfig, strategy: DensityControl | ForeignStrategy, step: int) -> Phase:
-    """Return what a step does.
-
-    Args:
-        config: step numbers as they are run.
-        strategy: decides what is collected; of one that is not ours it is not known, and it sees to that itself.
-        step: counts from 0.
-    """
+    """Return what a step does; what a strategy of other people collects is not known, and it sees to that itself."""
     own = isinstance(strategy, DensityControl)
     return Phase(
         sh_degree=active_sh_degree(step, config.sh_interval, config.sh_degree, config.strategy.sh_start_iter),
@@ -115,12 +110,6 @@ def phase_at(config: TrainConfig, strategy: DensityControl | ForeignStrategy, st
 
 def segment_end(config: TrainConfig, strategy: DensityControl | ForeignStrategy, first: int, longest: int) -> int:
     """Return how far a stepper goes by itself: to a densification step, a milestone, another phase, or far enough.
-
-    Args:
-        config: step numbers as they are run.
-        strategy: as in `phase_at`.
-        first: the step to begin with.
-        longest: most steps at a time.
 
     Returns:
         One more than the last step of the segment.
@@ -147,13 +136,7 @@ def is_milestone(config: TrainConfig, taken: int) -> bool:
 
 
 def updates_of_strategy(config: TrainConfig, strategy: DensityControl | ForeignStrategy, scene_scale: float) -> Updates:
-    """List the rates and the numbers of all of Adam's updates of a run.
-
-    Args:
-        config: step numbers as they are run.
-        strategy: at whose changes Adam may skip or restart; of one that is not ours it is not known.
-        scene_scale: the unit of the means' rate, world units.
-    """
+    """List rates and numbers of all of Adam's updates of a run; of other people's strategy no edits are known."""
     if isinstance(strategy, ForeignStrategy):
         return updates_of(config.lr, scene_scale, config.max_steps)
     edits = [step for step in range(config.max_steps) if strategy.is_refine_step(step)]
@@ -195,3 +178,50 @@ class ViewOrder:
         self._generator.set_state(state["generator"])
         self._order = list(state["order"])
         self._position = int(state["position"])
+
+
+# what the positions' rate begins at, over its last value
+_MEANS_AGAIN: Final = 10.0
+# settings of every method that time a change of the Gaussians or of the schedule, and what each is when there is none
+_NEVER: Final[dict[str, Any]] = {
+    **dict.fromkeys(("refine_stop_iter", "reset_every", "blur_start_iter", "refine_scale2d_stop_iter"), 0),
+    **dict.fromkeys(("means_rewind_iter", "rounds_start_iter"), 0),
+    **dict.fromkeys(("final_prune_iter", "blur_stop_iter", "sample_iter", "prune_iter"), -1),
+    **dict.fromkeys(("prune_shares", "reinit_iters", "soft_prune_iters", "hard_prune_iters"), ()),
+    "reset_at_zero": False,
+}
+
+
+def at_rest(strategy: DensityControl) -> DensityControl:
+    """Return the strategy of a method with every change of the Gaussians left out."""
+    own = {field.name for field in fields(strategy)}
+    return replace(strategy, **{name: value for name, value in _NEVER.items() if name in own})
+
+
+def refining(config: TrainConfig, steps: int) -> TrainConfig:
+    """Return the settings of a training that continues after the last step of another one."""
+    last, plan, lr = config.max_steps - 1, config.strategy, config.lr
+    degree = active_sh_degree(last, config.sh_interval, config.sh_degree, plan.sh_start_iter)
+    begins = min(_MEANS_AGAIN * lr.means_decay, 1.0)
+    ended = {name: lr.others_decay * getattr(lr, name) for name in ("scales", "quats", "sh0", "sh_rest")}
+    strategy = replace(
+        at_rest(plan),
+        # bands open at regular steps, which are counted from a past in which those in use have opened
+        sh_start_iter=-degree * steps,
+        pop_start_iter=0,
+        pop_stop_iter=steps if plan.regularizes(last) else 0,
+        opacities_stop_iter=0 if 0 <= plan.opacities_stop_iter <= last else -1,
+    )
+    return replace(
+        config,
+        given=None,
+        max_steps=steps,
+        strategy=strategy,
+        sh_interval=steps,
+        l2_stop_iter=0 if config.l2_stop_iter is not None and last >= config.l2_stop_iter else None,
+        lr=replace(lr, **ended, others_decay=1.0, means=begins * lr.means, means_decay=lr.means_decay / begins),
+        eval_steps=(),
+        save_steps=(),
+        max_renders=0,
+        coarse_stop_iters=(),
+    )

@@ -15,8 +15,6 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any, TypeVar
 
-__all__ = ["Abandoned", "StopRequest", "heard", "stop_requests"]
-
 T = TypeVar("T")
 
 
@@ -46,11 +44,7 @@ class StopRequest:
         return ctypes.addressof(self._flag)
 
     def ask(self) -> None:
-        """Ask for an end.
-
-        Raises:
-            Abandoned: within a block of `abandoning`.
-        """
+        """Ask for an end; within a block of `abandoning`, raise Abandoned."""
         self._flag.value = 1
         if self._abandons:
             self._abandons = False
@@ -59,9 +53,6 @@ class StopRequest:
     @contextlib.contextmanager
     def abandoning(self, allowed: bool = True) -> Iterator[None]:
         """Let a request end the block at once, as nothing that must be kept is changed by it.
-
-        Args:
-            allowed: False only runs the block.
 
         Raises:
             Abandoned: somebody has asked, before the block or while it ran.
@@ -109,9 +100,6 @@ def stop_requests(stop: StopRequest | None = None) -> Iterator[StopRequest]:
 
     The second one is obeyed at once. SIGHUP stays ignored where it is, as under nohup. Outside the main thread, where
     Python delivers no signals, nobody ever asks.
-
-    Args:
-        stop: what is asked; None makes one.
     """
     stop = StopRequest() if stop is None else stop
     if threading.current_thread() is not threading.main_thread():

@@ -1,24 +1,32 @@
-"""What takes the steps of a training run, on any engine; `TrainingRun` does all the rest."""
+"""What takes the steps of a training run, on any engine; `TrainingRun` does all the rest.
+
+`FusedStepper` has them taken by something that takes a whole step by itself: the fused step on a GPU, or one like it.
+That is given rows, the photographs and `StepSettings`; it holds the statistics of density control in its own arrays,
+which are copied into the strategy's state after every segment, in the strategy's own types.
+"""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import torch
+from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam
 
 from pop_fast.api.backend import Renderer
 from pop_fast.density.control import DensityControl
-from pop_fast.density.foreign import ForeignStrategy
-from pop_fast.density.protocol import State
+from pop_fast.density.protocol import ForeignStrategy, State
+from pop_fast.stages.density import blur_set
 from pop_fast.train.appearance import Appearance
 from pop_fast.train.config import TrainConfig
+from pop_fast.train.model import KEYS
 from pop_fast.train.ranks import ALONE, Ranks
 from pop_fast.train.signals import StopRequest
-from pop_fast.train.steps import Phase, StepStats, Updates
+from pop_fast.train.steps import Collected, Phase, StepSettings, StepStats, Updates
 from pop_fast.train.views import ViewTensors
 
 
@@ -28,14 +36,10 @@ class Stepper(Protocol):
     It works on what it is bound to and owns nothing that a checkpoint needs: after `steps` the parameters, the
     optimizers' state and the strategy's statistics in `state` are those of the last step; where several processes train
     together, after `synchronize`.
-
-    Attributes:
-        name: of the engine, for the statistics of a run.
-        step: steps taken.
     """
 
-    name: str
-    step: int
+    name: str  # of the engine, for the statistics of a run
+    step: int  # steps taken
 
     @property
     def longest(self) -> int:
@@ -68,31 +72,18 @@ class Stepper(Protocol):
 
 @dataclass(frozen=True)
 class Task:
-    """What a stepper is to train.
+    """What a stepper is to train."""
 
-    Attributes:
-        config: step numbers as they are run.
-        strategy: the one of density control.
-        views: to train on.
-        order: the views of every step, `config.batch_size` of them a step.
-        updates: which parameters Adam moves at which step.
-        step: steps taken.
-        appearance: what is learned of the photographs.
-        ranks: the processes that draw the views of a step.
-        stop: whether somebody has asked for an end.
-        scene_scale: by which depth is compared, world units.
-    """
-
-    config: TrainConfig
-    strategy: DensityControl | ForeignStrategy
-    views: Sequence[ViewTensors]
-    order: Sequence[int]
-    updates: Updates
-    step: int
-    appearance: Appearance
-    ranks: Ranks = ALONE
-    stop: StopRequest = field(default_factory=StopRequest)
-    scene_scale: float = 1.0
+    config: TrainConfig  # step numbers as they are run
+    strategy: DensityControl | ForeignStrategy  # the one of density control
+    views: Sequence[ViewTensors]  # to train on
+    order: Sequence[int]  # the views of every step, `config.batch_size` of them a step
+    updates: Updates  # which parameters Adam moves at which step
+    step: int  # steps taken
+    appearance: Appearance  # what is learned of the photographs
+    ranks: Ranks = ALONE  # the processes that draw the views of a step
+    stop: StopRequest = field(default_factory=StopRequest)  # whether somebody has asked for an end
+    scene_scale: float = 1.0  # by which depth is compared, world units
 
     @property
     def may_abandon(self) -> bool:
@@ -102,20 +93,182 @@ class Task:
 
 @dataclass(frozen=True)
 class Engine:
-    """Where and by what a run is done.
+    """Where and by what a run is done."""
 
-    Attributes:
-        name: that settings give it, under which a run is resumed.
-        device: holds parameters, moments and statistics.
-        backend: renders there for measurements, from and to the CPU.
-        make_stepper: makes what takes the steps.
-        facts: goes into the statistics of a run.
-        depends_on_threads: whether another number of threads may round otherwise; if not, a run is resumed with any.
-    """
-
-    name: str
-    device: torch.device
-    backend: Renderer
-    make_stepper: Callable[[Task], Stepper]
-    facts: Callable[[], dict[str, Any]] = dict
+    name: str  # that settings give it, under which a run is resumed
+    device: torch.device  # holds parameters, moments and statistics
+    backend: Renderer  # renders there for measurements, from and to the CPU
+    make_stepper: Callable[[Task], Stepper]  # makes what takes the steps
+    facts: Callable[[], dict[str, Any]] = dict  # goes into the statistics of a run
+    # whether another number of threads may round otherwise; if not, a run is resumed with any
     depends_on_threads: bool = True
+
+
+Rows = Mapping[str, Tensor]
+# s, after which a block of steps should be done, so that its progress is seen
+BLOCK_SECONDS: Final = 1.0
+
+
+class Fused(Protocol):
+    """What takes whole steps: `cuda_ext.training.train_step.FusedTrainer`, where each of these is explained."""
+
+    step: int
+
+    @property
+    def statistics(self) -> Any:
+        """What density control reads: `Collected`, or what has its attributes."""
+        ...
+
+    def rebind(self, params: Rows, m: Rows, v: Rows) -> None:
+        """Take new rows after a density step; statistics start from nothing."""
+        ...
+
+    def run(self, until: int, phase: Phase) -> None:
+        """Take steps of one phase until the counter stands at `until`, or until somebody has asked for an end."""
+        ...
+
+    def step_stats(self, first: int, last: int) -> Sequence[Sequence[float]]:
+        """Return the measurements of the steps from `first` to before `last`, in the order of `StepStats`."""
+        ...
+
+    def synchronize(self) -> None:
+        """Take over the rows, moments and statistics that other processes moved since the last time."""
+        ...
+
+    def facts(self) -> dict[str, int]:
+        """Return what the statistics of a run tell of the device."""
+        ...
+
+
+# parameters, first and second moments, the views, the view of every step, settings, the step to begin at
+MakeFused = Callable[[Rows, Rows, Rows, Sequence[ViewTensors], Sequence[int], StepSettings, int], Fused]
+
+
+@dataclass
+class FusedStepper:
+    """Takes steps by `make`, of `batch_size` views where that knows them, at most `most` at a time; see `Stepper`."""
+
+    task: Task
+    name: str
+    most: int
+    make: MakeFused
+    fused: Fused | None = None
+
+    def __post_init__(self) -> None:
+        self.step, self._views = self.task.step, self.task.config.batch_size
+        # of the last steps, a pixel
+        self._seconds: float | None = None
+        self._optimizers: Mapping[str, Adam] = {}
+        self._params: dict[str, Parameter] = {}
+        self._state: State = {}
+        # the last step taken and its phase, while what was collected is not in the strategy's state
+        self._collected: tuple[int, Phase] | None = None
+
+    def rebind(self, params: dict[str, Parameter], optimizers: Mapping[str, Adam], state: State) -> None:
+        self._params, self._optimizers, self._state = params, optimizers, state
+        rows = {key: params[key].detach() for key in KEYS}
+        moments = {key: optimizers[key].state[params[key]] for key in KEYS}
+        m, v = ({key: moments[key][name] for key in KEYS} for name in ("exp_avg", "exp_avg_sq"))
+        if self.fused is None:
+            task = self.task
+            settings = step_settings(task.config, task.updates, task.scene_scale)
+            self.fused = self.make(rows, m, v, task.views, task.order, settings, self.step)
+        else:
+            self.fused.rebind(rows, m, v)
+        self._give_statistics(self.fused.statistics)
+
+    @property
+    def longest(self) -> int:
+        """See `Stepper.longest`: as many as take about a second, if a pixel takes what it took last; one at least."""
+        if self._seconds is None:
+            return 1
+        seconds = 0.0
+        for count in range(min(self.most, len(self.task.order) // self._views - self.step)):
+            seconds += self._seconds * self._pixels(self.step + count, self.step + count + 1)
+            if seconds > BLOCK_SECONDS:
+                return max(count, 1)
+        return self.most
+
+    def _pixels(self, first: int, last: int) -> int:
+        """Return how many pixels the views of some steps have."""
+        views = [self.task.views[index] for index in self.task.order[first * self._views : last * self._views]]
+        return sum(view.height * view.width for view in views)
+
+    def steps(self, first: int, last: int, phase: Phase) -> list[StepStats]:
+        assert self.fused is not None
+        if self._collected is not None and self._collected[1] != phase:
+            self.synchronize()
+        start = time.perf_counter()
+        try:
+            self.fused.run(last, phase)
+        finally:
+            self.step = last = self.fused.step
+        if last <= first:
+            return []
+        self._collected = last, phase
+        if phase.statistics:
+            self._state["views"] += (last - first) * self._views
+        if self.task.ranks.size == 1:
+            self.synchronize()
+        took = torch.tensor([time.perf_counter() - start], dtype=torch.float64)
+        # processes that train together agree on how many steps come next
+        took = max(float(one) for one in self.task.ranks.gather([took]))
+        self._seconds = took / max(self._pixels(first, last), 1)
+        numbers = self.task.updates.numbers[first:last].amax(0).tolist()
+        for key, number in zip(KEYS, numbers, strict=True):
+            if number > 0:
+                self._optimizers[key].state[self._params[key]]["step"].fill_(float(number))
+        return [StepStats(*row) for row in self.fused.step_stats(first, last)]
+
+    def synchronize(self) -> None:
+        if self.fused is not None and self._collected is not None:
+            self.fused.synchronize()
+            self._take_statistics(self.fused.statistics, *self._collected)
+            self._collected = None
+
+    def facts(self) -> dict[str, Any]:
+        return {} if self.fused is None else dict(self.fused.facts())
+
+    def _take_statistics(self, found: Collected, last: int, phase: Phase) -> None:
+        """Copy what was collected into the strategy's state."""
+        state, pop = self._state, self.task.config.strategy
+        if phase.statistics:
+            state["grad2d"], state["count"] = found.grad_sum.clone(), found.n_visible.to(found.grad_sum.dtype)
+        if found.sh_rest_sum is not None:
+            state["sh_rest_sum"] = found.sh_rest_sum.clone()
+        summed = phase.blur and pop.blur_window == "sum"
+        if summed or phase.window:
+            state["dominant_sum"] = found.dominant_sum.long()
+        if not phase.blur:
+            return
+        if summed:
+            view = self.task.views[self.task.order[last * self._views - 1]]
+            bound = (view.width, view.height, pop.theta_blur, pop.blur_min_pixels, view.kept_pixels)
+            state["blurred"] = blur_set(state["dominant_sum"], *bound)
+        else:
+            state["blurred"] = found.blurred.bool()
+
+    def _give_statistics(self, found: Collected) -> None:
+        """Go on from the strategy's state: after a checkpoint, or a change that kept the window."""
+        given = {"grad2d": found.grad_sum, "count": found.n_visible, "dominant_sum": found.dominant_sum}
+        for key, target in {**given, "blurred": found.blurred, "sh_rest_sum": found.sh_rest_sum}.items():
+            if target is not None and self._state.get(key) is not None:
+                target.copy_(self._state[key])
+
+
+def step_settings(config: TrainConfig, updates: Updates, scene_scale: float = 1.0) -> StepSettings:
+    """Return what stays the same over a run.
+
+    Args:
+        scene_scale: world units.
+    """
+    of_strategy = ("lambda_pop", "lambda_entropy", "pop_views", "pop_over")
+    of_strategy += ("blur_window", "theta_blur", "blur_min_pixels")
+    return StepSettings(
+        updates,
+        padding=config.ssim_padding,
+        depth_weight=config.depth_lambda * scene_scale,
+        profile=config.renderer,
+        **{name: getattr(config.strategy, name) for name in of_strategy},
+        **{name: getattr(config, name) for name in ("opacity_reg", "scale_reg", "background", "antialiased")},
+    )

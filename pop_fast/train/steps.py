@@ -24,21 +24,16 @@ if TYPE_CHECKING:
 
 
 class Updates(NamedTuple):
-    """Which parameters Adam moves at every step of a schedule, and how far: meaning in `pop_ref.optimizer`.
+    """Which parameters Adam moves at every step of a schedule, and how far: meaning in `pop_ref.optimizer`."""
 
-    Attributes:
-        rates: learning rates, that of the means in world units. [steps, groups] float64
-        numbers: the number of the update, from 1, that the bias corrections are of; 0 where a parameter is not moved.
-            [steps, groups] int32
-        sh_rest_every: gradients of the bands beyond the first are summed up from one update to the next if it is > 1;
-            else those of a step without an update are lost, as all other parameters' are.
-        betas: decay of Adam's first and second moments.
-    """
-
-    rates: Tensor
+    rates: Tensor  # learning rates, that of the means in world units. [steps, groups] float64
+    # the number of the update, from 1, that the bias corrections are of; 0 where a parameter is not moved. [steps,
+    # groups] int32
     numbers: Tensor
+    # gradients of the bands beyond the first are summed up from one update to the next if it is > 1; else those of a
+    # step without an update are lost, as all other parameters' are
     sh_rest_every: int = 1
-    betas: tuple[float, float] = BETAS
+    betas: tuple[float, float] = BETAS  # decay of Adam's first and second moments
 
     def __len__(self) -> int:
         return len(self.rates)
@@ -46,49 +41,37 @@ class Updates(NamedTuple):
 
 @dataclass(frozen=True)
 class StepSettings:
-    """What all steps of a run depend on.
+    """What all steps of a run depend on."""
 
-    Attributes:
-        updates: which parameters Adam moves at which step.
-        padding: SSIM's border, by which photographs are prepared; that of every phase's objective.
-        lambda_pop: weight of the POP term where it is on.
-        lambda_entropy: weight of the mean entropy of the opacities where it is on.
-        pop_views: important is what dominates a pixel of the "current" view, or of any view of the "window".
-        pop_over: the POP term averages over "all" Gaussians, or over those "visible" in the view.
-        blur_window: under "any_view" a blur flag stays up, under "own_view" it is the last view's alone, under "sum"
-            the caller makes it of the summed counts.
-        theta_blur: share of the image a Gaussian must dominate to be blurred.
-        blur_min_pixels: and at least so many pixels.
-        depth_weight: weight of the disparities at sparse points, the scene's scale included.
-        opacity_reg, scale_reg: weights of the mean opacity and of the mean scale.
-        background: colour behind everything.
-        profile, antialiased: of the renderer.
-        backward, deterministic: of the step on a GPU, as `cuda_ext.arrays.Settings` says.
-        eps: Adam's.
-        replay: replay steps as CUDA graphs; False launches every kernel anew, for debuggers and profilers.
-        counts: also tell how many splats every pixel blends and visits, which training does not read.
-    """
-
-    updates: Updates
+    updates: Updates  # which parameters Adam moves at which step
+    # SSIM's border, by which photographs are prepared; that of every phase's objective
     padding: Padding = Recipe.padding
-    lambda_pop: float = Recipe.lambda_pop
-    lambda_entropy: float = Recipe.lambda_entropy
+    lambda_pop: float = Recipe.lambda_pop  # weight of the POP term where it is on
+    lambda_entropy: float = Recipe.lambda_entropy  # weight of the mean entropy of the opacities where it is on
+    # important is what dominates a pixel of the "current" view, or of any view of the "window"
     pop_views: str = Recipe.pop_views
+    # the POP term averages over "all" Gaussians, or over those "visible" in the view
     pop_over: str = Recipe.pop_over
+    # under "any_view" a blur flag stays up, under "own_view" it is the last view's alone, under "sum" the caller
+    # makes it of the summed counts
     blur_window: str = DensityConfig.blur_window
-    theta_blur: float = DensityConfig.theta_blur
-    blur_min_pixels: float = DensityConfig.blur_min_pixels
-    depth_weight: float = 0.0
+    theta_blur: float = DensityConfig.theta_blur  # share of the image a Gaussian must dominate to be blurred
+    blur_min_pixels: float = DensityConfig.blur_min_pixels  # and at least so many pixels
+    depth_weight: float = 0.0  # weight of the disparities at sparse points, the scene's scale included
+    # opacity_reg, scale_reg: weights of the mean opacity and of the mean scale
     opacity_reg: float = 0.0
     scale_reg: float = 0.0
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # colour behind everything
+    # profile, antialiased: of the renderer
     profile: Profile = Recipe.profile
     antialiased: bool = False
+    # backward, deterministic: of the step on a GPU, as `cuda_ext.arrays.Settings` says
     backward: str = "pixel_parallel"
     deterministic: bool = True
     eps: float = EPS
+    # replay steps as CUDA graphs; False launches every kernel anew, for debuggers and profilers
     replay: bool = True
-    counts: bool = False
+    counts: bool = False  # also tell how many splats every pixel blends and visits, which training does not read
 
     def blur_pixels(self, kept_pixels: int) -> float:
         """Return the whole number of pixels that a blurred Gaussian dominates more than, of a view's that count."""
@@ -97,25 +80,16 @@ class StepSettings:
 
 
 class Phase(NamedTuple):
-    """What one kind of step does; steps of one phase and one image size share a graph.
+    """What one kind of step does; steps of one phase and one image size share a graph."""
 
-    Attributes:
-        sh_degree: highest active colour band.
-        pop: the POP term is on.
-        statistics: screen gradients are collected.
-        blur: dominant pixels are collected.
-        objective: what the render is compared with its photograph by.
-        window: dominant pixels are summed over the window for the POP term, also where blur is not asked for.
-        entropy: the entropy of the opacities is in the loss.
-    """
-
-    sh_degree: int
-    pop: bool
-    statistics: bool
-    blur: bool
-    objective: Objective = Objective()
+    sh_degree: int  # highest active colour band
+    pop: bool  # the POP term is on
+    statistics: bool  # screen gradients are collected
+    blur: bool  # dominant pixels are collected
+    objective: Objective = Objective()  # what the render is compared with its photograph by
+    # dominant pixels are summed over the window for the POP term, also where blur is not asked for
     window: bool = False
-    entropy: bool = False
+    entropy: bool = False  # the entropy of the opacities is in the loss
 
     @property
     def dominance(self) -> bool:
@@ -127,24 +101,16 @@ class StepStats(NamedTuple):
     """Measurements of one step, the first five in the order of the compiled steps.
 
     An engine need not measure all of them at every step; NaN stands for what it has not measured.
-
-    Attributes:
-        pixelwise: mean of the objective's pixelwise loss, without its weight.
-        ssim: SSIM.
-        objective: the photometric objective.
-        square: mean square of the difference, the render clamped to [0, 1].
-        pop: the weighted regularizers: the strategy's, as the POP term is, and those of the settings; 0 without any.
-        n_blended: Gaussians that a pixel blends, on average.
-        n_traversed: entries of its tile's list that a pixel visits, on average.
     """
 
-    pixelwise: float
+    pixelwise: float  # mean of the objective's pixelwise loss, without its weight
     ssim: float
     objective: float
-    square: float
+    square: float  # mean square of the difference, the render clamped to [0, 1]
+    # the weighted regularizers: the strategy's, as the POP term is, and those of the settings; 0 without any
     pop: float
-    n_blended: float = math.nan
-    n_traversed: float = math.nan
+    n_blended: float = math.nan  # Gaussians that a pixel blends, on average
+    n_traversed: float = math.nan  # entries of its tile's list that a pixel visits, on average
 
 
 @dataclass
@@ -190,23 +156,16 @@ _ONLY: Final[Mapping[str, Any]] = MappingProxyType(
 
 @dataclass(frozen=True)
 class WholeStep:
-    """What a backend offers in addition to its stages where it takes training steps by itself.
+    """What a backend offers in addition to its stages where it takes training steps by itself."""
 
-    Attributes:
-        name: of what takes the steps, for the statistics of a run.
-        make: given a `pop_fast.train.stepper.Task`, returns what makes a `pop_fast.train.fused_stepper.Fused`.
-        most: steps at a time, however quick they are, before the program looks up: Ctrl-C, the progress bar.
-        losses: names of the losses between pixels that it knows.
-        only: settings by name, with the one value of each that it knows; those of the strategy begin with "strategy.".
-        depends_on_threads: whether another number of threads may round otherwise.
-    """
-
-    name: str
+    name: str  # of what takes the steps, for the statistics of a run
+    # given a `pop_fast.train.stepper.Task`, returns what makes a `pop_fast.train.stepper.Fused`
     make: Callable[[Any], Callable[..., Any]]
-    most: int
-    losses: tuple[str, ...] = ("l2", "l1")
+    most: int  # steps at a time, however quick they are, before the program looks up: Ctrl-C, the progress bar
+    losses: tuple[str, ...] = ("l2", "l1")  # names of the losses between pixels that it knows
+    # settings by name, with the one value of each that it knows; those of the strategy begin with "strategy."
     only: Mapping[str, Any] = field(default_factory=lambda: _ONLY)
-    depends_on_threads: bool = True
+    depends_on_threads: bool = True  # whether another number of threads may round otherwise
 
     def unknown(self, config: TrainConfig) -> Iterator[tuple[str, Any, Any]]:
         """Give name, value and the one known value of every setting that it does not know."""
@@ -228,11 +187,6 @@ def why_not_trained(backend: Backend, config: TrainConfig, own_strategy: bool = 
     """Return one sentence on why a backend cannot take the steps of a run and what to do, or None.
 
     Where the tensors are the CPU's, autograd over the stages takes whatever steps a whole one does not know.
-
-    Args:
-        backend: which can run here.
-        config: the settings.
-        own_strategy: whether the density strategy is one of this package.
     """
     if backend.device == "cpu":
         return None

@@ -23,35 +23,31 @@ from tqdm import tqdm
 
 from pop_fast.data.capture import Capture
 from pop_fast.data.initialize import initialize_params
-from pop_fast.density.foreign import ForeignStrategy
 from pop_fast.density.passes import Passes
-from pop_fast.density.protocol import DensificationStep, Draws, Strategy
+from pop_fast.density.protocol import DensificationStep, Draws, ForeignStrategy, Strategy
 from pop_fast.errors import PopError
 from pop_fast.io.heartbeat import Heartbeat, so_far
 from pop_fast.io.ply import Frame, save_ply
 from pop_fast.stages.covariance import opacities_from_logits
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.appearance import Appearance
-from pop_fast.train.batch_stepper import check_batch
 from pop_fast.train.checkpoint import moved_to, on_cpu
 from pop_fast.train.choose import choose_backend
-from pop_fast.train.coarse import coarse_to_fine
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.engines import engine_of
+from pop_fast.train.engines import engine_of, translate_oom
 from pop_fast.train.environment import reproducible, run_facts, versions
 from pop_fast.train.evaluate import evaluate, population
-from pop_fast.train.gpu_proxy import translate_oom
 from pop_fast.train.lpips import load_nets
 from pop_fast.train.model import KEYS, make_optimizers, require_usable
 from pop_fast.train.preflight import check_start, check_views, facts, find_warnings
 from pop_fast.train.ranks import ALONE, Ranks
-from pop_fast.train.records import Segment, Stopwatch, Times, record_of
-from pop_fast.train.results import ResultFolder
+from pop_fast.train.results import ResultFolder, Segment, Stopwatch, Times, record_of
 from pop_fast.train.schedule import ViewOrder, active_sh_degree, phase_at, reads_rows, segment_end, updates_of_strategy
 from pop_fast.train.signals import Abandoned, StopRequest, stop_requests
 from pop_fast.train.stepper import Engine, Stepper, Task
 from pop_fast.train.steps import Phase, StepStats
-from pop_fast.train.views import ViewTensors
+from pop_fast.train.torch_stepper import check_batch
+from pop_fast.train.views import ViewTensors, coarse_to_fine
 
 Watch = Callable[["TrainingRun"], None]
 _WATCHED_STEPS: Final = 5  # at a time, between which a watch sees the run
@@ -229,7 +225,7 @@ class TrainingRun:
     def take_steps(self, last: int) -> Segment:
         """Take the steps up to `last`, and the densification step that is due after them.
 
-        All are of one phase, and none but the last is followed by a densification step; see `phases.segment_end`.
+        All are of one phase, and none but the last is followed by a densification step; see `segment_end`.
 
         Args:
             last: how many steps will have been taken, over `step`.

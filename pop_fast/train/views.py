@@ -1,11 +1,18 @@
-"""A capture's views as tensors, the one call that renders them from raw parameters, and such a render in layers."""
+"""A capture's views as tensors, also shrunk, the one call that renders them from raw parameters, and renders in layers.
+
+Coarse to fine: the first steps see the photographs shrunk, whose large shapes are learned at a fraction of the cost.
+`coarse_stop_iters` = (a, b) shrinks by 4 until step a and by 2 until step b. What a step sees is a view like any other,
+so that nothing of a step's meaning changes: its photograph is the average of the original's pixels, its camera the same
+one with fewer pixels. Densification reads the gradients and the dominated pixels of the view as it is seen.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any, Final, TypeVar
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -23,26 +30,18 @@ V = TypeVar("V")
 
 @dataclass(frozen=True, eq=False)
 class ViewTensors:
-    """One view.
+    """One view."""
 
-    Attributes:
-        name: relative file name.
-        photo: uint8 [H, W, 3]
-        mask: True where the photograph counts, or None. bool [H, W]
-        viewmat: world -> camera, in the precision of the training. [1, 4, 4]
-        K: intrinsics, px, likewise. [1, 3, 3]
-        alpha: opacity of a photograph with transparency, which `photo` has laid over the settings' background, of 255;
-            None where it has none. uint8 [H, W]
-        points: sparse points that it sees, world, in the precision of the camera; None where they are not known or not
-            asked for. [P, 3]
-    """
-
-    name: str
-    photo: Tensor
-    mask: Tensor | None
-    viewmat: Tensor
-    K: Tensor
+    name: str  # relative file name
+    photo: Tensor  # uint8 [H, W, 3]
+    mask: Tensor | None  # True where the photograph counts, or None. bool [H, W]
+    viewmat: Tensor  # world -> camera, in the precision of the training. [1, 4, 4]
+    K: Tensor  # intrinsics, px, likewise. [1, 3, 3]
+    # opacity of a photograph with transparency, which `photo` has laid over the settings' background, of 255; None
+    # where it has none. uint8 [H, W]
     alpha: Tensor | None = None
+    # sparse points that it sees, world, in the precision of the camera; None where they are not known or not asked
+    # for. [P, 3]
     points: Tensor | None = None
 
     @classmethod
@@ -50,8 +49,6 @@ class ViewTensors:
         """Take over a view of a capture, its camera in a precision.
 
         Args:
-            view: the view.
-            dtype: the precision.
             points: the capture's, of which those that the view sees are kept; None keeps none.
 
         Raises:
@@ -145,16 +142,11 @@ def render_view(
     Colour bands above `sh_degree` are left out of the graph, so that their gradient need not be made to be zero.
 
     Args:
-        backend: what renders.
-        params: raw parameters.
         view: the camera, and the mask that `dominant_counts` are restricted to.
-        config: background, profile and antialiasing are read.
-        sh_degree: highest active colour band.
         dominance: dominant ids and counts will be read from `info`.
         counts: Gaussians per pixel will be read from `info`.
         absgrad: so will the gradient of the screen centres summed of absolute values.
         background: colour behind everything in the place of the config's. [3]
-        depth: also render the expected depth.
     """
     given = rasterization_arguments(params, view, config, sh_degree, background)
     mode = {"render_mode": "RGB+ED"} if depth else {}
@@ -175,11 +167,7 @@ def rasterization_arguments(
     sh_degree: int,
     background: Tensor | None = None,
 ) -> dict[str, Any]:
-    """Return what `rasterization()` is given for a view of raw parameters.
-
-    Args:
-        params, view, config, sh_degree, background: as of `render_view`.
-    """
+    """Return what `rasterization()` is given for a view of raw parameters."""
     opacities = opacities_from_logits(params["opacities"])
     bands = (sh_degree + 1) ** 2
     sh = params["sh0"] if bands == 1 else torch.cat([params["sh0"], params["shN"][:, : bands - 1]], dim=1)
@@ -211,18 +199,13 @@ def _counts_inside(dominant_ids: Tensor, mask: Tensor, n: int) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """What one camera sees.
+    """What one camera sees."""
 
-    Attributes:
-        image: encoded RGB, not clamped. float32 [H, W, 3]
-        alpha: 1 - T_final, how much of the background is covered. float32 [H, W]
-        depth: mean camera z of what is blended, by weight; world units, 0 where nothing is. float32 [H, W]
-        dominant_ids: the Gaussian with the largest weight, -1 none; None where it was not asked for. int [H, W]
-    """
-
-    image: np.ndarray
-    alpha: np.ndarray
+    image: np.ndarray  # encoded RGB, not clamped. float32 [H, W, 3]
+    alpha: np.ndarray  # 1 - T_final, how much of the background is covered. float32 [H, W]
+    # mean camera z of what is blended, by weight; world units, 0 where nothing is. float32 [H, W]
     depth: np.ndarray
+    # the Gaussian with the largest weight, -1 none; None where it was not asked for. int [H, W]
     dominant_ids: np.ndarray | None
 
 
@@ -238,15 +221,62 @@ def render_layers(
     """Render colour and depth of a camera in one pass.
 
     Args:
-        backend: what renders.
-        params: raw parameters.
         view: the camera; its photograph gives the size alone.
-        config: background, profile and antialiasing are read.
-        sh_degree: highest active colour band.
-        dominance: also find the dominant Gaussians.
     """
     given = rasterization_arguments(params, view, config, sh_degree)
     drawn, alphas, info = backend.rasterization(**given, render_mode="RGB+ED", dominance=dominance)
     found = drawn[0].cpu().numpy()
     ids = info["dominant_ids"][0].cpu().numpy() if dominance else None
     return Layers(found[..., :3], alphas[0, ..., 0].cpu().numpy(), found[..., 3], ids)
+
+
+# px, a side that no view is shrunk below: a few of SSIM's windows of 11
+SMALLEST_SIDE: Final = 32
+
+
+def coarse_to_fine(
+    views: Sequence[ViewTensors], order: Sequence[int], stops: Sequence[int], size: int
+) -> tuple[list[ViewTensors], list[int]]:
+    """Return the views at every size that is seen, and which of them every step, of `size` views, sees."""
+    return with_shrunk(views, stops), [
+        index_at(place // size, index, len(views), stops) for place, index in enumerate(order)
+    ]
+
+
+def with_shrunk(views: Sequence[ViewTensors], stops: Sequence[int]) -> list[ViewTensors]:
+    """Return the views, then all of them shrunk by 2, by 4 and so on, one power for every entry of `stops`."""
+    return [shrunk(view, 2**level) for level in range(len(stops) + 1) for view in views]
+
+
+def index_at(step: int, index: int, n_views: int, stops: Sequence[int]) -> int:
+    """Return where the view that a step sees stands in `with_shrunk`."""
+    return index + n_views * sum(step < stop for stop in stops)
+
+
+def shrunk(view: ViewTensors, factor: int) -> ViewTensors:
+    """Return a view with a smaller photograph, and the camera that takes it.
+
+    Args:
+        factor: power of 2, of which as much is used as leaves a side of 32 px.
+
+    Returns:
+        The view of round(H / factor) by round(W / factor) px; a pixel counts where half of what it averages does.
+    """
+    while factor > 1 and min(view.height, view.width) < SMALLEST_SIDE * factor:
+        factor //= 2
+    if factor == 1:
+        return view
+    height, width = round(view.height / factor), round(view.width / factor)
+
+    def small(image: Tensor) -> Tensor:
+        resized = cv2.resize(image.numpy(), (width, height), interpolation=cv2.INTER_AREA)
+        return torch.from_numpy(np.ascontiguousarray(resized))
+
+    K = view.K.clone()
+    K[:, 0] *= width / view.width
+    K[:, 1] *= height / view.height
+    mask = None if view.mask is None else small(view.mask.float()) >= 0.5
+    if mask is not None and not mask.any():
+        return shrunk(view, factor // 2)
+    alpha = None if view.alpha is None else small(view.alpha)
+    return replace(view, photo=small(view.photo), mask=mask, K=K, alpha=alpha)

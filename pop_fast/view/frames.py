@@ -29,8 +29,8 @@ from pop_fast.io.image_header import HEIF_SUFFIXES
 from pop_fast.io.images import IMAGE_SUFFIXES, write_png
 from pop_fast.io.ply import Frame, save_ply
 from pop_fast.train.config import TrainConfig
+from pop_fast.train.engines import renderer
 from pop_fast.train.environment import reproducible
-from pop_fast.train.gpu_proxy import renderer
 from pop_fast.train.load_result import Splat, paths_read
 from pop_fast.train.views import ViewTensors, render_view
 from pop_fast.view.paths import PATHS, VideoFile, camera_path

@@ -180,7 +180,7 @@ def program(name: str, package: str, backend: str, dtype: str) -> Any:
     trains = training_stages(package, own_adam.get("adam_step")) | own_adam | photograph_stages(package, backend, dtype)
     if backend == "compiled":
         # one module of its own holds the passes over views
-        scores = importlib.import_module(f"{package}.compiled.scores")
+        scores = importlib.import_module(f"{package}.compiled.compositing")
         passes = ("contributions", "sensitivities", "screen_moments", "fisher_blocks", "dominant_points")
         trains |= {name: getattr(scores, name) for name in passes}
     return TorchAdapter(name, rasterization, stages, dtype, stages=trains)

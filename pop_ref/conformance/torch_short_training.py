@@ -72,8 +72,8 @@ class Trainee:
 
     def coarse_view(self, photo: np.ndarray, mask: np.ndarray | None, K: np.ndarray, factor: int) -> dict[str, Any]:
         """Return photograph, mask and intrinsics of a view that is shrunk by a power of 2, as far as it is."""
-        tensor, of = self._torch.as_tensor, self._module("train.coarse")
-        view = self._module("train.views").ViewTensors(
+        tensor, of = self._torch.as_tensor, importlib.import_module(f"{self._package}.train.views")
+        view = importlib.import_module(f"{self._package}.train.views").ViewTensors(
             name="0", photo=tensor(photo), mask=None if mask is None else tensor(mask),
             viewmat=self._torch.eye(4, dtype=self._float)[None], K=tensor(K).to(self._float)[None],
         )  # fmt: skip

@@ -12,9 +12,8 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from pop_fast.api.registry import get_backend
-from pop_fast.train.fused_stepper import FusedStepper
-from pop_fast.train.stepper import Engine
+from pop_fast.api.backend import get_backend
+from pop_fast.train.stepper import Engine, FusedStepper
 from pop_fast.train.steps import Collected, Phase, StepSettings, StepStats
 from pop_fast.train.views import ViewTensors
 from pop_ref.settings import PARAMETERS

@@ -13,17 +13,16 @@ from pathlib import Path
 import pytest
 import torch
 
+from pop_fast.api.backend import get_backend
 from pop_fast.api.rasterize import rasterization
-from pop_fast.api.registry import get_backend
 from pop_fast.blocks import jobs
 from pop_fast.cli.train import check_backend
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.choose import check_gpus, choose_backend
-from pop_fast.train.engines import whole_engine
+from pop_fast.train.engines import GpuProxy, renderer, translate_oom, whole_engine
 from pop_fast.train.environment import reproducible
-from pop_fast.train.gpu_proxy import GpuProxy, renderer, translate_oom
 from pop_fast.train.preflight import facts, find_warnings
 from pop_fast.train.views import ViewTensors, render_view
 from tests.app.conftest import TRAIN, Pop

@@ -21,10 +21,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pop_fast.api.registry import get_backend
+from pop_fast.api.backend import get_backend
 from pop_fast.blocks import jobs
-from pop_fast.blocks.partition import Partition, divide, grid_of
-from pop_fast.blocks.plan import Job, Plan, make_plan, read_plan
+from pop_fast.blocks.plan import Job, Partition, Plan, divide, grid_of, make_plan, read_plan
 from pop_fast.children import module_command
 from pop_fast.cli import main
 from pop_fast.data.block import write_block

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import torch
 
-from pop_fast.api.registry import get_backend
+from pop_fast.api.backend import get_backend
 from pop_fast.blocks import jobs
 from pop_fast.blocks.jobs import block_folder, parts_of
-from pop_fast.blocks.merge import TAKEN
 from pop_fast.blocks.plan import Job, read_job, read_plan
 from pop_fast.blocks.rounds import write_round_block
+from pop_fast.blocks.run import TAKEN
 from pop_fast.cli import main
 from pop_fast.data.load import load_capture
 from pop_fast.data.random_points import in_picture

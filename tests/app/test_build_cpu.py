@@ -13,13 +13,13 @@ import pytest
 
 from cuda_ext.compiler import find_compiler
 from pop_fast import compiled
-from pop_fast.api.registry import get_backend
+from pop_fast.api.backend import get_backend
 from pop_fast.cli.doctor import backends
 from pop_fast.compiled import build as building
 from pop_fast.compiled.library import open_library
 from pop_fast.errors import PopError
 from pop_fast.train.choose import choose_backend
-from pop_fast.train.gpu_proxy import renderer
+from pop_fast.train.engines import renderer
 from tests.app.conftest import Pop
 from tests.app.damage import says
 from tests.app.tiny import tiny_config

@@ -15,8 +15,7 @@ from pop_fast.density import DensityControl, GsplatStrategy, POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.train import LearningRates, TrainConfig
 from pop_fast.train.config import first_difference
-from pop_fast.train.jsonable import to_plain
-from pop_fast.train.presets import METHODS, QUICK_RATES, Given, options_for
+from pop_fast.train.presets import METHODS, QUICK_RATES, Given, options_for, to_plain
 from pop_fast.train.results import read_config
 from pop_fast.train.schedule import ViewOrder, active_sh_degree, updates_of
 from pop_ref.constants import PROFILES

@@ -16,11 +16,11 @@ import torch
 
 import cuda_ext
 import pop_fast
-from pop_fast.api.registry import BACKENDS, get_backend
+from pop_fast.api.backend import BACKENDS, get_backend
+from pop_fast.api.backends import FAST, TorchBackend
 from pop_fast.cli.explain import chosen_view
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.stages.backend import FAST, TorchBackend
 from pop_fast.stages.losses import photometric_3dgs, photometric_pop
 from pop_fast.train.config import TrainConfig
 from pop_fast.view.explain import ExplainedView, explain_pixel, explain_view

@@ -15,24 +15,21 @@ from torch import Tensor
 
 import pop_fast.compiled
 from cuda_ext.arrays import CudaMemoryError
-from pop_fast.api.registry import require_backend
+from pop_fast.api.backend import require_backend
+from pop_fast.api.backends import CUDA
 from pop_fast.blocks.rounds import hold_last, shown_in
-from pop_fast.cuda.backend import CUDA
 from pop_fast.data.initialize import initialize_params
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train import checkpoint as ckpt
-from pop_fast.train.batch_stepper import BatchStepper
 from pop_fast.train.engines import engine_of, torch_engine
-from pop_fast.train.fused_stepper import FusedStepper, step_settings
 from pop_fast.train.model import KEYS
 from pop_fast.train.presets import METHODS
-from pop_fast.train.refining import at_rest, refining
-from pop_fast.train.schedule import phase_at, segment_end, updates_of
-from pop_fast.train.stepper import Task
+from pop_fast.train.schedule import at_rest, phase_at, refining, segment_end, updates_of
+from pop_fast.train.stepper import FusedStepper, Task, step_settings
 from pop_fast.train.steps import why_not_trained
-from pop_fast.train.torch_stepper import TorchStepper
+from pop_fast.train.torch_stepper import BatchStepper, TorchStepper
 from pop_ref.settings import PARAMETERS
 from tests.app.drift import MOST, Drift, drift_engine
 from tests.app.interruptions import interrupted, run_until

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from pop_fast.api.registry import get_backend
+from pop_fast.api.backend import get_backend
 from pop_fast.io.formats import load_splat_file, save_as
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture

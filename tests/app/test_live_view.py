@@ -21,7 +21,7 @@ import torch
 from pop_fast.cli.view import stands_of_capture
 from pop_fast.io.pictures import id_colors
 from pop_fast.train import TrainingRun
-from pop_fast.train.gpu_proxy import renderer
+from pop_fast.train.engines import renderer
 from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
 from pop_fast.train.views import ViewTensors, render_layers, render_view
 from pop_fast.view.live import KeyCamera, RecordedPath, SplatScene, ViewState, read_path

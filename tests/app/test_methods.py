@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pop_fast.api.registry import get_backend
+from pop_fast.api.backend import get_backend
 from pop_fast.density import DensityControl
 from pop_fast.density.protocol import Draws
 from pop_fast.errors import PopError

@@ -18,12 +18,12 @@ from typing import Any
 import pytest
 import torch
 
-from pop_fast.api import registry
+from pop_fast.api import backend
+from pop_fast.api.backend import BACKENDS
+from pop_fast.api.backends import FAST
 from pop_fast.api.rasterize import rasterization
-from pop_fast.api.registry import BACKENDS
 from pop_fast.density import DensificationStep, POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.stages.backend import FAST
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from tests.app.conftest import TRAIN, Pop
@@ -51,7 +51,7 @@ LISTED = Path(__file__).with_name("asked.txt")
 
 
 def backend():
-    from pop_fast.stages.backend import TorchBackend
+    from pop_fast.api.backends import TorchBackend
 
     @dataclass(frozen=True)
     class MadeUp(TorchBackend):
@@ -305,7 +305,7 @@ def test_a_gpu_trains_with_the_strategies_of_this_package(tmp_path, monkeypatch)
 BACKEND_MODULE = """
 from dataclasses import dataclass
 
-from pop_fast.stages.backend import TorchBackend
+from pop_fast.api.backends import TorchBackend
 
 ASKED = []
 
@@ -343,15 +343,15 @@ def look_again() -> None:
 
 
 def test_a_registered_backend_is_known_by_its_name_and_draws(installed: pytest.MonkeyPatch) -> None:
-    assert registry.backend_names() == ("fast", "compiled", "cuda", "ref", "mine", "broken")
+    assert backend.backend_names() == ("fast", "compiled", "cuda", "ref", "mine", "broken")
     drawn = rasterization(**scene(), **cameras(), backend="mine")[0]
     assert torch.equal(drawn, rasterization(**scene(), **cameras(), backend="fast")[0])
-    assert torch.equal(drawn, rasterization(**scene(), **cameras(), backend=registry.get_backend("mine"))[0])
+    assert torch.equal(drawn, rasterization(**scene(), **cameras(), backend=backend.get_backend("mine"))[0])
 
 
 def test_one_that_cannot_be_loaded_is_named(installed: pytest.MonkeyPatch) -> None:
     with pytest.raises(PopError, match=r"the backend at no_such_package:BACKEND cannot be loaded: No module named"):
-        registry.get_backend("broken")
+        backend.get_backend("broken")
 
 
 def test_a_name_that_nobody_registers_is_refused_before_anything_is_written(

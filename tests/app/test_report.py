@@ -25,7 +25,7 @@ from pop_fast.io import pictures
 from pop_fast.io.frame import Frame
 from pop_fast.io.pictures import colormap_table
 from pop_fast.io.ply import save_ply
-from pop_fast.train.gpu_proxy import renderer
+from pop_fast.train.engines import renderer
 from pop_fast.train.load_result import load_splat
 from pop_fast.view.paths import frames_in
 from pop_fast.view.report import checks, write_report

@@ -21,9 +21,9 @@ import pop_fast.compiled
 from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
-from pop_fast.train.batch_stepper import check_batch
 from pop_fast.train.ranks import ALONE, Ranks, join
 from pop_fast.train.signals import stop_requests
+from pop_fast.train.torch_stepper import check_batch
 from tests.app.conftest import launched
 from tests.app.interruptions import interrupt, run_until
 from tests.app.tiny import last_checkpoint, tiny_capture, tiny_config

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 
-from pop_fast.api.registry import get_backend
+from pop_fast.api.backend import get_backend
 from pop_fast.train import TrainingRun, training_run
 from pop_fast.train import checkpoint as ckpt
 from tests.app.captures import PINHOLE, camera, photograph, ring, write_model, write_photograph

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 import torch
 
-from pop_fast.api.registry import get_backend
+from pop_fast.api.backend import get_backend
+from pop_fast.api.backends import FAST
 from pop_fast.cli import progress
 from pop_fast.cli.progress import bars
 from pop_fast.data import Capture, View
@@ -24,7 +25,6 @@ from pop_fast.errors import PopError
 from pop_fast.io import heartbeat
 from pop_fast.io.heartbeat import Heartbeat, duration
 from pop_fast.io.ply import load_ply
-from pop_fast.stages.backend import FAST
 from pop_fast.train import TrainingRun
 from pop_fast.train.evaluate import average, measure, population, psnr
 from pop_fast.train.model import KEYS, adam_step, first_non_finite, make_optimizers

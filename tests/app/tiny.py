@@ -17,7 +17,7 @@ from pop_fast.data.capture import Capture, View
 from pop_fast.density import GsplatStrategy, InriaStrategy, POPStrategy
 from pop_fast.train import LearningRates, TrainConfig, TrainingRun
 from pop_fast.train import checkpoint as ckpt
-from pop_fast.train.records import Segment
+from pop_fast.train.results import Segment
 
 WIDTH, HEIGHT = 32, 24
 N_POINTS = 60

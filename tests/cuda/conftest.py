@@ -61,10 +61,9 @@ def emulated_engine() -> Any:
     """Return the emulated GPU, once it is installed, as `pop train` takes one."""
     import torch
 
-    from pop_fast.api.registry import get_backend
-    from pop_fast.train.fused_stepper import FusedStepper
-    from pop_fast.train.gpu_proxy import GpuProxy
-    from pop_fast.train.stepper import Engine, Task
+    from pop_fast.api.backend import get_backend
+    from pop_fast.train.engines import GpuProxy
+    from pop_fast.train.stepper import Engine, FusedStepper, Task
 
     device, cuda = torch.device("cpu"), get_backend("cuda")
     step = cuda.whole_step()

@@ -156,9 +156,9 @@ def test_rasterization_refuses_what_it_does_not_support_and_names_what_is_wrong(
         "width": 4,
         "height": 4,
     }
-    from pop_fast.cuda import backend
+    from pop_fast.api import backends
 
-    monkeypatch.setattr(backend.cuda_ext, "why_not", lambda: None)
+    monkeypatch.setattr(backends.cuda_ext, "why_not", lambda: None)
     with pytest.raises(NotImplementedError, match=r"covars=.* by backend 'cuda': the kernels start from quats"):
         rasterization(**rows, covars=torch.zeros(1, 3, 3))
     with pytest.raises(ValueError, match="render_mode"):

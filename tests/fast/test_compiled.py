@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from pop_fast import compiled
+from pop_fast.api.backend import get_backend
 from pop_fast.api.checks import check_sizes
-from pop_fast.api.registry import get_backend
-from pop_fast.compiled import splatting as in_cpp
+from pop_fast.compiled import compositing as in_cpp
 from pop_fast.density.passes import Passes
 from pop_fast.stages import splatting
 from pop_fast.stages.compositing import Composite

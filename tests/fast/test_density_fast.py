@@ -18,7 +18,7 @@ from pop_fast import compiled
 from pop_fast.density import rows as ops
 from pop_fast.stages import density as fast
 from pop_fast.stages import tiles
-from pop_fast.stages.blend.blend import Stop, count_passed, weights_of_alphas
+from pop_fast.stages.blend import Stop, count_passed, weights_of_alphas
 from pop_fast.stages.tiles import TileLists, tight_tile_lists, tile_lists
 from pop_fast.train.model import make_optimizers
 from pop_ref import density as oracle

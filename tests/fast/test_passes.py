@@ -12,7 +12,7 @@ from torch import Tensor
 from pop_fast import compiled
 from pop_fast.density.passes import Passes, ViewContributions
 from pop_fast.errors import PopError
-from pop_fast.stages.taming import pixel_weights
+from pop_fast.stages.density import pixel_weights
 from pop_fast.train import TrainConfig
 from pop_fast.train.views import render_view
 from pop_ref.constants import PROFILES
@@ -130,7 +130,7 @@ def test_weights_and_remaining_light_sum_to_one(backend: str) -> None:
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("profile", ["paper", "inria"])
 def test_a_pass_draws_what_a_training_draws(backend: str, profile: str) -> None:
-    from pop_fast.api.registry import get_backend
+    from pop_fast.api.backend import get_backend
 
     config = TrainConfig(profile=profile, background=BACKGROUND)
     found = Passes.of(get_backend(backend), views(), config).contributions(raw_params(), 1, 2)

@@ -16,13 +16,13 @@ import torch.utils._pytree
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from pop_fast.api.backend import backend_names, fastest_backend, get_backend
+from pop_fast.api.backends import FAST
 from pop_fast.api.checks import Checks
-from pop_fast.api.meta import RenderMeta
+from pop_fast.api.rasterize import RenderMeta
 from pop_fast.api.rasterize import rasterization as program
-from pop_fast.api.registry import backend_names, fastest_backend, get_backend
 from pop_fast.errors import PopError
-from pop_fast.stages.backend import FAST
-from pop_fast.stages.blend import buffers
+from pop_fast.stages import blend
 from pop_ref.constants import PAPER
 
 WIDTH, HEIGHT, N = 21, 18, 24
@@ -204,12 +204,12 @@ def test_absolute_gradients_bound_the_signed_ones() -> None:
 def test_buffers_are_reused_and_can_be_freed() -> None:
     leaf = scene(4)["means"].requires_grad_()
     rasterization(**{**scene(4), "means": leaf}, **cameras())[0].sum().backward()
-    taken = buffers.acquire(64, torch.float64)
-    buffers.release(taken)
-    assert buffers.acquire(64, torch.float64).data_ptr() == taken.data_ptr()
-    assert buffers.retained_bytes() > 0
-    buffers.clear()
-    assert buffers.retained_bytes() == 0
+    taken = blend.acquire_buffer(64, torch.float64)
+    blend.release_buffer(taken)
+    assert blend.acquire_buffer(64, torch.float64).data_ptr() == taken.data_ptr()
+    assert blend._pool.retained > 0
+    blend.clear_buffers()
+    assert blend._pool.retained == 0
 
 
 def test_an_empty_scene_is_the_background() -> None:
@@ -241,7 +241,7 @@ def test_auto_is_the_default_and_takes_the_fastest_that_is_there(
     compiled: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from pop_fast import compiled as kernels
-    from pop_fast.compiled.backend import CompiledBackend
+    from pop_fast.api.backends import CompiledBackend
 
     asked: list[str] = []
     monkeypatch.setattr(kernels, "why_not", lambda: None if compiled else "not compiled")

@@ -28,7 +28,7 @@ SHARED_WITH_FAST = VALUES | {"pop_ref.notation", "pop_ref.records", "pop_ref.reg
 # rooms of the program whose work is to show what the oracle does
 SHOW_THE_ORACLE = (
     "pop_fast/view/explain/",
-    "pop_fast/oracle/",
+    "pop_fast/oracle.py",
     "pop_fast/cli/vectors.py",
     "pop_fast/cli/learn.py",
 )

@@ -45,7 +45,7 @@ EXEMPT = {
     "pop_fast.machine": SYSTEM,
     "pop_fast.train.environment": SYSTEM,
     "pop_fast.cli.limits:_photographs": "takes what load_checkpoint has judged",
-    "pop_fast.blocks.merge:merge": "takes what read_round has judged",
+    "pop_fast.blocks.run:merge": "takes what read_round has judged",
     "paper_repro.figures.qualitative:_view": "takes what read_view has judged",
     "paper_repro.published:publish": "takes what read_view has judged",
     "pop_fast.cli.eval:_record": "adds to what read_stats has judged",

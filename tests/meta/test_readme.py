@@ -60,13 +60,17 @@ def load(name: str) -> ModuleType:
 stages = load("stages")
 kit_tables = load("kit_tables")
 tables = load("tables")
+FAST = {
+    name: given
+    for path in (ROOT / "pop_fast" / "stages").glob("*.py")
+    for name, given in stages.functions(path).items()
+}
 BOTH_ROOMS = [
-    (f"{module}.{name}", reference, fast[name])
+    (f"{module}.{name}", reference, FAST[name])
     for stage in stages.STAGES
     for module in stage.modules
-    if (fast := stages.functions(ROOT / "pop_fast" / "stages" / f"{module}.py")) is not None
     for name, reference in stages.functions(ROOT / "pop_ref" / f"{module}.py").items()
-    if name in fast
+    if name in FAST
 ]
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from pop_fast.api.registry import get_backend
+from pop_fast.api.backend import get_backend
 from pop_fast.train.engines import torch_engine, whole_engine
 
 ENGINES = ("fast", "compiled", "native")

@@ -12,8 +12,8 @@ import torch
 
 import pop_ref.appearance
 import pop_ref.refinement
-from pop_fast.api.registry import get_backend
-from pop_fast.cuda.backend import CUDA
+from pop_fast.api.backend import get_backend
+from pop_fast.api.backends import CUDA
 from pop_fast.data.capture import Capture
 from pop_fast.data.initialize import initialize_params
 from pop_fast.errors import PopError

@@ -12,12 +12,11 @@ import torch
 
 from pop_fast import compiled
 from pop_fast.errors import PopError
-from pop_fast.train import TrainingRun, coarse
-from pop_fast.train.coarse import SMALLEST_SIDE, index_at, shrunk, with_shrunk
+from pop_fast.train import TrainingRun
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.steps import Phase
 from pop_fast.train.torch_stepper import TorchStepper, ViewGradient
-from pop_fast.train.views import ViewTensors
+from pop_fast.train.views import SMALLEST_SIDE, ViewTensors, index_at, shrunk, with_shrunk
 from tests.app.tiny import last_checkpoint, tiny_capture, tiny_config
 
 needs_compiled = pytest.mark.skipif(not compiled.available(), reason=compiled.why_not() or "")
@@ -100,7 +99,7 @@ def test_stops_that_cannot_be_are_refused(stops):
 @pytest.fixture
 def tiny_may_shrink(monkeypatch: pytest.MonkeyPatch) -> None:
     """Views of 32 x 24 px may be halved."""
-    monkeypatch.setattr(coarse, "SMALLEST_SIDE", 12)
+    monkeypatch.setattr("pop_fast.train.views.SMALLEST_SIDE", 12)
 
 
 @pytest.mark.usefixtures("tiny_may_shrink")

@@ -15,14 +15,14 @@ import pytest
 import torch
 
 from benchmarks.faults.runs import same
-from pop_fast.api.registry import get_backend
+from pop_fast.api.backend import get_backend
+from pop_fast.api.backends import CompiledBackend
 from pop_fast.compiled import native_step
-from pop_fast.compiled.backend import CompiledBackend
 from pop_fast.data.initialize import initialize_params
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.stages.tiles import TileLists, tile_lists
-from pop_fast.train import TrainingRun, fused_stepper
+from pop_fast.train import TrainingRun, stepper
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.engines import engine_of, torch_engine, whole_engine
 from pop_fast.train.model import KEYS
@@ -236,7 +236,7 @@ def test_how_many_steps_are_taken_at_a_time_changes_no_bit(
     own, took = CompiledBackend.whole_step, TrainingRun.take_steps
     monkeypatch.setattr(TrainingRun, "take_steps", lambda run, last: blocks.append(last - run.step) or took(run, last))
     for seconds, most in ((0.0, 20), (math.inf, 3), (math.inf, 20)):
-        monkeypatch.setattr(fused_stepper, "BLOCK_SECONDS", seconds)
+        monkeypatch.setattr("pop_fast.train.stepper.BLOCK_SECONDS", seconds)
         monkeypatch.setattr(CompiledBackend, "whole_step", lambda self, most=most: replace(own(self), most=most))
         folder = tmp_path / f"{seconds}_{most}"
         config = tiny_config(folder, method, backend="compiled", checkpoint_every=0, save_steps=())
@@ -487,11 +487,11 @@ def test_laws_notice_statistics_that_a_whole_step_hands_on_wrongly(
     law = law_named("test_collected:a_training_collects_the_oracles_gradients_views_and_blur_flags")
     backend = shipped("compiled32")
     assert obeys(law, backend) is None
-    taken_over = fused_stepper.FusedStepper._take_statistics
+    taken_over = stepper.FusedStepper._take_statistics
 
     def wrongly(stepper: Any, *args: Any) -> None:
         taken_over(stepper, *args)
         stepper._state[name] = change(stepper._state[name])
 
-    monkeypatch.setattr(fused_stepper.FusedStepper, "_take_statistics", wrongly)
+    monkeypatch.setattr(stepper.FusedStepper, "_take_statistics", wrongly)
     assert obeys(law, backend) is not None

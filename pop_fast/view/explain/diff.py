@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from pop_fast.api.registry import backend_names, get_backend
+from pop_fast.api.backend import backend_names, get_backend
 from pop_fast.errors import PopError
 from pop_fast.view.explain.maps import Map, scaled
 from pop_fast.view.explain.pixel import Step, Walk, candidates, oracle_splats, walk

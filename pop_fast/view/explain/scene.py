@@ -14,7 +14,7 @@ from pop_fast.data.capture import View
 from pop_fast.errors import PopError
 from pop_fast.stages.covariance import opacities_from_logits, scales_from_log_scales
 from pop_fast.stages.losses import photometric
-from pop_fast.stages.polarization import importance_mask, pop_loss_vjp
+from pop_fast.stages.regularizers import importance_mask, pop_loss_vjp
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.presets import LOSSES
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from pop_fast.errors import PopError
 from pop_fast.io import pictures
-from pop_fast.train.commands import shell_line
+from pop_fast.train.results import shell_line
 from pop_fast.view.document import asset
 from pop_fast.view.report.model import Finding, ReportView
 
@@ -128,7 +128,7 @@ def encoding_rows(encodings: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...
     """Return the cells of a table of encodings, under `encoding_heads`.
 
     Args:
-        encodings: entries of the statistics, as `pop_fast.train.encodings.Encoding` makes them.
+        encodings: entries of the statistics, as `pop_fast.train.evaluate.Encoding` makes them.
 
     Returns:
         A row a format: its name, MB, bytes a Gaussian, size as a share of the PLY's, PSNR and how far it is from the

@@ -13,11 +13,10 @@ import numpy as np
 
 from pop_fast.errors import PopError
 from pop_fast.io.read_back import check_record, parse_json, read_arrays, read_json
-from pop_fast.train.commands import read_commands, shell_line
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import read_record
 from pop_fast.train.presets import METHODS, Given, words_of
-from pop_fast.train.results import read_config
+from pop_fast.train.results import read_commands, read_config, shell_line
 from pop_fast.view.report.checks import Checks, read_checks
 from pop_fast.view.report.compare import threads_of
 from pop_fast.view.report.curves import Window

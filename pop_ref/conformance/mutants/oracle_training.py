@@ -128,6 +128,9 @@ _LINES: Final[Lines] = {
         ("copies_are_split_too", "the copy of a Gaussian that is cloned and split is split with it",
          "np.concatenate([split, np.zeros(int(np.sum(clone)), dtype=bool)])", "np.concatenate([split, split[clone]])",
          "test_density:the_copy_of_a_gaussian_that_is_cloned_and_split_stays_whole"),
+        ("refinement_starts_at_its_start", "the step that refinement starts after is its first",
+         "config.refine_start_iter < step", "config.refine_start_iter <= step",
+         "test_density:the_gaussians_change_every_hundred_steps_and_opacities_are_reset_where_that_is_asked_for"),
     ),
     "density_rows.py": (
         ("moments_left_behind",
@@ -574,11 +577,6 @@ _LINES: Final[Lines] = {
         ("appearance_a_step_ahead", "the rates of exposures and cameras are those of the next step",
          "share = step / max_steps", "share = (step + 1) / max_steps",
          "test_few_photographs:rates_of_exposures_and_cameras_fall_from_step_to_step_and_not_as_one_another"),
-    ),
-    "density_config.py": (
-        ("refinement_starts_at_its_start", "the step that refinement starts after is its first",
-         "config.refine_start_iter < step", "config.refine_start_iter <= step",
-         "test_density:the_gaussians_change_every_hundred_steps_and_opacities_are_reset_where_that_is_asked_for"),
     ),
     "training.py": (
         ("depth_weighed_without_the_scene", "the weight of sparse depth is not multiplied by the scene's scale",

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pop_fast.api.registry import get_backend
+from pop_fast.api.backend import get_backend
 from pop_ref.conformance.mutants.trial import every_law, law_named
 from pop_ref.conformance.torch_short_training import Trainee
 from tests.cuda.conftest import emulated_engine

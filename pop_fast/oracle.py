@@ -1,11 +1,12 @@
-"""The stages of a view by the oracle, as autograd functions on tensors.
+"""The oracle as stages of a view, which are autograd functions on tensors, and as a pass over one.
 
-Tensors go in and come out in their own precision, and every stage computes in float64.
+It is slow and exact, for small scenes and for comparison: tensors go in and come out in their own precision, and every
+stage computes in float64.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,26 +14,26 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pop_fast.stages.compositing import Composite
-from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of
+from pop_fast.stages.contributions import Contributions, DominantPoints
+from pop_fast.stages.splatting import ProjectionSettings, Shapes, Splats, colors_of
+from pop_fast.stages.stage_set import PassInput, Seen
 from pop_fast.stages.tiles import TileLists
 from pop_ref import compositing, splatting
+from pop_ref.chord import dominant_points
+from pop_ref.contributions import contributions
+from pop_ref.fisher import fisher_blocks, screen_moments
 from pop_ref.records import Camera, Gaussians
 from pop_ref.records import Splats as OracleSplats
+from pop_ref.render import render
+from pop_ref.sensitivity import sensitivities
 from pop_ref.tiles import tile_lists
-
-
-class Shapes(NamedTuple):
-    """Rotations and sizes as they are: the oracle makes covariances where it projects."""
-
-    quats: Tensor
-    scales: Tensor
 
 
 class OracleStages:
     """Draws views as `pop_fast.api.backend.ViewStages` says."""
 
     def covariances(self, quats: Tensor, scales: Tensor) -> Shapes:
-        """Return both as they are."""
+        """Return both as they are: the oracle makes covariances where it projects."""
         return Shapes(quats, scales)
 
     def splats(
@@ -45,7 +46,6 @@ class OracleStages:
         settings: ProjectionSettings,
         sh_degree: int | None,
     ) -> Splats:
-        """See `pop_ref.splatting.project`."""
         made = _Project.apply(means, *shapes, opacities, colors, viewmat, settings, sh_degree)
         means2d, depths, conics, blended, shaded, radii = made
         return Splats(means2d, depths, conics, blended, radii, colors=shaded)
@@ -62,7 +62,6 @@ class OracleStages:
         counts: bool,
         absgrad_sink: Tensor | None,
     ) -> Composite:
-        """See `pop_ref.compositing.composite`."""
         colors = colors_of(rows)
         behind = colors.new_zeros(colors.shape[1]) if background is None else background
         place = (rows.depths.detach(), rows.radii, settings, tile_size, absgrad_sink)
@@ -71,12 +70,10 @@ class OracleStages:
         return Composite(image, alphas, ids, weights, blended, traversed, None)
 
     def tile_lists(self, rows: Splats, settings: ProjectionSettings, tile_size: int) -> TileLists:
-        """See `pop_ref.tiles.tile_lists`."""
         width, height = settings.width, settings.height
         return TileLists.of(_lists(_records(rows), settings, tile_size), width, height, tile_size)
 
     def counts_entries(self, tile_size: int) -> bool:
-        """Visited entries are counted with tiles of any size."""
         return True
 
 
@@ -89,12 +86,8 @@ class _Project(torch.autograd.Function):
         gaussians = Gaussians(_array(means), _array(quats), _array(scales), _array(opacities), sh)
         camera = Camera(_array(viewmat), _array(settings.K), settings.width, settings.height)
         ctx.of = (gaussians, camera)
-        ctx.options = {
-            "sh_degree": sh_degree,
-            "profile": settings.profile,
-            "antialiased": settings.antialiased,
-            "colors": given,
-        }
+        how = {"profile": settings.profile, "antialiased": settings.antialiased}
+        ctx.options = {"sh_degree": sh_degree, "colors": given, **how}
         ctx.like = means
         made = splatting.project(gaussians, camera, **ctx.options)
         radii = torch.as_tensor(made.radii, dtype=torch.int32)
@@ -163,3 +156,47 @@ def _lists(rows: OracleSplats, settings: ProjectionSettings, tile_size: int) -> 
 
 def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().double().cpu().numpy()
+
+
+class OracleView:
+    """A shot that has been drawn."""
+
+    def __init__(self, shot: PassInput) -> None:
+        g, c = shot.gaussians, shot.camera
+        self._gaussians = Gaussians(*(_array(t) for t in (g.means, g.quats, g.scales, g.opacities, g.sh)))
+        self._camera = Camera(_array(c.viewmat), _array(c.K), c.width, c.height)
+        self._background, self._dtype, self._shot = _array(shot.background), g.means.dtype, shot
+        how = {name: getattr(shot, name) for name in ("sh_degree", "profile", "antialiased")}
+        self._render = render(self._gaussians, self._camera, background=self._background, **how)
+
+    def seen(self) -> Seen:
+        made = self._render
+        radii = torch.as_tensor(made.splats.radii, dtype=torch.int32)
+        depths = self._floats(made.splats.depths)
+        return Seen(self._floats(made.image), torch.as_tensor(made.dominant_ids), radii, depths)
+
+    def contributions(self, pixel_map: Tensor | None) -> Contributions:
+        given = None if pixel_map is None else _array(pixel_map)
+        made = contributions(*self._listed(), given, self._shot.profile)
+        found = (made.weight_sum, made.n_pixels, made.map_sum, made.distance_sum)
+        return Contributions(*(torch.as_tensor(sums) for sums in found))
+
+    def sensitivities(self) -> Tensor:
+        return torch.as_tensor(sensitivities(*self._listed(), self._background, self._shot.profile))
+
+    def fisher_blocks(self) -> Tensor:
+        moments = screen_moments(*self._listed(), self._background, self._shot.profile)
+        shot = self._shot
+        return torch.as_tensor(fisher_blocks(self._gaussians, self._camera, moments, shot.sh_degree, shot.profile))
+
+    def dominant_points(self) -> DominantPoints:
+        made, profile = self._render, self._shot.profile
+        found = dominant_points(made.splats, made.tile_lists, self._gaussians, self._camera, profile.tile_size, profile)
+        return DominantPoints(self._floats(found.points), torch.as_tensor(found.ids), self._floats(found.T_final))
+
+    def _listed(self) -> tuple[OracleSplats, list[list[int]], int, int, int]:
+        made, camera = self._render, self._camera
+        return made.splats, made.tile_lists, camera.width, camera.height, self._shot.profile.tile_size
+
+    def _floats(self, values: np.ndarray) -> Tensor:
+        return torch.as_tensor(values, dtype=self._dtype)

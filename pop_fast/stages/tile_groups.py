@@ -32,23 +32,14 @@ PAIRS_PER_THREAD = 1 << 18  # (entry, pixel) pairs of a step: more than its over
 
 @dataclass(frozen=True)
 class PackedLists:
-    """Tile lists in which every tile begins a new block; the last block, and what is left of the others, is padding.
+    """Tile lists in which every tile begins a new block; the last block, and what is left of the others, is padding."""
 
-    Attributes:
-        ids: splat of every entry, the number of splats for padding. [8 B] int64
-        block_tiles: tile of every block. [B] int64
-        first_blocks: each tile's first block. [tiles]
-        n_blocks: each tile's number of blocks. [tiles]
-        tile_size: px.
-        tiles_x: tiles in a row.
-    """
-
-    ids: Tensor
-    block_tiles: Tensor
-    first_blocks: Tensor
-    n_blocks: Tensor
-    tile_size: int
-    tiles_x: int
+    ids: Tensor  # splat of every entry, the number of splats for padding. [8 B] int64
+    block_tiles: Tensor  # tile of every block. [B] int64
+    first_blocks: Tensor  # each tile's first block. [tiles]
+    n_blocks: Tensor  # each tile's number of blocks. [tiles]
+    tile_size: int  # px
+    tiles_x: int  # tiles in a row
 
     @classmethod
     def of(cls, lists: TileLists, n_splats: int) -> PackedLists:
@@ -64,23 +55,14 @@ class PackedLists:
 
 @dataclass(frozen=True)
 class TileGroup:
-    """Some tiles, longest list first.
+    """Some tiles, longest list first."""
 
-    Attributes:
-        tiles: tile numbers. [G]
-        first_blocks: number of each tile's first block. [G]
-        n_blocks: blocks of each tile's list, descending. [G]
-        reached: for each block of the lists, how many tiles' lists reach it.
-        null_block: number of a block of padding.
-        n_pixels: of a tile.
-    """
-
-    tiles: Tensor
-    first_blocks: Tensor
-    n_blocks: Tensor
-    reached: list[int]
-    null_block: int
-    n_pixels: int
+    tiles: Tensor  # tile numbers. [G]
+    first_blocks: Tensor  # number of each tile's first block. [G]
+    n_blocks: Tensor  # blocks of each tile's list, descending. [G]
+    reached: list[int]  # for each block of the lists, how many tiles' lists reach it
+    null_block: int  # number of a block of padding
+    n_pixels: int  # of a tile
 
     @property
     def slab(self) -> int:
@@ -99,9 +81,7 @@ class TileGroup:
 
         Args:
             rows: tiles to choose from, as places in the group; all when None.
-            n: how many of them take part, from the first.
             start: block of the lists where the step begins.
-            count: blocks that it takes.
 
         Returns:
             [n, count]
@@ -134,17 +114,11 @@ NULL_EXPONENT = -1e4  # 2 to this power is 0 in float32 and float64: entries tha
 
 @dataclass(frozen=True)
 class Entries:
-    """What the pairs of one tile-list entry share, in float64, in the order of packed lists; padding has splat N.
+    """What the pairs of one tile-list entry share, in float64, in the order of packed lists; padding has splat N."""
 
-    Attributes:
-        lists: the packed lists.
-        u: splat's centre from the tile's centre, px. [8 B]
-        v: px. [8 B]
-    """
-
-    lists: PackedLists
-    u: Tensor
-    v: Tensor
+    lists: PackedLists  # the packed lists
+    u: Tensor  # splat's centre from the tile's centre, px. [8 B]
+    v: Tensor  # px. [8 B]
 
     @classmethod
     def of(cls, means2d: Tensor, lists: PackedLists) -> Entries:
@@ -161,7 +135,6 @@ def exponent_coefficients(entries: Entries, conics: Tensor, opacities: Tensor) -
     """Return the six coefficients of log2(alpha) of every entry, such that padding blends nothing. [6, 8 B] float64
 
     Args:
-        entries: of the tile lists.
         conics: inverse screen covariances, px^-2. [N, 3]
         opacities: [N]
     """

@@ -1,6 +1,7 @@
 """Front-to-back blending of a group of tiles with early ray termination, and its transpose.
 
 Meaning: `pop_ref.compositing`.
+
 One step of the blend takes a group of tiles, K list entries and all pixels of a tile, in this order:
 
     alpha = 2^(coefficients @ basis), 0 under the floor (D5), the ceiling at most (D6)
@@ -17,13 +18,14 @@ number per pixel, B, the light from behind dotted with the pixel's gradient:
     q[k] = colour[k] . v_image - B;  B += alpha[k] q[k];  G[k] = weight[k] q[k]
 
 G = alpha dL/dalpha; its six moments over a tile's pixels give every geometric gradient (`splat_gradients`).
-There is no division by 1 - alpha.
+There is no division by 1 - alpha. Buffers are used again: fresh pages cost more than the arithmetic that fills them.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Final
@@ -31,19 +33,14 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from pop_fast.stages.blend import buffers
-from pop_fast.stages.blend.tile_groups import BLOCK, Entries, TileGroup, exponent_coefficients, pixel_basis
+from pop_fast.stages.tile_groups import BLOCK, Entries, TileGroup, exponent_coefficients, pixel_basis
 from pop_ref.constants import Profile
 
 EIGHT: Final = 8  # entries whose comparisons of weights make one number
 
 
 class ActiveTiles:
-    """Named states with a row per tile of a group, of which a shrinking choice is held close together.
-
-    Attributes:
-        rows: the tiles that are held, ascending; all when None.
-    """
+    """States with a row per tile of a group, of which a shrinking choice, `rows`, is held together; None is all."""
 
     def __init__(self, states: dict[str, Tensor]) -> None:
         self.rows: Tensor | None = None
@@ -124,13 +121,9 @@ class Dominance:
 
 @dataclass(frozen=True)
 class Stop:
-    """The transmittance that a pixel must stay above.
+    """The transmittance that a pixel must stay above."""
 
-    Attributes:
-        at: a pixel stops where T <= at.
-    """
-
-    at: float
+    at: float  # a pixel stops where T <= at
 
     @classmethod
     def of(cls, profile: Profile, dtype: torch.dtype) -> Stop:
@@ -148,7 +141,6 @@ def weights_of_alphas(alpha: Tensor, transmittances: Tensor, stop: Stop) -> Tens
         alpha: in and, where a pixel stops, out. [n, K, P]
         transmittances: T before the step in the first of K + 1 rows; out: T after it in the last, still to be
             compared with the stop, and in the others the weights. [n, K + 1, P]
-        stop: when pixels stop.
 
     Returns:
         The weights, a view of `transmittances`. [n, K, P]
@@ -182,57 +174,36 @@ COMPACT_BELOW = 0.8  # share of live tiles under which the group is compacted
 
 @dataclass(frozen=True)
 class Step:
-    """One blended step, as the transpose needs it.
+    """One blended step, as the transpose needs it."""
 
-    Attributes:
-        blocks: of eight entries each, the null block where a list has ended. [n, K / 8]
-        rows: which of the group's tiles took part: the first `n` of these, or of all when None.
-        transmittance: T before the step; belongs to the buffers. [n, P]
-    """
-
-    blocks: Tensor
-    rows: Tensor | None
-    transmittance: Tensor
+    blocks: Tensor  # of eight entries each, the null block where a list has ended. [n, K / 8]
+    rows: Tensor | None  # which of the group's tiles took part: the first `n` of these, or of all when None
+    transmittance: Tensor  # T before the step; belongs to the buffers. [n, P]
 
 
 @dataclass
 class GroupBlend:
-    """What blending a group gives.
+    """What blending a group gives."""
 
-    Attributes:
-        image: weighted colours and, last, the sum of weights. [G, D + 1, P]
-        steps: front to back.
-        n_blended: [G, P], when counted.
-        n_passed: list entries that the pixel went past without stopping. [G, P], when counted.
-        dominant_weights: the largest weights, when asked for. [G, P]
-        dominant_places: and their places in the tile's list, -1 where nothing was blended. [G, P]
-        n_pairs: (entry, pixel) pairs evaluated.
-    """
-
-    image: Tensor
-    steps: list[Step] = field(default_factory=list)
-    n_blended: Tensor | None = None
-    n_passed: Tensor | None = None
-    dominant_weights: Tensor | None = None
+    image: Tensor  # weighted colours and, last, the sum of weights. [G, D + 1, P]
+    steps: list[Step] = field(default_factory=list)  # front to back
+    n_blended: Tensor | None = None  # [G, P], when counted
+    n_passed: Tensor | None = None  # list entries that the pixel went past without stopping. [G, P], when counted.
+    dominant_weights: Tensor | None = None  # the largest weights, when asked for. [G, P]
+    # and their places in the tile's list, -1 where nothing was blended. [G, P]
     dominant_places: Tensor | None = None
-    n_pairs: int = 0
+    n_pairs: int = 0  # (entry, pixel) pairs evaluated
 
 
 @dataclass(frozen=True)
 class Blender:
-    """The fixed numbers of a blend.
+    """The fixed numbers of a blend."""
 
-    Attributes:
-        table: per entry, the exponent's coefficients, the colours and a 1, in blocks of eight. [B, 8, 6 + D + 1]
-        basis: pixel basis. [6, P]
-        profile: constants and strictness.
-        clamps: whether any alpha can pass the ceiling.
-    """
-
+    # per entry, the exponent's coefficients, the colours and a 1, in blocks of eight. [B, 8, 6 + D + 1]
     table: Tensor
-    basis: Tensor
-    profile: Profile
-    clamps: bool
+    basis: Tensor  # pixel basis. [6, P]
+    profile: Profile  # constants and strictness
+    clamps: bool  # whether any alpha can pass the ceiling
 
     @classmethod
     def of(cls, entries: Entries, conics: Tensor, opacities: Tensor, colors: Tensor, profile: Profile) -> Blender:
@@ -257,7 +228,7 @@ class Blender:
         dominant = Dominance(self.table.dtype)
         steps: list[Step] = []
         start, n_pairs = 0, 0
-        with buffers.acquired(2, group.slab, self.table.dtype) as scratch:
+        with acquired_buffers(2, group.slab, self.table.dtype) as scratch:
             while start < len(group.reached) and (n := active.count_below(group.reached[start])) > 0:
                 blocks = group.blocks(active.rows, n, start, group.step_blocks(start, n))
                 entries, transmittance = self._entries(blocks), active["transmittance"][:n]
@@ -265,7 +236,7 @@ class Blender:
                 self._alphas(entries, alpha)
                 if counted:
                     active["n_passed"][:n].add_(count_passed(alpha, transmittance, self.stop))
-                before = buffers.copy(transmittance)
+                before = copy_to_buffer(transmittance)
                 weight = self._weights(alpha, transmittances, before)
                 torch.ops.aten.threshold.out(transmittances[:, -1], self.stop.at, 0.0, out=transmittance)
                 active["image"][:n].baddbmm_(entries[:, :, 6:].transpose(1, 2), weight)
@@ -278,7 +249,7 @@ class Blender:
                 if keep:
                     steps.append(Step(blocks, active.rows, before))
                 else:
-                    buffers.release(before)
+                    release_buffer(before)
                 active.drop(n, transmittance, COMPACT_BELOW)
         return self._result(active.whole(), steps, n_pairs)
 
@@ -296,16 +267,9 @@ class Blender:
 
     @staticmethod
     def _result(states: dict[str, Tensor], steps: list[Step], n_pairs: int) -> GroupBlend:
-        codes = states.get("codes")
-        return GroupBlend(
-            states["image"],
-            steps,
-            states.get("n_blended"),
-            states.get("n_passed"),
-            states.get("best"),
-            None if codes is None else Dominance.places(codes),
-            n_pairs,
-        )
+        n_blended, n_passed, best, codes = (states.get(name) for name in ("n_blended", "n_passed", "best", "codes"))
+        places = None if codes is None else Dominance.places(codes)
+        return GroupBlend(states["image"], steps, n_blended, n_passed, best, places, n_pairs)
 
     def _entries(self, blocks: Tensor) -> Tensor:
         """Gather a step's rows of the table. [n, K, 6 + D + 1]"""
@@ -333,7 +297,7 @@ class Blender:
             colours and, when asked for, the sums of absolute gradients along x and y.
         """
         active = ActiveTiles({"behind": v_image.new_zeros((v_image.shape[0], v_image.shape[2])), "v": v_image})
-        with buffers.acquired(3, group.slab, self.table.dtype) as scratch:
+        with acquired_buffers(3, group.slab, self.table.dtype) as scratch:
             for step in reversed(blend.steps):
                 active.select(step.rows)
                 n = len(step.blocks)
@@ -345,14 +309,13 @@ class Blender:
                     behind.addcmul_(a, q_k)
                 # nothing lies behind a pixel that had stopped before this step
                 torch.ops.aten.threshold_backward.grad_input(behind, step.transmittance, 0.0, grad_input=behind)
-                buffers.release(step.transmittance)
+                release_buffer(step.transmittance)
                 yield step.blocks.view(-1), self._rows(entries, alpha, weight, q, v, absolute)
 
     def again(self, group: TileGroup, step: Step, scratch: list[Tensor]) -> list[Tensor]:
         """Blend a step that was kept once more.
 
         Args:
-            group: whose step it is.
             step: of a `blend` that kept what the transpose needs; its light stays.
             scratch: two of `group.slab` numbers, or three.
 
@@ -416,3 +379,59 @@ def _shaped(scratch: list[Tensor], entries: Tensor, n_pixels: int) -> list[Tenso
     n, length, _ = entries.shape
     lengths = (length, length + 1, length)
     return [slab[: n * k * n_pixels].view(n, k, n_pixels) for slab, k in zip(scratch, lengths, strict=False)]
+
+
+RETAINED_BYTES = 1 << 30
+
+
+class _Pool:
+    def __init__(self) -> None:
+        self.free: dict[tuple[torch.dtype, int], list[Tensor]] = {}
+        self.retained = 0
+
+
+_pool = _Pool()
+
+
+def acquire_buffer(numel: int, dtype: torch.dtype) -> Tensor:
+    """Return a flat buffer of at least `numel` uninitialised numbers, used before if one is free.
+
+    Lengths are powers of two, so that scenes whose sizes change from step to step share a few kinds of buffers.
+    """
+    length = 1 << max(numel - 1, 0).bit_length()
+    free = _pool.free.get((dtype, length))
+    if not free:
+        return torch.empty(length, dtype=dtype)
+    _pool.retained -= length * dtype.itemsize
+    return free.pop()
+
+
+def release_buffer(slab: Tensor) -> None:
+    """Return a buffer from `acquire_buffer`, or a view of one's beginning; nobody may use it afterwards."""
+    size = slab.untyped_storage().nbytes()
+    slab = slab.as_strided((size // slab.itemsize,), (1,), 0)
+    if _pool.retained + size <= RETAINED_BYTES:
+        _pool.retained += size
+        _pool.free.setdefault((slab.dtype, slab.numel()), []).append(slab)
+
+
+def copy_to_buffer(tensor: Tensor) -> Tensor:
+    """Return a copy in a buffer from `acquire_buffer`, which `release_buffer` takes back."""
+    return acquire_buffer(tensor.numel(), tensor.dtype)[: tensor.numel()].view(tensor.shape).copy_(tensor)
+
+
+@contextmanager
+def acquired_buffers(n: int, numel: int, dtype: torch.dtype) -> Iterator[list[Tensor]]:
+    """Lend `n` buffers of at least `numel` numbers for a block of code."""
+    taken = [acquire_buffer(numel, dtype) for _ in range(n)]
+    try:
+        yield taken
+    finally:
+        for slab in taken:
+            release_buffer(slab)
+
+
+def clear_buffers() -> None:
+    """Free every retained buffer."""
+    _pool.free.clear()
+    _pool.retained = 0

@@ -1,1 +1,0 @@
-"""Front-to-back blending in torch: alpha, tiles in groups, the walk through their lists, and reused buffers."""
