@@ -181,7 +181,7 @@ class Trainee:
         """Return what passes over a training view of the Gaussians sum: contributions, scores, blocks, points."""
         config, _ = self._settings(watch)
         protocol = self._module("density.passes")
-        passes = protocol.Passes.of(self._module("api.registry").require_backend(self._backend), self._views(watch),
+        passes = protocol.Passes.of(self._module("api.backend").require_backend(self._backend), self._views(watch),
                                     config)  # fmt: skip
         params = {name: value.detach() for name, value in self._params(watch).items()}
         H, W = watch.cameras[view].height, watch.cameras[view].width
@@ -201,7 +201,7 @@ class Trainee:
     def written_meta(self, watch: Watch) -> list[str]:
         """Write to every key of a view's meta before it is read, and return those that forget it."""
         config, _ = self._settings(watch)
-        views, backend = self._module("train.views"), self._module("api.registry").require_backend(self._backend)
+        views, backend = self._module("train.views"), self._module("api.backend").require_backend(self._backend)
         meta = views.render_view(backend, self._params(watch), self._views(watch)[0], config, 2).info
         for name in list(meta):
             meta[name] = name
