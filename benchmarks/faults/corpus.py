@@ -35,7 +35,7 @@ from pop_fast.io.image_header import can_read_heif
 from pop_fast.io.ply import save_ply
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.load_result import RECORD, CaptureRecord, record_text
-from pop_fast.view.live.state import KeyCamera, path_of
+from pop_fast.view.live.draw import KeyCamera, path_of
 from pop_fast.view.report.checks import Checks
 from pop_ref.conformance.scene_files import save_scene
 from pop_ref.conformance.vectors import export

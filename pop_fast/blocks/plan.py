@@ -49,7 +49,7 @@ import numpy as np
 from pop_fast.blocks.partition import Partition, divide, grid_of
 from pop_fast.data.block import write_block
 from pop_fast.data.capture import Capture, Listing, SparsePoints
-from pop_fast.data.random_points import in_picture
+from pop_fast.data.load import in_picture
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.read_back import read_json

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import tyro
 
-from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED
-from pop_fast.cli.arguments import parse
+from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED, parse
 from pop_fast.cli.train_blocks import merged_lines, plan_lines, round_lines
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
@@ -102,7 +101,7 @@ def _part(args: Args, job: Job) -> Part:
 
 def _partition(folder: Path, config: TrainConfig, record: CaptureRecord, job: Job) -> int:
     from pop_fast.blocks.run import divide_capture
-    from pop_fast.cli.progress import bars
+    from pop_fast.io.heartbeat import bars
 
     with bars(config.progress) as progress:
         division = divide_capture(config, record, job, progress=progress)
@@ -143,7 +142,7 @@ def _options(folder: Path, own: TrainConfig) -> Any:
         own: the settings of the training.
     """
     from pop_fast.cli.train import arguments
-    from pop_fast.cli.train_checks import as_begun, check_output
+    from pop_fast.cli.train_options import as_begun, check_output
     from pop_fast.train.load_result import read_record
 
     record, place = read_record(folder), Path(own.result_dir)
@@ -160,9 +159,9 @@ def _train_round(folder: Path, config: TrainConfig, record: CaptureRecord, job: 
     from pop_fast.blocks.jobs import marker_of
     from pop_fast.blocks.rounds import check_merged, read_core, read_start, write_counts, write_round_block
     from pop_fast.blocks.run import round_config
-    from pop_fast.cli.errors import printable
+    from pop_fast.cli import printable
     from pop_fast.cli.train import check_backend, open_capture, summary
-    from pop_fast.cli.train_checks import record_of, resumption, stopped
+    from pop_fast.cli.train_options import record_of, resumption, stopped
     from pop_fast.train.choose import choose_backend
     from pop_fast.train.load_result import RECORD, record_text
 
@@ -202,9 +201,9 @@ def _train_round(folder: Path, config: TrainConfig, record: CaptureRecord, job: 
 
 def _merge(folder: Path, config: TrainConfig, record: CaptureRecord, job: Job, part: Part) -> int:
     from pop_fast.blocks.run import merge_capture
-    from pop_fast.cli.finish import FinishOptions, finish
-    from pop_fast.cli.progress import bars
+    from pop_fast.cli.export import FinishOptions, finish
     from pop_fast.cli.train import report, summary
+    from pop_fast.io.heartbeat import bars
 
     try:
         options = replace(FinishOptions(**job.finish), skip_checks=True)

@@ -10,8 +10,8 @@ from typing import Annotated, Any, Final
 
 import tyro
 
-from pop_fast.cli.arguments import parse
-from pop_fast.cli.capture_options import CaptureArguments
+from pop_fast.cli import parse
+from pop_fast.cli.options import CaptureArguments
 from pop_fast.errors import PopError
 
 _EXAMPLES: Final = """
@@ -39,7 +39,7 @@ def run(argv: Sequence[str]) -> int:
     args = parse(Args, argv, "compare", examples=_EXAMPLES)
     if not args.results:
         raise PopError("nothing to compare; name one or more result folders")
-    from pop_fast.view.report.compare import markdown, plain, row
+    from pop_fast.view.report.source import markdown, plain, row
 
     found = [_stats(path, args) for path in args.results]
     unfinished = [path for path, stats in zip(args.results, found, strict=True) if "psnr" not in stats]

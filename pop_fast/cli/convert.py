@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Final
 import numpy as np
 import tyro
 
-from pop_fast.cli.arguments import parse
+from pop_fast.cli import parse
 from pop_fast.cli.export import HTML, check_file, file_format, note_lost_frame, say_written
-from pop_fast.cli.limits import FormatName, LimitOptions, Output, Shown, limited
+from pop_fast.cli.options import FormatName, LimitOptions, Output, Shown, limited
 from pop_fast.errors import PopError
 
 if TYPE_CHECKING:

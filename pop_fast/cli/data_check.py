@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import tyro
 
-from pop_fast.cli.arguments import parse
-from pop_fast.cli.errors import printable
+from pop_fast.cli import parse, printable
 
 if TYPE_CHECKING:
     from pop_fast.data.photo_quality import CaptureFinding
@@ -104,8 +103,8 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
 
 def _each(items: Sequence[T], read: Callable[[T], R], file_of: Callable[[T], Path | None]) -> tuple[list[R], list[str]]:
     """Read photographs, several at a time, with progress; what was read, and a line for each JPEG with damage."""
-    from pop_fast.cli.progress import bars
-    from pop_fast.io.jpeg import jpeg_damage
+    from pop_fast.io.heartbeat import bars
+    from pop_fast.io.images import jpeg_damage
 
     files = [path for path in map(file_of, items) if path is not None]
     found: list[R] = []

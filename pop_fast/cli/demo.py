@@ -9,7 +9,7 @@ from typing import Annotated, Final
 
 import tyro
 
-from pop_fast.cli.arguments import parse
+from pop_fast.cli import parse
 
 _EXAMPLES: Final = """
     pop demo scene && pop train scene --minutes 2
@@ -37,8 +37,8 @@ class Args:
 def run(argv: Sequence[str]) -> int:
     """Run the subcommand."""
     args = parse(Args, argv, "demo", examples=_EXAMPLES)
-    from pop_fast.cli.progress import bars
     from pop_fast.demo import make_demo
+    from pop_fast.io.heartbeat import bars
 
     with bars() as progress:
         folder = make_demo(

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from pop_fast.api.registry import backend_names, get_backend
-from pop_fast.cli.arguments import parse
+from pop_fast.cli import parse
 from pop_fast.machine import machine_name, memory_bytes
 
 # holds all of torch that Python calls, and needs the rest of it

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import tyro
 
-from pop_fast.cli.arguments import parse
-from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
+from pop_fast.cli import parse
+from pop_fast.cli.options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import check_file, check_folder, folder_atomically, write_atomically
 from pop_fast.train.load_result import load_splat
@@ -75,11 +75,9 @@ def _explain(args: Args, at: tuple[int, int] | None) -> int:
     from pop_fast.train.environment import reproducible
     from pop_fast.view.explain import explain_pixel, explain_view
     from pop_fast.view.explain.diff import difference
-    from pop_fast.view.explain.maps import view_maps, write_maps
-    from pop_fast.view.explain.model import WIDTH, table
     from pop_fast.view.explain.page import page
-    from pop_fast.view.explain.pixel import check_inside
-    from pop_fast.view.explain.scene import with_objective
+    from pop_fast.view.explain.pixel import WIDTH, check_inside, table
+    from pop_fast.view.explain.scene import view_maps, with_objective, write_maps
 
     splat = load_splat(args.splat)
     capture, config = open_with_bars(splat, args)

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final
 
 import tyro
 
-from pop_fast.cli.arguments import parse
+from pop_fast.cli import parse
 
 _EXAMPLES: Final = """
     pop learn start mine           write thirteen files to fill in

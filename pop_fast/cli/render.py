@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import tyro
 
-from pop_fast.cli.arguments import parse
-from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
+from pop_fast.cli import parse
+from pop_fast.cli.options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import check_file, check_folder, folder_atomically, write_atomically
 from pop_fast.train.load_result import load_splat, paths_read

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import tyro
 
-from pop_fast.cli.arguments import parse
-from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
+from pop_fast.cli import parse
+from pop_fast.cli.options import CaptureArguments, open_with_bars
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +38,7 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _check(args: Args) -> None:
-    from pop_fast.cli.finish import checked
+    from pop_fast.cli.export import checked
     from pop_fast.train.load_result import load_splat
 
     splat = load_splat(args.result)

@@ -16,25 +16,27 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import tyro
 
 from pop_fast.api.registry import BACKENDS, require_backend
-from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED
-from pop_fast.cli.arguments import parse
-from pop_fast.cli.errors import describe, printable
-from pop_fast.cli.finish import FinishOptions, finish
-from pop_fast.cli.limits import LimitOptions
+from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED, describe, parse, printable
+from pop_fast.cli.export import FinishOptions, finish
+from pop_fast.cli.options import LimitOptions
 from pop_fast.cli.train_blocks import check_blocks, train_in_blocks
-from pop_fast.cli.train_checks import (
+from pop_fast.cli.train_options import (
+    PLAN,
+    BlocksOptions,
     as_begun,
     check_early,
     check_output,
     chooses_for_itself,
     notes_before,
+    overrides,
+    plan_of,
     record_of,
+    rename_aliases,
     resumption,
     stopped,
     with_length,
     with_size,
 )
-from pop_fast.cli.train_options import PLAN, BlocksOptions, overrides, plan_of, rename_aliases
 from pop_fast.cli.view import LiveView, check_viewer
 from pop_fast.data.sfm_files import SfmOptions
 from pop_fast.errors import PopError
@@ -181,8 +183,8 @@ def _in_a_folder(config: TrainConfig) -> TrainConfig:
     """Take photographs out of a video, or out of an archive, where the capture is one."""
     if not Path(config.data).is_file():
         return config
-    from pop_fast.cli.progress import bars
     from pop_fast.data.unpack import capture_folder
+    from pop_fast.io.heartbeat import bars
 
     with bars(config.progress) as progress:
         folder, said = capture_folder(Path(config.data), progress)
@@ -399,8 +401,8 @@ def open_capture(config: TrainConfig, options: Any) -> Capture:
 
     The cameras of bare photographs are found first.
     """
-    from pop_fast.cli.progress import bars
     from pop_fast.data.load import load_capture
+    from pop_fast.io.heartbeat import bars
     from pop_fast.lazy import background_import
 
     # a folder that is not there is said at once

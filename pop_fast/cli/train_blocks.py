@@ -9,9 +9,8 @@ from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pop_fast.cli import EXIT_INTERRUPTED
-from pop_fast.cli.errors import printable
-from pop_fast.cli.finish import FinishOptions, table_lines
+from pop_fast.cli import EXIT_INTERRUPTED, printable
+from pop_fast.cli.export import FinishOptions, table_lines
 from pop_fast.cli.train_options import BlocksOptions
 from pop_fast.errors import PopError
 
@@ -238,7 +237,7 @@ def _dividing(job: Job) -> dict[str, Any]:
 
 def _divided(config: TrainConfig, options: Any, job: Job) -> Division:
     from pop_fast.blocks.run import divide_capture
-    from pop_fast.cli.progress import bars
+    from pop_fast.io.heartbeat import bars
     from pop_fast.train.load_result import CaptureRecord
 
     how = {"images": options.images, "missing": options.missing, "source": options.source}
@@ -256,7 +255,7 @@ def _begin(folder: Path, config: TrainConfig, options: Any, job: Job, division: 
     import numpy as np
 
     from pop_fast.blocks.plan import JOB, job_text
-    from pop_fast.cli.train_checks import record_of
+    from pop_fast.cli.train_options import record_of
     from pop_fast.train.commands import COMMANDS_FILE, commands_text
     from pop_fast.train.load_result import RECORD, record_text
     from pop_fast.train.results import ResultFolder

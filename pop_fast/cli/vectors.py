@@ -9,7 +9,7 @@ from typing import Annotated, Final, Literal
 
 import tyro
 
-from pop_fast.cli.arguments import parse
+from pop_fast.cli import parse
 from pop_fast.io.atomic import folder_atomically
 
 _EXAMPLES: Final = """

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import tyro
 
-from pop_fast.cli.arguments import parse
-from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
+from pop_fast.cli import parse
+from pop_fast.cli.options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
 from pop_fast.train.load_result import Splat, load_splat
 

@@ -18,9 +18,8 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 
+from pop_fast.data.cameras import PINHOLES, Numbers, check_size, make_camera
 from pop_fast.data.capture import Listing, PosedImage, SparsePoints
-from pop_fast.data.fields import Numbers, check_size
-from pop_fast.data.pinhole import PINHOLES, make_camera
 from pop_fast.errors import CaptureError, PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.read_back import read_arrays, read_json

@@ -12,16 +12,18 @@ import numpy as np
 
 from pop_fast.data.capture import Listing, PosedImage, SparsePoints
 from pop_fast.data.colmap import find_model
-from pop_fast.data.exposure_drift import UNEVEN, exposures, levels_at
 from pop_fast.data.load import find_listing
 from pop_fast.data.normalize import FAR_APART, nearest_cameras
 from pop_fast.data.photo_quality import (
+    UNEVEN,
     CaptureFinding,
     Shown,
     State,
     about_mixed_sizes,
     about_number,
     about_use,
+    exposures,
+    levels_at,
     measure,
     number,
 )
@@ -244,8 +246,8 @@ def about_points(
 
 def about_reprojection(root: Path) -> Iterator[CaptureFinding]:
     """Tell the mean reprojection error of the model's tracks, where it has any."""
+    from pop_fast.data.cameras import require_colmap
     from pop_fast.data.colmap import quiet_colmap
-    from pop_fast.data.pinhole import require_colmap
 
     model = find_model(root)
     if model is None:

@@ -29,9 +29,8 @@ from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
 
+from pop_fast.data.cameras import Numbers, brown_lens, check_size, make_camera, shortened, viewmat_from_pose
 from pop_fast.data.capture import PosedImage, SparsePoints
-from pop_fast.data.fields import Numbers, brown_lens, check_size, shortened, viewmat_from_pose
-from pop_fast.data.pinhole import make_camera
 from pop_fast.data.transforms import points_beside
 from pop_fast.errors import CaptureError
 from pop_fast.io.image_header import read_size

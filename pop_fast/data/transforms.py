@@ -15,11 +15,10 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
+from pop_fast.data.cameras import WIDEST, Numbers, brown_lens, make_camera, shortened, viewmat_from_pose
 from pop_fast.data.capture import PosedImage, SparsePoints, Split
-from pop_fast.data.fields import WIDEST, Numbers, brown_lens, shortened, viewmat_from_pose
-from pop_fast.data.pinhole import make_camera
 from pop_fast.errors import CaptureError
-from pop_fast.io.ply_rows import read_points
+from pop_fast.io.ply import read_points
 
 __all__ = ["find_transforms", "points_beside", "read_transforms"]
 

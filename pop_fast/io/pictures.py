@@ -1,4 +1,4 @@
-"""Pictures of arrays: error maps, dominant-id maps, and their way into a page as data URIs."""
+"""Pictures of arrays: error maps, depth maps, dominant-id maps, and their way into a page as data URIs."""
 
 from __future__ import annotations
 
@@ -83,3 +83,37 @@ def colorbar_css(name: str = COLORMAP) -> str:
     """Give the colours of a map as a CSS gradient from the bottom to the top of the scale."""
     stops = colormap_table(name)[np.linspace(0, 255, 12).astype(int)]
     return "linear-gradient(90deg," + ",".join(f"#{r:02x}{g:02x}{b:02x}" for r, g, b in stops) + ")"
+
+
+DEPTH_COLORS: Final = "viridis_r"
+_NOTHING: Final = (112, 112, 118)
+
+
+def depth_range(depths: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Choose one range for all depth maps: their joint 1st to 99th percentile, without NaN."""
+    known = [depth[np.isfinite(depth)][:: max(1, depth.size // 50_000)] for depth in depths]
+    joined = np.concatenate(known) if known else np.zeros(0)
+    if not len(joined):
+        return 0.1, 1.0
+    near, far = (max(float(np.quantile(joined, q)), 1e-12) for q in (0.01, 0.99))
+    return near, max(far, near * (1.0 + 1e-6))
+
+
+def depth_picture(depth: np.ndarray, near: float, far: float) -> np.ndarray:
+    """Colour a depth map by its logarithm, near in yellow and far in violet, grey where it is not finite.
+
+    A garden has its background many times as far away as its table: evenly spaced colours would leave the table one.
+
+    Args:
+        depth: over 0, or NaN. [H, W]
+        near: yellow, over 0.
+        far: violet, over `near`.
+
+    Returns:
+        uint8 [H, W, 3]
+    """
+    known = np.isfinite(depth)
+    level = np.log(np.clip(np.where(known, depth, near), near, far) / near) / np.log(far / near)
+    picture = colormap_table(DEPTH_COLORS)[np.round(255.0 * level).astype(np.uint8)]
+    picture[~known] = _NOTHING
+    return picture

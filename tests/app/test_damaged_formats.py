@@ -21,13 +21,11 @@ import pytest
 import zstandard
 
 from benchmarks.faults.ksplat import ksplat_of
-from pop_fast.data.video import take_frames
+from pop_fast.data.unpack import take_frames
 from pop_fast.errors import PopError
-from pop_fast.io import budget
-from pop_fast.io.budget import check_memory
 from pop_fast.io.formats import FORMATS, encoded, load_splat_file
 from pop_fast.io.images import read_image
-from pop_fast.io.read_back import read_arrays
+from pop_fast.io.read_back import check_memory, read_arrays
 from tests.app.clouds import many
 from tests.app.conftest import Pop, in_a_child
 from tests.app.damage import says

@@ -25,9 +25,17 @@ from pop_fast.train.gpu_proxy import renderer
 from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
 from pop_fast.train.views import ViewTensors, render_layers, render_view
 from pop_fast.view.live import KeyCamera, RecordedPath, SplatScene, ViewState, read_path
-from pop_fast.view.live.draw import follow, scene_of
+from pop_fast.view.live.draw import (
+    field_of_view,
+    follow,
+    from_capture,
+    path_of,
+    pose_of_viewmat,
+    scene_of,
+    to_capture,
+    viewmat_of_pose,
+)
 from pop_fast.view.live.server import Pace
-from pop_fast.view.live.state import field_of_view, from_capture, path_of, pose_of_viewmat, to_capture, viewmat_of_pose
 from pop_fast.view.paths import frames_in
 from tests.app.browser import browser
 from tests.app.conftest import Pop

@@ -17,10 +17,10 @@ from PIL import Image
 from pop_fast.data import load_capture, run_sfm, sfm
 from pop_fast.data.capture import View
 from pop_fast.data.photo_quality import sharpness
-from pop_fast.data.sfm_search import pairs_of
-from pop_fast.data.video import take_frames
+from pop_fast.data.sfm import pairs_of
+from pop_fast.data.unpack import take_frames
+from pop_fast.demo.make import render_view
 from pop_fast.demo.scene import make_scene
-from pop_fast.demo.tracer import render_view
 from pop_fast.errors import CaptureError, PopError
 from pop_fast.io import images
 from pop_fast.io.images import list_images, read_image

@@ -22,11 +22,11 @@ from pop_fast.data.capture import View
 from pop_fast.data.normalize import neighbour_degrees
 from pop_fast.errors import PopError
 from pop_fast.io import pictures
-from pop_fast.io.frame import Frame
-from pop_fast.io.pictures import colormap_table
-from pop_fast.io.ply import save_ply
+from pop_fast.io.pictures import colormap_table, depth_picture, depth_range
+from pop_fast.io.ply import Frame, save_ply
 from pop_fast.train.gpu_proxy import renderer
 from pop_fast.train.load_result import load_splat
+from pop_fast.view.document import Chart, Series, Window, draw, draw_histogram, nice_ticks, short_number
 from pop_fast.view.paths import frames_in
 from pop_fast.view.report import checks, write_report
 from pop_fast.view.report.checks import (
@@ -39,9 +39,7 @@ from pop_fast.view.report.checks import (
     stops_between,
     write_checks,
 )
-from pop_fast.view.report.curves import Chart, Series, Window, draw, draw_histogram, nice_ticks, short_number
 from pop_fast.view.report.model import verdict
-from pop_fast.view.report.sections import depth_picture, depth_range
 from pop_fast.view.report.source import read_result, running_mean, thin_out
 from tests.app.browser import browser
 from tests.app.conftest import TRAIN, TRAIN_AND_CHECK, Pop

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pop_fast.cli import capture_options, explain, export, render
 from pop_fast.cli import eval as eval_command
-from pop_fast.cli.finish import table_lines
+from pop_fast.cli import explain, export, render
+from pop_fast.cli.export import table_lines
 from pop_fast.data import load, sfm
 from pop_fast.demo import make
 from pop_fast.errors import PopError

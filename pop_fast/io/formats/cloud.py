@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.errors import PopError
-from pop_fast.io.frame import Frame
-from pop_fast.io.ply import checked_params
+from pop_fast.io.ply import Frame, checked_params
 
 SH_C0: Final = 0.28209479177387814
 # columns of f_rest by degree, over three

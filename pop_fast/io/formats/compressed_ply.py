@@ -16,9 +16,7 @@ import numpy as np
 
 from pop_fast.errors import PopError
 from pop_fast.io.formats.cloud import SH_C0, Cloud, drop_largest, logits_of_bytes, restore_largest, to_bytes
-from pop_fast.io.frame import Frame
-from pop_fast.io.ply import MODE, asks_for_antialiasing
-from pop_fast.io.ply_rows import header_of, read_header
+from pop_fast.io.ply import MODE, Frame, asks_for_antialiasing, header_of, read_header
 
 _CHUNK: Final = 256
 _RANGES: Final = tuple(

@@ -11,14 +11,11 @@ from torch import Tensor
 
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
-from pop_fast.io.format_registry import FORMATS, PLY, format_names
-from pop_fast.io.formats import sog
+from pop_fast.io.formats import FORMATS, PLY, format_names, sog
 from pop_fast.io.formats.cloud import Cloud
 from pop_fast.io.formats.compressed_ply import is_compressed
 from pop_fast.io.formats.table import READ_ONLY
-from pop_fast.io.frame import Frame
-from pop_fast.io.ply import asks_for_antialiasing, params_of_ply, ply_bytes
-from pop_fast.io.ply_rows import header_of
+from pop_fast.io.ply import Frame, asks_for_antialiasing, header_of, params_of_ply, ply_bytes
 
 
 class Stored(NamedTuple):

@@ -22,7 +22,7 @@ import numpy as np
 from pop_fast.errors import PopError
 from pop_fast.io.formats import spz
 from pop_fast.io.formats.cloud import COEFFICIENTS, SH_C0, Cloud, to_bytes
-from pop_fast.io.frame import KEY, Frame
+from pop_fast.io.ply import KEY, Frame
 
 NAME: Final = "KHR_gaussian_splatting"
 SPZ_NAME: Final = "KHR_gaussian_splatting_compression_spz_2"

@@ -19,8 +19,8 @@ from typing import Final
 import numpy as np
 
 from pop_fast.errors import PopError
-from pop_fast.io.budget import check_memory
 from pop_fast.io.formats.cloud import COEFFICIENTS, SH_C0, Cloud, logits_of_bytes
+from pop_fast.io.read_back import check_memory
 
 _HEADER_SIZE, _SECTION_SIZE, _BUCKET_SIZE = 4096, 1024, 12
 # version, sections, Gaussians, level; range of the coefficients of level 2

@@ -24,9 +24,9 @@ import torch
 from torch import Tensor
 
 from pop_fast.errors import PopError
-from pop_fast.io.budget import check_members, check_memory
 from pop_fast.io.formats.cloud import COEFFICIENTS, Cloud, drop_largest, logits_of_bytes, restore_largest, to_bytes
-from pop_fast.io.frame import KEY, Frame
+from pop_fast.io.ply import KEY, Frame
+from pop_fast.io.read_back import check_members, check_memory
 
 _CODES: Final = 256
 _ROUNDS: Final = 8

@@ -25,9 +25,9 @@ from typing import Final
 import numpy as np
 
 from pop_fast.errors import PopError
-from pop_fast.io.budget import check_memory
 from pop_fast.io.formats.cloud import COEFFICIENTS, Cloud, drop_largest, logits_of_bytes, restore_largest, to_bytes
-from pop_fast.io.frame import KEY, Frame
+from pop_fast.io.ply import KEY, Frame
+from pop_fast.io.read_back import check_memory
 
 MAGIC: Final = 0x5053474E
 # magic, version, count, degree, fractional bits, flags, and a zero byte or the number of streams

@@ -15,9 +15,8 @@ import torch
 
 from pop_fast.api.registry import backend_names, get_backend
 from pop_fast.errors import PopError
-from pop_fast.view.explain.maps import Map, scaled
 from pop_fast.view.explain.pixel import Step, Walk, candidates, oracle_splats, walk
-from pop_fast.view.explain.scene import TILE_SIZE, ExplainedView
+from pop_fast.view.explain.scene import TILE_SIZE, ExplainedView, Map, scaled
 from pop_ref.camera import in_front
 from pop_ref.constants import PROFILES, Profile
 from pop_ref.dominance import dominant_id

@@ -10,8 +10,8 @@ import numpy as np
 
 from pop_fast.io.pictures import data_uri, fit, id_colors
 from pop_fast.view.document import asset, document, element
-from pop_fast.view.explain.maps import Map, crop
-from pop_fast.view.explain.model import PixelExplanation, Row, weighty
+from pop_fast.view.explain.pixel import PixelExplanation, Row, weighty
+from pop_fast.view.explain.scene import Map, crop
 from pop_ref.constants import PROFILES
 
 Box = tuple[int, int, int, int]

@@ -1,4 +1,8 @@
-"""From a state to a picture, of a splat at rest or of a training between its steps."""
+"""What one browser shows: a camera, a size, a mode and what is left out, and the picture of these.
+
+The splat is at rest, or of a training between its steps. A recorded path of cameras is a JSON file, which
+`pop render --path FILE` takes.
+"""
 
 from __future__ import annotations
 
@@ -11,15 +15,22 @@ import torch
 from torch import Tensor
 
 from pop_fast.density.shrink import inside, opaque_enough
-from pop_fast.io.pictures import colormap_table, id_colors
+from pop_fast.io.pictures import colormap_table, depth_picture, depth_range, id_colors
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.views import Layers, render_layers
-from pop_fast.view.live.state import Box, ViewState
-from pop_fast.view.report.sections import depth_picture, depth_range
 
 if TYPE_CHECKING:
     from pop_fast.train.training_run import TrainingRun
     from pop_fast.view.live.server import LiveViewer
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, get_args
+
+from pop_fast.errors import PopError
+from pop_fast.io.read_back import read_json
+from pop_fast.train.views import ViewTensors
+from pop_fast.view.paths import interpolate
 
 # what covers a pixel by less has no depth
 _SEEN = 0.1
@@ -138,3 +149,168 @@ def follow(viewer: LiveViewer, run: TrainingRun, world_transform: np.ndarray) ->
     note = f"step {run.step:,} of {run.config.max_steps:,}"
     viewer.show(scene_of(run, world_transform), note)
     viewer.draw_due(_SHARE)
+
+
+Mode = Literal["colour", "dominant", "opacity", "depth"]
+MODES: Final[tuple[Mode, ...]] = get_args(Mode)
+# xmin, ymin, zmin, xmax, ymax, zmax
+Box = tuple[float, float, float, float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class ViewState:
+    """A view that can be drawn.
+
+    Attributes:
+        viewmat: world -> camera, OpenCV. [4, 4]
+        fov_y: angle from the upper to the lower edge, radians.
+        width: px
+        height: px
+        mode: what is drawn: the render, dominant Gaussians, how opaque pixels are, or their depth.
+        min_opacity: Gaussians of less are left out.
+        crop: those with centres outside are left out; in the capture's own frame.
+    """
+
+    viewmat: np.ndarray
+    fov_y: float
+    width: int
+    height: int
+    mode: Mode = "colour"
+    min_opacity: float = 0.0
+    crop: Box | None = None
+
+    @property
+    def K(self) -> np.ndarray:
+        """Intrinsics, px, with square pixels and the axis in the middle. [3, 3]"""
+        return intrinsics(self.fov_y, self.width, self.height)
+
+    def camera(self) -> ViewTensors:
+        """Return the camera as renderers take it."""
+        blank = torch.zeros((self.height, self.width, 3), dtype=torch.uint8)
+        viewmat = torch.from_numpy(np.asarray(self.viewmat, np.float64)).float()[None]
+        return ViewTensors("view", blank, None, viewmat, torch.from_numpy(self.K).float()[None])
+
+
+def intrinsics(fov_y: float, width: int, height: int) -> np.ndarray:
+    """Return the intrinsics of a camera with square pixels and its axis in the middle, px. [3, 3]"""
+    focal = height / (2.0 * np.tan(fov_y / 2.0))
+    return np.array([[focal, 0.0, width / 2.0], [0.0, focal, height / 2.0], [0.0, 0.0, 1.0]])
+
+
+def field_of_view(K: np.ndarray, height: int) -> float:
+    """Return the angle from the upper to the lower edge of a photograph, radians."""
+    return float(2.0 * np.arctan2(height / 2.0, K[1, 1]))
+
+
+def viewmat_of_pose(wxyz: np.ndarray, position: np.ndarray) -> np.ndarray:
+    """Return world -> camera of a camera's rotation (camera -> world, unit quaternion) and place. [4, 4]"""
+    w, x, y, z = np.asarray(wxyz, np.float64) / np.linalg.norm(wxyz)
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = rotation.T
+    viewmat[:3, 3] = -rotation.T @ np.asarray(position, np.float64)
+    return viewmat
+
+
+def pose_of_viewmat(viewmat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a camera's rotation, camera -> world as a unit quaternion wxyz, and its place. [4], [3]"""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(viewmat[:3, :3].T).as_quat()
+    return np.array([w, x, y, z]), -viewmat[:3, :3].T @ viewmat[:3, 3]
+
+
+_KIND: Final = "pop camera path"
+_FIX: Final = "record it again in 'pop view'"
+
+
+@dataclass(frozen=True, eq=False)
+class KeyCamera:
+    """A camera to pass: world -> camera [4, 4], and the angle from the upper to the lower edge, radians."""
+
+    viewmat: np.ndarray
+    fov_y: float
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedPath:
+    """Cameras to pass in order, in the capture's own frame."""
+
+    cameras: tuple[KeyCamera, ...]
+
+    def text(self) -> str:
+        """Return what the file holds."""
+        entries = [{"viewmat": c.viewmat.tolist(), "fov_y_degrees": float(np.degrees(c.fov_y))} for c in self.cameras]
+        return json.dumps({"kind": _KIND, "frame": "capture", "cameras": entries}, indent=2) + "\n"
+
+    def along(self, n_frames: int, world_transform: np.ndarray) -> list[KeyCamera]:
+        """Glide through the cameras: cubic splines through places, rotations and the logarithm of the focal length.
+
+        Args:
+            n_frames: cameras on the path; its first and last are the recorded ones. A single camera stays.
+            world_transform: world = world_transform @ the capture's own frame. [4, 4]
+
+        Returns:
+            Cameras of the world.
+        """
+        viewmats = np.stack([from_capture(c.viewmat, world_transform) for c in self.cameras])
+        if len(viewmats) == 1:
+            return [KeyCamera(viewmats[0], self.cameras[0].fov_y)] * n_frames
+        at = np.linspace(0.0, len(viewmats) - 1.0, n_frames)
+        zooms = np.interp(at, np.arange(len(viewmats)), [np.log(np.tan(c.fov_y / 2.0)) for c in self.cameras])
+        path = interpolate(viewmats, n_frames)
+        return [KeyCamera(v, float(2.0 * np.arctan(np.exp(zoom)))) for v, zoom in zip(path, zooms, strict=True)]
+
+
+def to_capture(viewmat: np.ndarray, world_transform: np.ndarray) -> np.ndarray:
+    """Express a camera of the world in the capture's own frame; it stays rigid. [4, 4]"""
+    moved = viewmat @ world_transform
+    moved[:3] /= np.cbrt(np.linalg.det(world_transform[:3, :3]))
+    return moved
+
+
+def from_capture(viewmat: np.ndarray, world_transform: np.ndarray) -> np.ndarray:
+    """Express a camera of the capture's own frame in the world; it stays rigid. [4, 4]"""
+    return to_capture(viewmat, np.linalg.inv(world_transform))
+
+
+def read_path(path: Path) -> RecordedPath:
+    """Read a recorded path.
+
+    Raises:
+        PopError: it is not one; names the entry.
+    """
+    content = read_json(path, _FIX)
+    if content.get("kind") != _KIND or content.get("frame") != "capture":
+        raise PopError(f"{path}: is not a camera path of 'pop view' (kind {content.get('kind')!r}); {_FIX}")
+    entries = content.get("cameras")
+    if not isinstance(entries, list) or not entries:
+        raise PopError(f"{path}: has no cameras; {_FIX}")
+    return RecordedPath(tuple(_camera(entry, f"{path}: cameras[{i}]") for i, entry in enumerate(entries)))
+
+
+def _camera(entry: Any, where: str) -> KeyCamera:
+    try:
+        viewmat, degrees = np.array(entry["viewmat"], np.float64), float(entry["fov_y_degrees"])
+    except (TypeError, KeyError, ValueError, OverflowError) as error:
+        raise PopError(f"{where}: needs viewmat and fov_y_degrees ({error}); {_FIX}") from error
+    if viewmat.shape != (4, 4) or not np.allclose(viewmat[:3, :3] @ viewmat[:3, :3].T, np.eye(3), atol=1e-4):
+        raise PopError(f"{where}: viewmat is no rigid 4 x 4 matrix; {_FIX}")
+    if not np.isfinite(viewmat).all() or not np.array_equal(viewmat[3], [0.0, 0.0, 0.0, 1.0]):
+        raise PopError(f"{where}: viewmat is no rigid 4 x 4 matrix; {_FIX}")
+    if np.linalg.det(viewmat[:3, :3]) < 0.0:
+        raise PopError(f"{where}: viewmat is mirrored, which no camera is; {_FIX}")
+    if not 0.0 < degrees < 180.0:
+        raise PopError(f"{where}: fov_y_degrees is {degrees:g}; it must be in (0, 180); {_FIX}")
+    return KeyCamera(viewmat, float(np.radians(degrees)))
+
+
+def path_of(cameras: Sequence[KeyCamera], world_transform: np.ndarray) -> RecordedPath:
+    """Make a path of cameras of the world."""
+    return RecordedPath(tuple(KeyCamera(to_capture(c.viewmat, world_transform), c.fov_y) for c in cameras))

@@ -10,8 +10,8 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
+from pop_fast.view.live.draw import MODES, Box, KeyCamera, Mode, ViewState, path_of
 from pop_fast.view.live.guard import Rule, flag, interval, number, one_of
-from pop_fast.view.live.state import MODES, Box, KeyCamera, Mode, ViewState, path_of
 
 _LONGEST: Final = (480, 720, 960, 1280, 1920)
 _AXES: Final = ("x", "y", "z")

@@ -14,8 +14,8 @@ import numpy as np
 from pop_fast.data.normalize import FAR_APART
 from pop_fast.data.photo_quality import FEW
 from pop_fast.train.automatic import LOOKS
+from pop_fast.view.document import Window
 from pop_fast.view.report.checks import Checks
-from pop_fast.view.report.curves import Window
 from pop_ref.settings import Recipe
 
 # training views are always matched better, dB

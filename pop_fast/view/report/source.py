@@ -1,4 +1,7 @@
-"""Read a result folder into what the report shows. Only files in the folder are read; what is absent is left out."""
+"""Read result folders into what a report shows, and into a row of a table of several results.
+
+Only files in the folder are read; what is absent is left out.
+"""
 
 from __future__ import annotations
 
@@ -12,17 +15,17 @@ from typing import Any, Final
 import numpy as np
 
 from pop_fast.errors import PopError
+from pop_fast.io.atomic import write_atomically
 from pop_fast.io.read_back import check_record, parse_json, read_arrays, read_json
 from pop_fast.train.commands import read_commands, shell_line
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import read_record
-from pop_fast.train.presets import METHODS, Given, words_of
+from pop_fast.train.presets import ALIASES, METHODS, Given, words_of
 from pop_fast.train.results import read_config
+from pop_fast.view.document import Window
 from pop_fast.view.report.checks import Checks, read_checks
-from pop_fast.view.report.compare import threads_of
-from pop_fast.view.report.curves import Window
 from pop_fast.view.report.model import Finding, Histogram, ReportData, ReportView, Tile, verdict
-from pop_fast.view.report.sections import checked_encodings, encoding_heads, encoding_rows
+from pop_fast.view.report.page import page
 
 # float32 numbers of a Gaussian: as gsplat's checkpoints hold it, and as Inria's PLY does (with three zero normals)
 BYTES_CKPT: Final = 59 * 4
@@ -375,3 +378,150 @@ def _settings(config: TrainConfig, folder: Path) -> dict[str, Any]:
         "scale_lambda_pop": given.scale_lambda_pop,
         **({"chosen by the run": "; ".join(record.chosen)} if record is not None and record.chosen else {}),
     } | config.flat()
+
+
+COLUMNS: Final = (
+    "capture",
+    "method",
+    "λ",
+    "steps",
+    "PSNR",
+    "SSIM",
+    "Gaussians",
+    "with opacity ≥ 1/255",
+    "per pixel: blended / traversed",
+    "opacity > 0.9 / < 0.1",
+    "seconds",
+    "machine",
+)
+_TEXT: Final = frozenset({"capture", "method", "machine"})
+
+
+def row(stats: Mapping[str, Any]) -> list[str]:
+    """Write one run's statistics (stats/val_step*.json) as the cells of a row; what is absent becomes a dash."""
+
+    def cell(form: str, *keys: str) -> str:
+        values = [stats.get(key) for key in keys]
+        return "–" if any(value is None for value in values) else form.format(*values)
+
+    steps = stats.get("step")
+    method = str(stats.get("method", "–"))
+    machine = [str(stats.get("machine", "–")), *([stats["backend"]] if stats.get("backend") else [])]
+    machine += [threads_of(stats)] if "threads" in stats else []
+    return [
+        str(stats.get("capture", "–")),
+        METHODS[name].title.split(" (")[0] if (name := ALIASES.get(method, method)) in METHODS else method,
+        "–" if not stats.get("lambda_pop") else f"{stats['lambda_pop']:g}",
+        "–" if steps is None else _steps(steps + 1, stats.get("max_steps")),
+        cell("{:.2f}", "psnr"),
+        cell("{:.4f}", "ssim"),
+        cell("{:,}", "num_GS"),
+        cell("{:,}", "num_GS_above_floor"),
+        cell("{:.1f} / {:.1f}", "n_blended", "n_traversed"),
+        cell("{:.0%} / {:.0%}", "opacity_above_0.9", "opacity_below_0.1"),
+        cell("{:,.0f}", "seconds"),
+        ", ".join(machine),
+    ]
+
+
+def _steps(taken: int, planned: Any) -> str:
+    """Write how many steps a row is of, and of how many where the run has not come to its end."""
+    return f"{taken:,}" if not isinstance(planned, int) or taken >= planned else f"{taken:,} of {planned:,}, unfinished"
+
+
+def threads_of(stats: Mapping[str, Any]) -> str:
+    """Write how many threads a run had."""
+    return f"{stats['threads']} thread{'' if stats['threads'] == 1 else 's'}"
+
+
+def markdown(rows: Sequence[Sequence[str]]) -> str:
+    """Lay rows out as a Markdown table, numbers to the right."""
+    rule = ["---" if name in _TEXT else "---:" for name in COLUMNS]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (COLUMNS, rule, *rows))
+
+
+def plain(rows: Sequence[Sequence[str]]) -> str:
+    """Lay rows out in columns for a terminal."""
+    table = [COLUMNS, *rows]
+    widths = [max(len(cells[i]) for cells in table) for i in range(len(COLUMNS))]
+    lines: list[str] = []
+    for cells in table:
+        padded = (
+            cell.ljust(width) if name in _TEXT else cell.rjust(width)
+            for name, cell, width in zip(COLUMNS, cells, widths, strict=True)
+        )
+        lines.append("  ".join(padded).rstrip())
+    return "\n".join(lines)
+
+
+_KINDS: Final[Mapping[str, tuple[type, ...]]] = {
+    "format": (str,),
+    "bytes": (int,),
+    "num_gaussians": (int,),
+    "psnr": (int, float, type(None)),
+    "views": (int,),
+}
+
+
+def checked_encodings(entries: Any, where: str, fix: str) -> list[dict[str, Any]]:
+    """Check the entry `encodings` of the statistics.
+
+    Raises:
+        PopError: it is not what `pop train` writes; names the entry.
+    """
+    if not isinstance(entries, list):
+        raise PopError(f"{where}: encodings is {type(entries).__name__}; it must be a list; {fix}")
+    for index, entry in enumerate(entries):
+        wrong = [
+            name
+            for name, kinds in _KINDS.items()
+            if not isinstance(entry, dict) or name not in entry or not isinstance(entry[name], kinds)
+        ]
+        if wrong:
+            raise PopError(f"{where}: encodings[{index}].{wrong[0]} is absent or of the wrong kind; {fix}")
+    return entries
+
+
+def encoding_heads(encodings: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    """Return the heads of a table of encodings; few of many held-out views are rendered, and the last head says so."""
+    views = max((entry["views"] for entry in encodings), default=0)
+    return "format", "MB", "B/Gaussian", "of the PLY", f"PSNR of {views} held-out view{'' if views == 1 else 's'}"
+
+
+def encoding_rows(encodings: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
+    """Return the cells of a table of encodings, under `encoding_heads`.
+
+    Args:
+        encodings: entries of the statistics, as `pop_fast.train.encodings.Encoding` makes them.
+
+    Returns:
+        A row a format: its name, MB, bytes a Gaussian, size as a share of the PLY's, PSNR and how far it is from the
+        PLY's.
+    """
+    whole = next((entry for entry in encodings if entry["format"] == "ply"), None)
+    rows = []
+    for entry in encodings:
+        share = f"1/{whole['bytes'] / max(entry['bytes'], 1):.1f}" if whole else ""
+        psnr = "" if entry["psnr"] is None else f"{entry['psnr']:.2f} dB"
+        if entry is not whole and whole and None not in (entry["psnr"], whole["psnr"]):
+            psnr += f" ({entry['psnr'] - whole['psnr']:+.2f})"
+        each = f"{entry['bytes'] / max(entry['num_gaussians'], 1):.1f}"
+        rows.append((entry["format"], f"{entry['bytes'] / 1e6:.2f}", each, share, psnr))
+    return rows
+
+
+def write_report(result_dir: str | Path) -> Path:
+    """Write report.html into a result folder, from the files in it alone.
+
+    Returns:
+        The page's path.
+
+    Raises:
+        PopError: the folder is not a result of `pop train`, or one of its files cannot be read.
+    """
+    folder = Path(result_dir)
+    # a name that is no text is shown with escapes
+    html = page(read_result(folder)).encode("utf-8", "backslashreplace")
+    target = folder / "report.html"
+    write_atomically(target, lambda file: file.write(html))
+    return target

@@ -1,4 +1,4 @@
-"""The options that make a splat smaller on its way into a file, and how they are applied."""
+"""Options of several subcommands: which capture to look at, and what to leave out of a splat on its way into a file."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, Literal
 
 from pop_fast.errors import PopError
-from pop_fast.io.format_registry import format_names
+from pop_fast.io.formats import format_names
 from pop_fast.io.heartbeat import duration
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from pop_fast.data import Capture
     from pop_fast.density.shrink import Score
-    from pop_fast.io.frame import Frame
+    from pop_fast.io.ply import Frame
     from pop_fast.train.compact import Compact, Tuner
     from pop_fast.train.config import TrainConfig
 
@@ -27,6 +27,19 @@ if TYPE_CHECKING:
 else:
     # what is registered when the program starts
     FormatName = Literal[(*format_names(), "html")]
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from pop_fast.train.load_result import CaptureOptions, Splat, open_capture
+
+if TYPE_CHECKING:
+    from pop_fast.data import Capture
+    from pop_fast.data.load import Photographs
+    from pop_fast.train.config import TrainConfig
+
+
 # views that scores are summed over, at most; of a larger capture, an even selection
 _MOST_VIEWS: Final = 100
 # bytes of what `--target-mb` counts in
@@ -245,7 +258,7 @@ def _fit_unseen(left: Limited, limits: LimitOptions, output: Output) -> None:
 
 def _fit_seen(left: Limited, limits: LimitOptions, output: Output, shown: Shown, score: Score) -> None:
     """Fit a splat into its bytes by what loses least in its training views, and tune what is left on them."""
-    from pop_fast.cli.progress import bars
+    from pop_fast.io.heartbeat import bars
     from pop_fast.train import compact
 
     capture, config, learned = _photographs(shown, left, limits.crop is not None)
@@ -357,3 +370,21 @@ def _scores(shown: Shown, params: Mapping[str, Tensor], score: Score) -> Tensor:
     placed = {name: value.to(device) for name, value in params.items()}
     degree = min(shown.sh_degree, degree_of(params))
     return shrink.view_scores(score, passes, placed, degree)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureArguments(CaptureOptions):
+    """Which photographs and cameras to use; what is not given is as in training."""
+
+    capture: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """The capture; by default the one it was trained on."""
+
+
+def open_with_bars(
+    splat: Splat, options: CaptureOptions, photographs: Photographs = "all"
+) -> tuple[Capture, TrainConfig]:
+    """Load the capture that a splat shows under progress bars; see `pop_fast.train.load_result.open_capture`."""
+    from pop_fast.io.heartbeat import bars
+
+    with bars() as progress:
+        return open_capture(splat, options, progress, photographs)
