@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
@@ -104,17 +103,9 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
 def _each(items: Sequence[T], read: Callable[[T], R], file_of: Callable[[T], Path | None]) -> tuple[list[R], list[str]]:
     """Read photographs, several at a time, with progress; what was read, and a line for each JPEG with damage."""
     from pop_fast.io.heartbeat import bars
-    from pop_fast.io.images import jpeg_damage
+    from pop_fast.io.images import in_threads, jpeg_damage
 
     files = [path for path in map(file_of, items) if path is not None]
-    found: list[R] = []
-    with bars() as progress, jpeg_damage(files) as damage, ThreadPoolExecutor(max_workers=4) as pool:
-        jobs = [pool.submit(read, item) for item in items]
-        try:
-            for job in jobs:
-                found.append(job.result())
-                progress("looking at photographs", len(found), len(jobs))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    with bars() as progress, jpeg_damage(files) as damage:
+        found = in_threads(read, items, "looking at photographs", progress, most=4)
     return found, list(damage.values())

@@ -41,9 +41,7 @@ def find_block(folder: Path) -> bool:
 def write_block(folder: Path, listing: Listing) -> None:
     """Write a block: its photographs are those of `listing.shots`, its points those of `listing.cloud`.
 
-    Args:
-        folder: where to; made where it is absent.
-        listing: in the capture's own frame, with the training frame of the whole capture as its `transform`.
+    All is in the capture's own frame, with the training frame of the whole capture as `listing.transform`.
     """
     cloud, transform = listing.cloud, listing.transform
     if cloud is None or transform is None:

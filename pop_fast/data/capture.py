@@ -52,12 +52,10 @@ class View:
 
     @property
     def width(self) -> int:
-        """Width of the image, px."""
         return int(self.image.shape[1])
 
     @property
     def height(self) -> int:
-        """Height of the image, px."""
         return int(self.image.shape[0])
 
     @property
@@ -134,11 +132,7 @@ class Capture:
         return float(1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
 
     def train_views(self, test_every: int = 8) -> tuple[View, ...]:
-        """Select the views to train on: all that `test_views` leaves, validation views apart.
-
-        Args:
-            test_every: as `test_views`.
-        """
+        """Select the views to train on: all that `test_views` leaves, validation views apart."""
         if self._has_split:
             return tuple(view for view in self.views if view.split == "train")
         return tuple(view for i, view in enumerate(self.views) if test_every <= 0 or i % test_every != 0)
@@ -161,12 +155,7 @@ class Capture:
 
 
 def held_out(splits: Sequence[Split | None], test_every: int) -> list[bool]:
-    """Tell which views are held out; see `Capture.test_views`.
-
-    Args:
-        splits: the capture's own assignment of each view, in the order of their names.
-        test_every: as `Capture.test_views`.
-    """
+    """Tell which views are held out, by the capture's own assignment in the order of their names; see `test_views`."""
     if any(split is not None for split in splits):
         chosen = "test" if "test" in splits else "val"
         return [split == chosen for split in splits]
@@ -205,12 +194,7 @@ class PosedImage:
 
 @dataclass(frozen=True, eq=False)
 class SparsePoints:
-    """Sparse points.
-
-    Attributes:
-        xyz: float64 [P, 3]
-        rgb: uint8 [P, 3]
-    """
+    """Sparse points: places float64 [P, 3], colours uint8 [P, 3]."""
 
     xyz: np.ndarray
     rgb: np.ndarray

@@ -53,12 +53,7 @@ class Photo:
 
 
 def read_listing(root: Path, images: str | None = None) -> Listing | None:
-    """Read where photographs were taken, as training does; see `pop_fast.data.load.find_listing`.
-
-    Args:
-        root: the capture's folder.
-        images: the folder in it with the photographs, in place of the listed one.
-    """
+    """Read where photographs were taken, as training does; `images` is their folder in place of the listed one."""
     listing = find_listing(root, images=images)
     if listing is None or images is None:
         return listing

@@ -82,7 +82,7 @@ def read_model(model: Path) -> tuple[list[PosedImage], SparsePoints]:
     """Read cameras, poses and points of a model.
 
     Args:
-        model: the folder with cameras, images and points3D, `.bin` or `.txt` (binary preferred, as COLMAP does).
+        model: the folder with cameras, images and points3D, `.bin` or `.txt`.
 
     Returns:
         One shot for every image, sorted by name, and the points in order of their ids.
@@ -170,8 +170,6 @@ class ImageRecord:
         where: the record in its file, for messages.
         quat: rotation world -> camera, wxyz, as stored. float64 [4]
         translation: world -> camera. float64 [3]
-        camera_id: of its camera.
-        name: relative file name, as stored.
         image_id: by which tracks name it.
     """
 
@@ -267,11 +265,7 @@ def count_images_binary(path: Path) -> int:
 def read_binary(folder: Path) -> Model:
     """Read `cameras.bin`, `images.bin` and `points3D.bin`.
 
-    The rigs and frames of COLMAP 3.12 and later are only walked, to find an incomplete copy: every image has its own
-    pose in `images.bin` too.
-
-    Raises:
-        CaptureError: names the file and the record that is truncated, unknown or unreadable.
+    The rigs and frames of COLMAP 3.12 and later are only walked, to find an incomplete copy.
     """
     cameras = _read(folder / "cameras.bin", _binary_camera)
     images = _read(folder / "images.bin", _binary_image)
@@ -279,6 +273,10 @@ def read_binary(folder: Path) -> Model:
     for name, walk in (("rigs.bin", _walk_rig), ("frames.bin", _walk_frame)):
         if (folder / name).is_file():
             _read(folder / name, walk)
+    return _model(cameras, images, points)
+
+
+def _model(cameras: list[Any], images: list[ImageRecord], points: list[tuple[Any, ...]]) -> Model:
     return Model(
         {camera.camera_id: camera for camera in cameras},
         images,
@@ -368,25 +366,11 @@ def count_images_text(path: Path) -> int:
 
 
 def read_text(folder: Path) -> Model:
-    """Read `cameras.txt`, `images.txt` and `points3D.txt`.
-
-    Raises:
-        CaptureError: names the file, the line and the field that is absent or cannot be read.
-    """
-    cameras: dict[int, Any] = {}
-    for line in _records(folder / "cameras.txt", _CAMERA):
-        camera = _text_camera(line)
-        cameras[camera.camera_id] = camera
+    """Read `cameras.txt`, `images.txt` and `points3D.txt`."""
+    cameras = [_text_camera(line) for line in _records(folder / "cameras.txt", _CAMERA)]
     images = [_text_image(line) for line in _image_lines(folder / "images.txt")]
     points = [_text_point(line) for line in _records(folder / "points3D.txt", _TEXT_POINT)]
-    return Model(
-        cameras,
-        images,
-        np.array([point[0] for point in points], dtype=np.uint64),
-        np.array([point[1:4] for point in points], dtype=np.float64).reshape(-1, 3),
-        np.array([point[4:7] for point in points], dtype=np.uint8).reshape(-1, 3),
-        [point[-1] for point in points],
-    )
+    return _model(cameras, images, points)
 
 
 class _Line:

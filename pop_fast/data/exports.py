@@ -57,15 +57,7 @@ def photographs_of_polycam(root: Path) -> Path | None:
 
 
 def read_polycam(folder: Path, root: Path) -> list[PosedImage]:
-    """Read every camera of an export, sorted by name.
-
-    Args:
-        folder: as `find_polycam` returns it.
-        root: the capture.
-
-    Raises:
-        CaptureError: names the file, the field and what it should be.
-    """
+    """Read every camera of an export, sorted by name, from the folder that `find_polycam` returns."""
     photos = folder.parent / dict(_FOLDERS)[folder.name]
     relative = photos.relative_to(root).as_posix()
     return [_shot(path, photos, relative, number) for number, path in enumerate(sorted(folder.glob("*.json")), start=1)]
@@ -135,19 +127,7 @@ def find_metashape(root: Path) -> Path | None:
 
 
 def read_metashape(path: Path, root: Path, images: str) -> tuple[list[PosedImage], list[str]]:
-    """Read all cameras that are aligned, sorted by label.
-
-    Args:
-        path: the XML file.
-        root: the capture.
-        images: the folder in it with the photographs; "" for the capture itself.
-
-    Returns:
-        The shots, and notes on cameras that were left out.
-
-    Raises:
-        CaptureError: names the file, the element and what it should be.
-    """
+    """Read all cameras that are aligned, sorted by label, and notes on those that were left out."""
     try:
         document = ET.fromstring(path.read_bytes())
     except OSError as error:
@@ -277,16 +257,7 @@ def find_realitycapture(root: Path) -> Path | None:
 
 
 def read_realitycapture(path: Path, root: Path, images: str) -> list[PosedImage]:
-    """Read all cameras, sorted by name.
-
-    Args:
-        path: the CSV file.
-        root: the capture; its photographs say the size, which the file does not.
-        images: the folder in it with the photographs; "" for the capture itself.
-
-    Raises:
-        CaptureError: names the file, the row, the field and what it should be.
-    """
+    """Read all cameras, sorted by name; the photographs say their size, which the file does not."""
     rows = _rows(path)
     sizes = {name: _size(root / images, name) for name, _ in rows}
     known = [size for size in sizes.values() if size is not None]
@@ -381,12 +352,7 @@ EXPORTS: Final = {
 
 
 def find_export(root: Path, program: str = "auto") -> tuple[str, Path] | None:
-    """Find what a program has exported: the program and its file or folder, or None.
-
-    Args:
-        root: the capture.
-        program: look for its export alone; "auto" takes the first that is there.
-    """
+    """Find what a program has exported, the program and its file or folder; "auto" takes the first that is there."""
     for name, (_, find, _) in EXPORTS.items():
         found = find(root) if program in ("auto", name) else None
         if found is not None:
@@ -397,24 +363,23 @@ def find_export(root: Path, program: str = "auto") -> tuple[str, Path] | None:
 def read_export(
     program: str, path: Path, root: Path, images: str | None = None
 ) -> tuple[list[PosedImage], SparsePoints | None, list[str]]:
-    """Read an export.
+    """Read an export that `find_export` found.
 
     Args:
         program: one of `EXPORTS`.
-        path: as `find_export` found it.
+        path: its file or folder.
         root: the capture.
         images: the folder in it with the photographs; by default `images`, or the capture itself where there is none.
 
     Returns:
         The shots; the points of `sparse_pc.ply` or `points3D.ply` in the capture, or None; notes.
-
-    Raises:
-        CaptureError: names the file, the field and what it should be.
     """
     folder = images or ("images" if (root / "images").is_dir() else "")
+    notes: list[str] = []
     if program == "polycam":
-        return read_polycam(path, root), points_beside(root), []
-    if program == "metashape":
+        shots = read_polycam(path, root)
+    elif program == "metashape":
         shots, notes = read_metashape(path, root, folder)
-        return shots, points_beside(root), notes
-    return read_realitycapture(path, root, folder), points_beside(root), []
+    else:
+        shots = read_realitycapture(path, root, folder)
+    return shots, points_beside(root), notes

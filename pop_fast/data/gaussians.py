@@ -94,14 +94,10 @@ def apply_similarity(params: dict[str, torch.Tensor], transform: np.ndarray) -> 
 
 
 def rotate_sh(sh: torch.Tensor, rotation: np.ndarray) -> torch.Tensor:
-    """Turn spherical harmonics: the colour seen along R d afterwards is the colour seen along d before.
+    """Turn spherical harmonics [N, 1|4|9|16, 3]: the colour along R d afterwards is the colour along d before.
 
     A band of degree l is closed under rotations, so M_l in basis_l(R d) M_l = basis_l(d) exists and is orthogonal; it
     is solved from more directions than the band has functions.
-
-    Args:
-        sh: float64 [N, 1|4|9|16, 3].
-        rotation: [3, 3].
     """
     degree = int(np.sqrt(sh.shape[1])) - 1
     directions = torch.from_numpy(_directions(32))

@@ -35,12 +35,7 @@ _NAMED = 12
 
 
 def about_other_models(root: Path, models: Sequence[tuple[Path, int]]) -> list[str]:
-    """Tell which models of a capture were passed over for the largest.
-
-    Args:
-        root: the capture's folder.
-        models: folders and their numbers of images (-1: unreadable), the one that is used first.
-    """
+    """Tell which models were passed over for the first, with their numbers of images (-1: unreadable)."""
     if len(models) < 2:
         return []
     listed = [f"{path.relative_to(root)} ({count if count >= 0 else 'unreadable'})" for path, count in models]
@@ -50,12 +45,7 @@ def about_other_models(root: Path, models: Sequence[tuple[Path, int]]) -> list[s
 
 
 def about_unplaced(folder: Path, shots: Sequence[PosedImage]) -> list[str]:
-    """Tell which photographs of a folder have no camera.
-
-    Args:
-        folder: where the photographs are.
-        shots: what the model lists.
-    """
+    """Tell which photographs of a folder have no camera among the shots that the model lists."""
     # by stem too, because a photograph may have been converted since the model was made
     placed = {name for shot in shots for name in (shot.file, splitext(shot.file)[0])}
     names = [path.relative_to(folder).as_posix() for path in photographs(folder)]
@@ -70,13 +60,7 @@ def about_unplaced(folder: Path, shots: Sequence[PosedImage]) -> list[str]:
 
 
 def about_random_points(views: Sequence[View], made: int, wanted: int) -> list[str]:
-    """Tell where random points can be expected to be poor: too few, or between cameras that all look away from there.
-
-    Args:
-        views: with their cameras.
-        made: points that were made.
-        wanted: points that should have been.
-    """
+    """Tell where random points can be expected to be poor: too few, or between cameras that all look away."""
     fix = "bring points: run pop sfm on the photographs, or name a PLY file as ply_file_path"
     length = float(np.linalg.norm(np.mean([view.viewmat[2, :3] for view in views], axis=0)))
     if length > _SAME_WAY:
@@ -182,11 +166,7 @@ def list_capture(
     sfm: bool | SfmOptions = False,
     progress: Progress | None = None,
 ) -> Listing:
-    """Read what a capture lists, and none of its photographs; see `load_capture`.
-
-    Raises:
-        CaptureError: one line that names the file, the field and the fix.
-    """
+    """Read what a capture lists, and none of its photographs; see `load_capture`."""
     root = Path(path)
     listing = find_listing(root, source, images)
     if listing is None:
@@ -203,9 +183,6 @@ def find_listing(root: Path, source: Source = "auto", images: str | None = None)
 
     Returns:
         None where nothing says so, but there are photographs that cameras can be found for.
-
-    Raises:
-        CaptureError: the folder is absent or none, it holds no photographs, or what says so is damaged.
     """
     _check_root(root)
     if source == "auto" and find_block(root):
@@ -306,13 +283,7 @@ def _from_photos(root: Path, images: str | None, sfm: bool | SfmOptions, progres
 def check_factor(root: Path, factor: int, smallest: int = 1) -> None:
     """Refuse a factor that leaves nothing of bare photographs, by their headers, before their cameras are searched for.
 
-    Args:
-        root: the capture's folder.
-        factor: by which photographs are shrunk.
-        smallest: side of the smallest photograph that can be used, px.
-
-    Raises:
-        CaptureError: names the first photograph that would be smaller.
+    `smallest` is the side of the smallest photograph that can be used, px.
     """
     folder = photo_folder(root)
     if factor == 1 or (root / f"{folder.name}_{factor}").is_dir():
@@ -361,11 +332,6 @@ def random_points(views: Sequence[View], count: int = 30_000, seed: int = 0) -> 
 
     The cube stands around the bounding box of the camera centres, with that box's longest side. Every point gets the
     mean colour of the photographs.
-
-    Args:
-        views: with their cameras in the world that the points shall be in.
-        count: how many points to make.
-        seed: of the generator.
 
     Raises:
         CaptureError: no two views look at a common part of the cube.

@@ -27,14 +27,10 @@ def transform_points(transform: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def transform_viewmats(transform: np.ndarray, viewmats: np.ndarray) -> np.ndarray:
-    """Move cameras by a similarity of the world, and keep their view matrices rigid.
+    """Move cameras [V, 4, 4] by a similarity of the world [4, 4], and keep their view matrices rigid.
 
     With R, s, t of the similarity and c' = s R c + t the new centre: rotation' = rotation R^T, viewmat' = [rotation',
     -rotation' c'].
-
-    Args:
-        transform: [4, 4] similarity, new world from old.
-        viewmats: [V, 4, 4] old world -> camera.
     """
     linear = transform[:3, :3]
     scale = np.cbrt(np.linalg.det(linear))
@@ -47,11 +43,9 @@ def transform_viewmats(transform: np.ndarray, viewmats: np.ndarray) -> np.ndarra
 
 
 def normalizing_transform(viewmats: np.ndarray, points: np.ndarray | None) -> np.ndarray:
-    """Find the similarity, normalised world from the capture's own.
+    """Find the similarity, normalised world from the capture's own, by viewmats [V, 4, 4] and sparse points [P, 3].
 
-    Args:
-        viewmats: [V, 4, 4] world -> camera.
-        points: [P, 3] sparse points; without points, or with fewer than four, only step (1) is taken.
+    Without points, or with fewer than four, only step (1) is taken.
 
     Raises:
         CaptureError: the cameras have no extent or no common up direction, or points are too far away.
@@ -107,14 +101,9 @@ FAR_APART: Final = 15.0
 
 
 def nearest_cameras(viewmats: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Find the nearest other camera of each, as the point that they look at sees them.
+    """Find the nearest other camera of each, as the point that they look at sees them, and the angle to it in degrees.
 
-    Args:
-        viewmats: world -> camera. [V, 4, 4]
-
-    Returns:
-        Its number, and the angle to it, degrees; [V] each. None of a single camera, and where they look at no one
-        point.
+    [V] each; None of a single camera, and where they look at no one point.
     """
     if len(viewmats) < 2 or not look_at_one_point(viewmats):
         return None

@@ -141,12 +141,7 @@ def thumbnail(gray: np.ndarray) -> np.ndarray:
 
 
 def look_the_same(thumb: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Tell which thumbnails look like another: they differ by no more than noise and compression make. bool [P]
-
-    Args:
-        thumb: float32 [24, 24]
-        others: float32 [P, 24, 24]
-    """
+    """Tell which thumbnails [P, 24, 24] differ from another by no more than noise and compression make. bool [P]"""
     return np.abs(others - thumb).mean(axis=(1, 2)) < _SAME
 
 
@@ -278,11 +273,7 @@ _SHARED: Final = 12
 
 
 def about_use(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
-    """Tell what stands against finding cameras: photographs that show nothing, or nothing in common.
-
-    Args:
-        shown: what was measured of the photographs, without those that could not be read.
-    """
+    """Tell what stands against finding cameras: photographs that show nothing, or nothing in common."""
     plain = [one.name for one in shown if float(one.thumb.std()) < _PLAIN]
     if plain:
         left = len(shown) - len(plain)
@@ -339,11 +330,7 @@ _ROUNDS: Final = 10
 
 
 def levels_at(image: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Measure the brightness around places of a photograph.
-
-    Args:
-        image: uint8 [H, W, 3 or 4]
-        places: px, pixel centres at +0.5. [M, 2]
+    """Measure the brightness around places [M, 2] of a photograph, px with pixel centres at +0.5.
 
     Returns:
         Stops, 0 at white; NaN outside the photograph and where it is nearly black or white. float64 [M]
@@ -379,13 +366,9 @@ class Exposures:
         return self._beyond_errors(self.stops)
 
     def unevenness(self, viewmats: np.ndarray) -> float | None:
-        """Return the standard deviation of what differs from the median of the four photographs taken nearest.
+        """Return the standard deviation of what differs from the median of the four photographs taken nearest, stops.
 
-        Args:
-            viewmats: world -> camera, as many. float64 [V, 4, 4]
-
-        Returns:
-            Stops; None where fewer than five photographs have an exposure.
+        None where fewer than five photographs have an exposure.
         """
         known = np.flatnonzero(np.isfinite(self.stops))
         if len(known) <= _NEIGHBOURS:
@@ -416,9 +399,7 @@ def _apart(viewmats: np.ndarray) -> np.ndarray:
 def exposures(levels: Sequence[np.ndarray], seen: Sequence[np.ndarray]) -> Exposures:
     """Tell how much brighter each photograph is than the median one, by the points that several see.
 
-    Args:
-        levels: of each photograph, what `levels_at` gives at the points that it sees. [V] of [M]
-        seen: numbers of these points. [V] of int [M]
+    `levels` are what `levels_at` gives at the points that each sees, `seen` the numbers of these points. [V] of [M]
     """
     values = np.concatenate([*levels, np.zeros(0)])
     photos = np.repeat(np.arange(len(levels)), [len(each) for each in levels])

@@ -15,10 +15,8 @@ are at +0.5, as COLMAP's are.
 from __future__ import annotations
 
 import math
-import os
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -32,7 +30,7 @@ from pop_fast.data.cameras import make_camera
 from pop_fast.data.capture import PosedImage, Progress, View
 from pop_fast.errors import CaptureError
 from pop_fast.io.image_header import read_size
-from pop_fast.io.images import find_image, read_image, read_mask, sound_jpegs
+from pop_fast.io.images import find_image, in_threads, read_image, read_mask, sound_jpegs
 
 
 @dataclass(frozen=True)
@@ -79,34 +77,24 @@ def read_views(
         shots: what is listed.
         options: how to read them.
         progress: called after every photograph.
-        wanted: tells of the shots that have a photograph whose is read; of the others only the cameras are taken, so
-            that they need no memory. None reads all.
+        wanted: tells whose photographs are read, None of all; of the others only the cameras are, and take no memory.
 
     Returns:
         Views in the order of the shots, and notes.
-
-    Raises:
-        CaptureError: a photograph or mask is absent, damaged, or of another shape than its camera.
     """
     photos, notes = _locate(root, listing, shots, options)
     rectify = _rectifier()
-    views: list[View] = []
     chosen = [True] * len(photos) if wanted is None else wanted([photo.shot for photo in photos])
     read = [photo.path for photo, out in zip(photos, chosen, strict=True) if out]
     what = "reading photographs" if read else "reading cameras"
-    with sound_jpegs(read), ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
-        jobs = [
-            pool.submit(_read if out else _camera_alone, photo, options, rectify)
-            for photo, out in zip(photos, chosen, strict=True)
-        ]
-        try:
-            for job in jobs:
-                views.append(job.result())
-                if progress is not None:
-                    progress(what, len(views), len(jobs))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    pairs = list(zip(photos, chosen, strict=True))
+    with sound_jpegs(read):
+        views = in_threads(
+            lambda one: _read(one[0], options, rectify) if one[1] else _camera_alone(one[0], rectify),
+            pairs,
+            what,
+            progress,
+        )
     return views, notes
 
 
@@ -223,9 +211,8 @@ def _placed(photo: _Photo, stored: tuple[int, int], rectify: Any) -> tuple[Undis
     return rectification, size, K
 
 
-def _camera_alone(photo: _Photo, options: PhotoOptions, rectify: Any) -> View:
+def _camera_alone(photo: _Photo, rectify: Any) -> View:
     """Make the view of a photograph whose header alone is read: its camera, and an image that takes no memory."""
-    del options  # they say how pixels are read
     stored = read_size(photo.path)
     if stored is None:
         height, width = read_image(photo.path).shape[:2]
@@ -313,17 +300,10 @@ def _read_mask(
 
 
 def shrink_bicubic(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Resize as Pillow does, and so gsplat's example trainer for the photographs of Mip-NeRF 360 (A32).
+    """Resize uint8 [H, W, C] as Pillow does, and so gsplat's example trainer for the photographs of Mip-NeRF 360 (A32).
 
     Rows are resized first, and rounded to bytes before columns are: which of the two one call of Pillow takes first
     depends on its version and the sizes, and a few values with it by one level.
-
-    Args:
-        image: uint8 [H, W, C]
-        size: new width and height, px.
-
-    Returns:
-        uint8 [size[1], size[0], C]
     """
     rows = Image.fromarray(image).resize((size[0], image.shape[0]), Image.Resampling.BICUBIC)
     return np.array(rows.resize(size, Image.Resampling.BICUBIC))
@@ -386,11 +366,6 @@ def intrinsics(camera: Any) -> np.ndarray:
 
 def undistortion(camera: Any, width: int, height: int) -> Undistortion:
     """Plan the undistortion of photographs stored at width x height px, whatever size the camera was calibrated at.
-
-    Args:
-        camera: a `PinholeCamera`, or a `pycolmap.Camera` of any perspective model.
-        width: of the stored photograph, px.
-        height: likewise.
 
     Raises:
         ValueError: a full-sphere camera, or no zoom between 0.5 and 4 keeps the new image inside the photograph. The

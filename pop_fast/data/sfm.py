@@ -27,7 +27,6 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import IO, Any, Final, Literal
@@ -42,7 +41,7 @@ from pop_fast.data.sfm_files import UPRIGHT, SfmOptions, recognise_result, write
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import check_folder, folder_atomically
 from pop_fast.io.image_header import HEIF_SUFFIXES, read_exif
-from pop_fast.io.images import list_images, read_image, sound_jpegs, unreadable_photographs, write_png
+from pop_fast.io.images import in_threads, list_images, read_image, sound_jpegs, unreadable_photographs, write_png
 
 
 @dataclass(frozen=True)
@@ -72,10 +71,7 @@ def photo_folder(root: Path) -> Path:
 
 
 def photographs(folder: Path) -> list[Path]:
-    """List the photographs of a folder and its subfolders, sorted by relative name; `masks` holds none.
-
-    Of a Polycam export only those that its cameras are of.
-    """
+    """List a folder's photographs, subfolders' too, by name: none of `masks`, of a Polycam export only its own."""
     exported = photographs_of_polycam(folder)
     if exported is not None:
         return list_images(exported)
@@ -123,7 +119,7 @@ def run_sfm(
     capture, target = _place(photos, out_dir)
     names = [path.relative_to(photos) for path in photographs(photos) if not path.resolve().is_relative_to(target)]
     for name in names:
-        if not _is_utf8(str(name)):
+        if any("\ud800" <= letter <= "\udfff" for letter in str(name)):
             raise CaptureError(
                 f"{photos / name}: the name is not UTF-8, which COLMAP's files need; rename the photograph"
             )
@@ -143,8 +139,7 @@ def run_sfm(
     with folder_atomically(target, overwrite, recognise=own) as folder:
         sparse = folder if in_place else folder / "sparse"
         with tempfile.TemporaryDirectory(prefix="pop_sfm_") as work, quiet_colmap():
-            job = _Job(photos, _stage(photos, names, Path(work)), Path(work), progress)
-            best = _find_cameras(job, options)
+            best = find_cameras(Search(str(photos), work, _stage(photos, names, Path(work)), options), progress)
             for image in best.images.values():
                 image.name = names[int(Path(image.name).stem)].as_posix()
             (sparse / "0").mkdir(parents=True)
@@ -158,14 +153,6 @@ def run_sfm(
     error = float(best.compute_mean_reprojection_error())
     notes = () if mixed is None or options.single_camera else (mixed.text,)
     return SfmResult(capture, best.num_reg_images(), len(names), best.num_points3D(), error, notes)
-
-
-def _is_utf8(name: str) -> bool:
-    try:
-        name.encode("utf-8")
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _place(photos: Path, out_dir: str | Path | None) -> tuple[Path, Path]:
@@ -183,67 +170,34 @@ def _place(photos: Path, out_dir: str | Path | None) -> tuple[Path, Path]:
     return capture, target
 
 
-@dataclass(frozen=True)
-class _Job:
-    photos: Path
-    names: list[str]  # in `work / "images"`
-    work: Path
-    progress: Progress | None
-
-
 def _stage(photos: Path, names: list[Path], work: Path) -> list[str]:
     """Give photographs plain numbers for names, because COLMAP's lists of pairs cannot hold a space."""
     (work / "images").mkdir()
-    staged = [f"{i:06d}{_plain_suffix(name)}" for i, name in enumerate(names)]
-    for name, plain in zip(names, staged, strict=True):
-        if name.suffix.lower() in HEIF_SUFFIXES:
-            # which COLMAP does not read
-            write_png(work / "images" / plain, read_image(photos / name)[:, :, :3])
+    staged: list[str] = []
+    for i, name in enumerate(names):
+        suffix = name.suffix.lower()
+        # HEIC is not read by COLMAP
+        plain = work / "images" / f"{i:06d}{'.png' if suffix in HEIF_SUFFIXES else suffix}"
+        staged.append(plain.name)
+        if suffix in HEIF_SUFFIXES:
+            write_png(plain, read_image(photos / name)[:, :, :3])
             continue
         try:
-            (work / "images" / plain).symlink_to((photos / name).resolve())
+            plain.symlink_to((photos / name).resolve())
         except OSError:  # where links need a privilege
-            shutil.copyfile(photos / name, work / "images" / plain)
+            shutil.copyfile(photos / name, plain)
     return staged
-
-
-def _plain_suffix(name: Path) -> str:
-    suffix = name.suffix.lower()
-    return ".png" if suffix in HEIF_SUFFIXES else suffix
 
 
 def _looked_at(photos: Path, names: list[Path], progress: Progress | None) -> list[Shown]:
     """Read all photographs once: damaged and useless ones are found before the long work begins."""
-    found: list[Shown] = []
-    files = [photos / name for name in names]
-    with sound_jpegs(files), ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
-        jobs = [
-            pool.submit(lambda file, name: measure(file, read_image(file), name.as_posix()), file, name)
-            for file, name in zip(files, names, strict=True)
-        ]
-        try:
-            for job in jobs:
-                found.append(job.result())
-                if progress is not None:
-                    progress("checking photographs", len(found), len(names))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    return found
-
-
-def _find_cameras(job: _Job, options: SfmOptions) -> Any:
-    search = Search(
-        photos=str(job.photos),
-        work=str(job.work),
-        names=job.names,
-        camera_model=options.camera_model,
-        single_camera=bool(options.single_camera),
-        max_size=options.max_size,
-        matcher=options.matcher,
-        seed=options.seed,
-    )
-    return find_cameras(search, job.progress)
+    with sound_jpegs([photos / name for name in names]):
+        return in_threads(
+            lambda name: measure(photos / name, read_image(photos / name), name.as_posix()),
+            names,
+            "checking photographs",
+            progress,
+        )
 
 
 def _write_upright(sparse: Path, photos: Path, names: list[Path]) -> None:
@@ -280,22 +234,13 @@ class Search:
         photos: the folder that messages name.
         work: a folder of the search's own, with the photographs in `images`; the model is written to `best`.
         names: of the photographs.
-        camera_model: COLMAP's name.
-        single_camera: all photographs share one camera.
-        max_size: longest side at which features are looked for, px.
-        matcher: "exhaustive" matches all with all, "sequential" each with its neighbours by name; "auto" chooses by
-            their number.
-        seed: of every random choice.
+        options: with `single_camera` decided.
     """
 
     photos: str
     work: str
     names: list[str]
-    camera_model: str
-    single_camera: bool
-    max_size: int
-    matcher: str
-    seed: int
+    options: SfmOptions
 
     @property
     def database(self) -> Path:
@@ -309,11 +254,7 @@ class Search:
 
 
 def check_camera_model(name: str) -> None:
-    """Check that COLMAP has a camera model of this name.
-
-    Raises:
-        CaptureError: it has none; names those that it has.
-    """
+    """Refuse the name of a camera model that COLMAP does not have; the CaptureError names those that it has."""
     known = [known for known in require_colmap().CameraModelId.__members__ if known != "INVALID"]
     if name not in known:
         raise CaptureError(f"camera_model is {name!r}; use one of {', '.join(known)}")
@@ -411,16 +352,22 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     out = os.fdopen(os.dup(1), "w", encoding="ascii")
     os.dup2(2, 1)
-    search = Search(**json.loads(sys.stdin.buffer.readline()))
+    given = json.loads(sys.stdin.buffer.readline())
+    search = Search(**given | {"options": SfmOptions(**given["options"])})
     _watch(search)
 
     def say(word: Any) -> None:
         out.write(json.dumps(word) + "\n")
         out.flush()
 
+    def tell(*report: Any) -> None:
+        say(report)
+
     try:
         with quiet_colmap():
-            _search(search, lambda *report: say(report)).write_binary(_made(Path(search.work, "best")))
+            _extract(search, tell)
+            _match(search, tell)
+            _map(search, tell).write_binary(_made(Path(search.work, "best")))
         say("")
     except CaptureError as error:
         say(str(error))
@@ -451,12 +398,6 @@ def _made(folder: Path) -> Path:
     return folder
 
 
-def _search(job: Search, tell: Callable[[str, int, int], None]) -> Any:
-    _extract(job, tell)
-    _match(job, tell)
-    return _map(job, tell)
-
-
 def _extract(job: Search, tell: Progress) -> None:
     """Find features, a few photographs at a time, so that progress can be reported."""
     pycolmap = require_colmap()
@@ -466,9 +407,9 @@ def _extract(job: Search, tell: Progress) -> None:
     pycolmap.import_images(
         job.database,
         job.images,
-        camera_mode=pycolmap.CameraMode.SINGLE if job.single_camera else pycolmap.CameraMode.AUTO,
+        camera_mode=pycolmap.CameraMode.SINGLE if job.options.single_camera else pycolmap.CameraMode.AUTO,
         image_names=job.names,
-        options=pycolmap.ImageReaderOptions(camera_model=job.camera_model),
+        options=pycolmap.ImageReaderOptions(camera_model=job.options.camera_model),
     )
     for start in range(0, n, _BATCH):
         tell(_FEATURES, start, n)
@@ -476,7 +417,7 @@ def _extract(job: Search, tell: Progress) -> None:
             job.database,
             job.images,
             image_names=job.names[start : start + _BATCH],
-            extraction_options=pycolmap.FeatureExtractionOptions(max_image_size=job.max_size),
+            extraction_options=pycolmap.FeatureExtractionOptions(max_image_size=job.options.max_size),
             device=pycolmap.Device.cpu,
         )
     tell(_FEATURES, n, n)
@@ -493,8 +434,8 @@ def pairs_of(n: int, matcher: str) -> list[tuple[int, int]]:
 def _match(job: Search, tell: Progress) -> None:
     pycolmap = require_colmap()
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = job.seed
-    pairs = pairs_of(len(job.names), job.matcher)
+    verification.ransac.random_seed = job.options.seed
+    pairs = pairs_of(len(job.names), job.options.matcher)
     listing = Path(job.work, "pairs.txt")
     for start in range(0, len(pairs), _BATCH**2):
         tell(_MATCHES, start, len(pairs))
@@ -512,9 +453,9 @@ def _match(job: Search, tell: Progress) -> None:
 def _map(job: Search, tell: Progress) -> Any:
     pycolmap = require_colmap()
     options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = job.seed
-    options.mapper.random_seed = job.seed
-    options.triangulation.random_seed = job.seed
+    options.random_seed = job.options.seed
+    options.mapper.random_seed = job.options.seed
+    options.triangulation.random_seed = job.options.seed
     options.min_model_size = 3
     # bundle adjustment adds in the order in which its threads finish: one thread gives the same bits every time
     options.num_threads = 1

@@ -52,24 +52,14 @@ _LIST = "sfm.sha256"
 
 
 def write_list(sparse: Path, folder: Path, prefix: str = "") -> None:
-    """List every file of a new result.
-
-    Args:
-        sparse: the new folder `sparse`, where the list is written.
-        folder: what was written, all of it.
-        prefix: what to put before the paths relative to `folder`, so that they are relative to the capture.
-    """
+    """List every file of a new result `folder` in its folder `sparse`, with `prefix` before their paths."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     lines = [f"{_sha256(path)}  {prefix}{path.relative_to(folder).as_posix()}\n" for path in files]
     (sparse / _LIST).write_text("".join(lines), encoding="utf-8", errors="surrogateescape")
 
 
 def read_upright(sparse: Path) -> dict[str, int]:
-    """Read by how many quarter turns clockwise photographs are to be turned, by name; those that are not are absent.
-
-    Raises:
-        CaptureError: the file is damaged.
-    """
+    """Read by how many quarter turns clockwise photographs are to be turned, by name; others are absent."""
     path = sparse / UPRIGHT
     if not path.is_file():
         return {}
@@ -84,12 +74,7 @@ def read_upright(sparse: Path) -> dict[str, int]:
 
 
 def recognise_result(capture: Path, target: Path) -> Callable[[Path], bool]:
-    """Make a test of whether a file, by its path relative to `target`, is as structure from motion wrote it.
-
-    Args:
-        capture: the capture's folder.
-        target: the folder that is to be replaced: the capture itself or its folder `sparse`.
-    """
+    """Make a test of whether a file, by its path relative to the `target` to be replaced, is as it was written."""
     written = _read_list(capture / "sparse" / _LIST)
 
     def recognise(file: Path) -> bool:

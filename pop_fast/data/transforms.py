@@ -39,17 +39,11 @@ def find_transforms(folder: Path) -> list[Path]:
 
 
 def read_transforms(paths: list[Path]) -> tuple[list[PosedImage], SparsePoints | None]:
-    """Read cameras and poses, and the points beside them.
-
-    Args:
-        paths: as `find_transforms` returns them; all in one folder.
+    """Read cameras and poses of what `find_transforms` found, and the points beside them.
 
     Returns:
         One shot for every listed frame, sorted by name, and the points of `ply_file_path`, of `sparse_pc.ply` or of
         `points3D.ply`; None where there is none.
-
-    Raises:
-        CaptureError: names the file, the frame, the field and what it should be.
     """
     shots: list[PosedImage] = []
     named: Path | None = None

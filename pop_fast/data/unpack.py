@@ -37,11 +37,9 @@ _LEFT_OUT = ("__MACOSX", ".DS_Store", "Thumbs.db")
 
 
 def capture_folder(path: Path, progress: Progress | None = None) -> tuple[Path, str | None]:
-    """Return the folder with the photographs of a file, made where it is not there; a folder is itself.
+    """Return the folder with the photographs of a video or a ZIP archive, made where it is absent; a folder is itself.
 
-    Args:
-        path: a folder, a video, a ZIP archive; of anything else it is returned, for the reader to refuse.
-        progress: called with (stage, done, total).
+    Anything else is returned, for the reader to refuse.
 
     Returns:
         The folder, and a line that says what was made of the file; None where it is a folder.
@@ -76,11 +74,7 @@ def _made_before(path: Path, target: Path) -> bool:
 
 
 def unpack(path: Path, target: Path) -> None:
-    """Unpack a ZIP archive, whole or not at all.
-
-    Args:
-        path: the archive.
-        target: the folder to make.
+    """Unpack a ZIP archive into a new folder, whole or not at all.
 
     Raises:
         CaptureError: it is damaged or locked, has a member that would lie elsewhere, or would not fit.

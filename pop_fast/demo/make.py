@@ -9,8 +9,6 @@ same from every camera. A picture is traced in square patches, and a patch looks
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,7 +20,7 @@ from pop_fast.data.colmap import quiet_colmap
 from pop_fast.demo.scene import DemoScene, Shape, dot, make_scene
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import check_folder, folder_atomically
-from pop_fast.io.images import write_png
+from pop_fast.io.images import in_threads, write_png
 
 _MODEL = {f"{name}.bin" for name in ("cameras", "images", "points3D", "rigs", "frames")}
 _CANDIDATES = 150  # a view
@@ -69,7 +67,12 @@ def make_demo(
     viewmats = _orbit(generator, views)
     K = np.array([[0.94 * width, 0.0, 0.503 * width], [0.0, 0.94 * width, 0.496 * height], [0.0, 0.0, 1.0]])
     with folder_atomically(out, overwrite, recognise=_is_ours) as folder:
-        photographs = _photograph(scene, viewmats, K, (width, height), progress)
+        photographs = in_threads(
+            lambda viewmat: render_view(scene, viewmat, K, width, height),
+            list(viewmats),
+            "taking photographs",
+            progress,
+        )
         (folder / "images").mkdir()
         for i, photograph in enumerate(photographs):
             write_png(folder / "images" / _name(i), photograph)
@@ -106,18 +109,6 @@ def _orbit(generator: np.random.Generator, views: int) -> np.ndarray:
         viewmats[i, :3, :3] = [right, np.cross(forward, right), forward]
         viewmats[i, :3, 3] = -viewmats[i, :3, :3] @ center
     return viewmats
-
-
-def _photograph(
-    scene: DemoScene, viewmats: np.ndarray, K: np.ndarray, size: tuple[int, int], progress: Progress | None
-) -> list[np.ndarray]:
-    photographs: list[np.ndarray] = []
-    with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
-        for photograph in pool.map(lambda viewmat: render_view(scene, viewmat, K, *size), viewmats):
-            photographs.append(photograph)
-            if progress is not None:
-                progress("taking photographs", len(photographs), len(viewmats))
-    return photographs
 
 
 @dataclass(frozen=True, eq=False)

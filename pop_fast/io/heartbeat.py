@@ -86,15 +86,7 @@ def duration(seconds: float) -> str:
 
 
 def so_far(step: int, of: int, n_gaussians: int, seconds: float, latest: str) -> str:
-    """Tell how far a training is.
-
-    Args:
-        step: steps taken, at least 1.
-        of: steps in all.
-        n_gaussians: how many there are.
-        seconds: that the steps took.
-        latest: what was measured last, in words that begin with a comma, or nothing.
-    """
+    """Tell how far a training is; `latest` is what was measured last, in words that begin with a comma, or nothing."""
     line = f"step {step:,} of {of:,}, {n_gaussians:,} Gaussians{latest}"
     if step == of:
         return f"{line}, measuring and writing"

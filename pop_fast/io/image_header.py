@@ -32,11 +32,7 @@ def can_read_heif() -> bool:
 
 
 def _opened(data: bytes, read: Callable[[Any], T], **how: Any) -> T:
-    """Open a file and read something of it.
-
-    Raises:
-        ValueError: the file is damaged.
-    """
+    """Open a file and read something of it; ValueError of a damaged file."""
     try:
         return read(import_module("pillow_heif").open_heif(data, **how))
     # memory can be had again, and no damage
@@ -53,21 +49,13 @@ def is_heif(data: bytes) -> bool:
 
 
 def heif_size(data: bytes) -> tuple[int, int]:
-    """Return width and height in px, upright, without decoding the pixels.
-
-    Raises:
-        ValueError: the file is damaged.
-    """
+    """Return width and height in px, upright, without decoding the pixels; ValueError of a damaged file."""
     width, height = _opened(data, lambda file: file.size)
     return int(width), int(height)
 
 
 def decode_heif(data: bytes) -> np.ndarray:
-    """Decode a file's first picture: RGB or RGBA, 8 bit, upright. uint8 [H, W, 3 or 4]
-
-    Raises:
-        ValueError: the file is damaged.
-    """
+    """Decode a file's first picture, 8 bit, upright; ValueError of a damaged file. uint8 [H, W, 3 or 4]"""
     pixels = _opened(data, lambda file: np.ascontiguousarray(np.asarray(file)), convert_hdr_to_8bit=True)
     # one channel is gray
     return np.repeat(pixels[..., None], 3, axis=2) if pixels.ndim == 2 else pixels

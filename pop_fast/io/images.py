@@ -19,10 +19,11 @@ import sys
 import tempfile
 import threading
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import IO, Final
+from typing import IO, Final, TypeVar
 
 import cv2
 import numpy as np
@@ -42,6 +43,9 @@ from pop_fast.io.image_header import (
     size_of,
 )
 from pop_fast.io.read_back import PICTURE, check_memory
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 # what cameras write and nothing here reads: HEIF without pillow-heif, and raw formats
@@ -102,13 +106,8 @@ def unreadable_photographs(folder: Path) -> str | None:
 def find_image(folder: Path, name: str) -> Path | None:
     """Find the file of an image by its relative name, under another image extension where the exact one is absent.
 
-    Files are paired by name and never by their place in a sorted list, so one missing file cannot shift the others.
-
-    Returns:
-        The file, or None.
-
-    Raises:
-        CaptureError: two files of the same stem fit and neither is the exact name.
+    Files are paired by name and never by their place in a sorted list, so one missing file cannot shift the others. A
+    CaptureError says that two files of the same stem fit and neither is the exact name.
     """
     exact = folder / name
     if exact.is_file():
@@ -131,12 +130,9 @@ def find_image(folder: Path, name: str) -> Path | None:
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Read a photograph as stored: RGB or RGBA, 8 bit.
+    """Read a photograph as stored: RGB or RGBA (not premultiplied), 8 bit. uint8 [H, W, 3 or 4]
 
     Gray becomes RGB; 16-bit samples are divided by 257 and rounded; EXIF orientation is ignored.
-
-    Returns:
-        uint8 [H, W, 3] or, with an alpha channel, [H, W, 4] (not premultiplied).
 
     Raises:
         CaptureError: the file is absent, truncated, corrupt, empty or not an image.
@@ -151,15 +147,33 @@ def read_image(path: Path) -> np.ndarray:
     raise CaptureError(f"{path}: has {image.shape[2]} channels; save it as gray, RGB or RGBA")
 
 
-def read_mask(path: Path) -> np.ndarray:
-    """Read a mask: True (keep) where the picture is brighter than half; colour is averaged, alpha ignored.
+def in_threads(
+    read: Callable[[T], R],
+    items: Sequence[T],
+    what: str,
+    progress: Callable[[str, int, int], None] | None,
+    most: int = 8,
+) -> list[R]:
+    """Read items several at a time, in their order; after an error or an interruption no further one is begun.
 
-    Returns:
-        bool [H, W].
-
-    Raises:
-        CaptureError: as `read_image`.
+    `progress` is called by this thread, with what is done, how many are, and of how many.
     """
+    found: list[R] = []
+    with ThreadPoolExecutor(min(most, os.cpu_count() or 1)) as pool:
+        jobs = [pool.submit(read, item) for item in items]
+        try:
+            for job in jobs:
+                found.append(job.result())
+                if progress is not None:
+                    progress(what, len(found), len(jobs))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return found
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """Read a mask, True (keep) where the picture is brighter than half; alpha is ignored. bool [H, W]"""
     image = read_image(path)
     return image[:, :, :3].mean(axis=2) > 127.5
 
@@ -347,12 +361,9 @@ _PADDING = 64
 
 @contextmanager
 def jpeg_damage(paths: Sequence[Path]) -> Iterator[dict[Path, str]]:
-    """Listen to what libjpeg says of photographs, while the block reads them or does anything else.
+    """Listen to what libjpeg says of the JPEG files among photographs, while the block reads them or does other work.
 
     The files are decoded a second time, small, in up to four further processes; see `main`.
-
-    Args:
-        paths: photographs of any format; only JPEG files are listened to.
 
     Yields:
         One line for every damaged file, in the order of `paths`; filled in when the block ends without an error.
@@ -376,11 +387,7 @@ def jpeg_damage(paths: Sequence[Path]) -> Iterator[dict[Path, str]]:
 
 @contextmanager
 def sound_jpegs(paths: Sequence[Path]) -> Iterator[None]:
-    """Refuse damaged JPEG files when the block that reads them has ended without an error.
-
-    Raises:
-        CaptureError: names the first of them.
-    """
+    """Refuse damaged JPEG files, naming the first, when the block that reads them has ended without an error."""
     with jpeg_damage(paths) as damage:
         yield
     for message in damage.values():

@@ -38,15 +38,9 @@ def error_picture(error: np.ndarray, top: float) -> np.ndarray:
 
 
 def id_colors(ids: np.ndarray) -> np.ndarray:
-    """Colour Gaussian ids so that one id always has one colour and neighbours differ; -1 (none) is black.
+    """Colour Gaussian ids, int [H, W], so that one id always has one colour and neighbours differ; -1 (none) is black.
 
     The id is hashed (splitmix64), its bits give a hue and one of two levels of saturation and brightness.
-
-    Args:
-        ids: Gaussian ids, -1 where no Gaussian was blended. int [H, W]
-
-    Returns:
-        uint8 [H, W, 3]
     """
     with np.errstate(over="ignore"):
         z = ids.astype(np.int64).astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)
@@ -100,17 +94,9 @@ def depth_range(depths: Sequence[np.ndarray]) -> tuple[float, float]:
 
 
 def depth_picture(depth: np.ndarray, near: float, far: float) -> np.ndarray:
-    """Colour a depth map by its logarithm, near in yellow and far in violet, grey where it is not finite.
+    """Colour a depth map [H, W] by its logarithm, near in yellow and far in violet, grey where it is not finite.
 
     A garden has its background many times as far away as its table: evenly spaced colours would leave the table one.
-
-    Args:
-        depth: over 0, or NaN. [H, W]
-        near: yellow, over 0.
-        far: violet, over `near`.
-
-    Returns:
-        uint8 [H, W, 3]
     """
     known = np.isfinite(depth)
     level = np.log(np.clip(np.where(known, depth, near), near, far) / near) / np.log(far / near)

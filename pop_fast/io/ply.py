@@ -75,11 +75,7 @@ def save_ply(
 
 
 def ply_bytes(params: dict[str, torch.Tensor], antialiased: bool = False, frame: Frame | None = None) -> bytes:
-    """Return what `save_ply` writes.
-
-    Raises:
-        PopError: a parameter is absent, of the wrong shape, NaN or Inf.
-    """
+    """Return what `save_ply` writes."""
     return _file(checked_params(params), antialiased, frame)
 
 
@@ -124,15 +120,7 @@ def load_ply(path: str | os.PathLike[str]) -> dict[str, torch.Tensor]:
 
 
 def params_of_ply(data: bytes, path: Path) -> dict[str, torch.Tensor]:
-    """Read splats from a PLY file's bytes; see `load_ply`.
-
-    Args:
-        data: the bytes.
-        path: their name, for errors.
-
-    Raises:
-        PopError: as `load_ply`.
-    """
+    """Read splats from a PLY file's bytes; see `load_ply`."""
     return _params(vertices_of(data, path), path)
 
 
@@ -189,11 +177,7 @@ def asks_for_antialiasing(header: Header) -> bool:
 
 
 def frame_of(path: str | os.PathLike[str]) -> Frame | None:
-    """Tell which world a PLY file's splats are in, by its comment; None where there is none, as of other programs.
-
-    Raises:
-        PopError: the comment is not one that this program writes.
-    """
+    """Tell which world a PLY file's splats are in, by its comment; None where there is none, as of other programs."""
     return Frame.of_comments(read_header(Path(path)).comments, Path(path))
 
 
@@ -235,14 +219,7 @@ _LONGEST: Final = 2**20
 
 @dataclass
 class Element:
-    """A kind of rows.
-
-    Attributes:
-        name: for example "vertex".
-        count: rows.
-        columns: name and type of each property; the type of a list's length where it is a list.
-        lists: whether a property is a list.
-    """
+    """A kind of rows: name and type of each property, or the type of a list's length where it is a list."""
 
     name: str
     count: int
@@ -268,11 +245,7 @@ class Header:
 
 
 def read_header(path: Path) -> Header:
-    """Read the header alone.
-
-    Raises:
-        PopError: absent, cut off, or it breaks the format's rules; names the line.
-    """
+    """Read the header alone; a PopError says that it is absent or cut off, or names the line that breaks a rule."""
     try:
         with open(path, "rb") as file:
             head = file.read(_LONGEST)
@@ -284,11 +257,7 @@ def read_header(path: Path) -> Header:
 
 
 def header_of(data: bytes, path: Path) -> Header:
-    """Read the header at the beginning of a file's bytes.
-
-    Raises:
-        PopError: cut off, or it breaks the format's rules; names the line.
-    """
+    """Read the header at the beginning of a file's bytes."""
     try:
         return _parse(data[:_LONGEST])
     except ValueError as error:
@@ -313,11 +282,7 @@ def read_vertices(path: Path) -> np.ndarray:
 
 
 def vertices_of(data: bytes, path: Path) -> np.ndarray:
-    """Return the rows of the element `vertex` of a file's bytes; see `read_vertices`.
-
-    Raises:
-        PopError: as `read_vertices`.
-    """
+    """Return the rows of the element `vertex` of a file's bytes; see `read_vertices`."""
     header = header_of(data, path)
     read = _vertex_elements(header, path)
     try:
@@ -338,11 +303,7 @@ def _vertex_elements(header: Header, path: Path) -> tuple[Element, ...]:
 
 
 def column(path: Path, rows: np.ndarray, name: str, kind: type) -> np.ndarray:
-    """Return one property of all rows as numbers of the type `kind`.
-
-    Raises:
-        PopError: it is a list.
-    """
+    """Return one property of all rows as numbers of a type; a PopError says that it is a list."""
     if rows.dtype[name].kind == "O":
         raise PopError(f"{path}: vertex.{name} is a list; it must be one number a vertex")
     return rows[name].astype(kind)
@@ -509,11 +470,7 @@ class Frame:
 
     @classmethod
     def of_comments(cls, comments: Sequence[str], path: Path) -> Frame | None:
-        """Read the frame from the comments of a PLY's header; None where they have none, as of other programs.
-
-        Raises:
-            PopError: the comment is not one that this program writes.
-        """
+        """Read the frame from the comments of a PLY's header; None where they have none, as of other programs."""
         for comment in comments:
             if comment.startswith(COMMENT):
                 name, *numbers = comment.removeprefix(COMMENT).split() or [""]
@@ -525,11 +482,7 @@ class Frame:
 
     @classmethod
     def of_entry(cls, holder: Any, path: Path) -> Frame | None:
-        """Read the frame from an object of JSON that may hold it under the name `KEY`; None where it does not.
-
-        Raises:
-            PopError: the entry is not one that this program writes.
-        """
+        """Read the frame from an object of JSON that may hold it under the name `KEY`; None where it does not."""
         if not isinstance(holder, Mapping) or KEY not in holder:
             return None
         entry = holder[KEY]

@@ -34,11 +34,7 @@ _LARGEST: Final = 1e150
 
 
 def read_json(path: Path, fix: str) -> dict[str, Any]:
-    """Read a JSON file that holds an object.
-
-    Raises:
-        PopError: it cannot be read or holds something else; ends in `fix`.
-    """
+    """Read a JSON file that holds an object; a PopError that it does not, or cannot be read, ends in `fix`."""
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
@@ -50,11 +46,7 @@ def read_json(path: Path, fix: str) -> dict[str, Any]:
 
 
 def parse_json(text: str, where: str, fix: str) -> Any:
-    """Parse JSON.
-
-    Raises:
-        PopError: it is not JSON, or nested deeper or with longer numbers than Python reads.
-    """
+    """Parse JSON; a PopError says that it is none, or nested deeper or with longer numbers than Python reads."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -62,11 +54,7 @@ def parse_json(text: str, where: str, fix: str) -> Any:
 
 
 def check_record(record: Any, where: str, fix: str, needed: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return a record of statistics whose known entries are the numbers and texts that a run writes, or null.
-
-    Raises:
-        PopError: names the entry as `where: entry`.
-    """
+    """Return a record of statistics whose known entries are what a run writes; a PopError names another one."""
     if not isinstance(record, dict):
         raise PopError(f"{where}: holds {type(record).__name__}; it must be an object; {fix}")
     for key in needed:
@@ -98,16 +86,13 @@ def _shown(value: Any) -> str:
 
 
 def read_arrays(path: Path, forms: Mapping[str, tuple[str, int]], fix: str) -> dict[str, np.ndarray]:
-    """Read arrays from an .npz file.
+    """Read arrays from an .npz file; a PopError names one that is absent or of another form, and ends in `fix`.
 
     Args:
         path: the file.
         forms: by name the kinds that an array may have, as in `numpy.dtype.kind`, and how many axes it has; a name with
             a "?" behind it may be absent.
         fix: what to do about a damaged file.
-
-    Raises:
-        PopError: it is damaged, or an array is absent or of another form; names it.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -136,12 +121,8 @@ def read_torch_file(path: Path, fix: str) -> Any:
     `torch.save` writes a zip whose members carry CRC-32 checksums, and torch's own reader skips these: a flipped bit in
     a tensor would be read as another number.
 
-    Args:
-        path: the file.
-        fix: what to do about a damaged file, for the message.
-
     Raises:
-        PopError: the file is absent, cannot be read, or is damaged.
+        PopError: the file is absent, cannot be read, or is damaged; ends in `fix`.
     """
     import torch
 
@@ -183,7 +164,7 @@ _MOST_TIMES: Final = 200
 
 
 def check_memory(path: Path | str, needed: int, packed: int, what: str, fix: str, floor: int = _ANY) -> None:
-    """Refuse what needs more memory than its file makes likely, or than there is.
+    """Refuse what needs more memory than its file makes likely, or than there is; a PopError names both sizes in MB.
 
     Args:
         path: the file, for the error.
@@ -192,9 +173,6 @@ def check_memory(path: Path | str, needed: int, packed: int, what: str, fix: str
         what: states it, for the error.
         fix: what to do, for the error.
         floor: bytes that are always likely.
-
-    Raises:
-        PopError: names the file, what it states, and both sizes in MB.
     """
     if needed <= _ANY:
         return
@@ -209,18 +187,7 @@ def check_memory(path: Path | str, needed: int, packed: int, what: str, fix: str
 
 
 def check_members(path: Path | str, archive: zipfile.ZipFile, packed: int, fix: str, times: int = 1) -> None:
-    """Refuse a zip whose members would come to too much; see `check_memory`.
-
-    Args:
-        path: the file, for the error.
-        archive: opened; no member is read.
-        packed: the file's own bytes.
-        fix: what to do, for the error.
-        times: bytes that are needed for one of a member.
-
-    Raises:
-        PopError: names the file and the largest member.
-    """
+    """Refuse a zip whose members would come to too much, at `times` bytes for one of theirs; see `check_memory`."""
     members = archive.infolist()
     if members:
         largest = max(members, key=lambda member: member.file_size)

@@ -78,16 +78,7 @@ class Cloud:
 
     @classmethod
     def of(cls, params: Mapping[str, Tensor], antialiased: bool = False, frame: Frame | None = None) -> Cloud:
-        """Take over raw parameters; colour degrees in which all coefficients are exactly 0 are left out.
-
-        Args:
-            params: means [N, 3], scales [N, 3], quats [N, 4], opacities [N], sh0 [N, 1, 3], shN [N, 0|3|8|15, 3], raw.
-            antialiased: to be drawn with antialiasing.
-            frame: the world that they are in, where it is known.
-
-        Raises:
-            PopError: a parameter is absent, of the wrong shape, NaN or Inf, or a quaternion is zero.
-        """
+        """Take over raw parameters, as `checked_params` does; colour degrees in which all coefficients are 0 are left out."""
         arrays = checked_params(dict(params))
         quats = arrays["quats"].astype(np.float64)
         quats /= np.linalg.norm(quats, axis=1, keepdims=True)
@@ -132,11 +123,7 @@ class Cloud:
         return replace(self, means=self.means * signs, quats=quats, rest=rest)
 
     def checked(self, path: Path) -> Cloud:
-        """Return this as it was read from a file, if all of it can be drawn.
-
-        Raises:
-            PopError: a value is NaN or Inf, or a quaternion is zero; names the file, the row and the field.
-        """
+        """Return this as it was read from a file, if all of it can be drawn; a PopError names file, row and field."""
         for name in _FIELDS:
             bad = np.argwhere(~np.isfinite(getattr(self, name)))
             if len(bad):
@@ -160,15 +147,10 @@ def to_bytes(values: np.ndarray) -> np.ndarray:
 
 
 def morton_order(means: np.ndarray) -> np.ndarray:
-    """Order centres along a space-filling curve, so that neighbours in the file are neighbours in space.
+    """Order centres [N, 3] along a space-filling curve, so that neighbours in the file are neighbours in space.
 
-    Far-away centres are pulled in by a logarithm first: a few of them would leave the rest in one cell.
-
-    Args:
-        means: [N, 3]
-
-    Returns:
-        A permutation, ties in the order they have. int64 [N]
+    Far-away centres are pulled in by a logarithm first: a few of them would leave the rest in one cell. A permutation,
+    ties in the order they have. int64 [N]
     """
     if len(means) == 0:
         return np.zeros(0, np.int64)
@@ -185,10 +167,7 @@ def morton_order(means: np.ndarray) -> np.ndarray:
 
 
 def drop_largest(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Leave out the component of the largest magnitude, after a change of sign that makes it positive.
-
-    Args:
-        quats: of norm 1. [N, 4]
+    """Leave out the component of the largest magnitude of unit quaternions, after a change of sign that makes it positive.
 
     Returns:
         Which was left out, int64 [N], and the others in order, within sqrt(1/2) of 0. float64 [N, 3]

@@ -36,21 +36,13 @@ _WRITE_AGAIN: Final = "copy or write the file again"
 
 
 def is_compressed(path: Path) -> bool:
-    """Tell whether a PLY file is of this kind, by its header.
-
-    Raises:
-        PopError: as `read_header`.
-    """
+    """Tell whether a PLY file is of this kind, by its header."""
     columns = {element.name: {name for name, _ in element.columns} for element in read_header(path).elements}
     return "chunk" in columns and set(_WORDS) <= columns.get("vertex", set())
 
 
 def chunked(cloud: Cloud) -> np.ndarray:
-    """Order Gaussians so that those of a chunk are close together: halves along the widest axis, down to chunks.
-
-    Returns:
-        A permutation. int64 [N]
-    """
+    """Order Gaussians so that those of a chunk are close together: halves along the widest axis. int64 [N]"""
     means = cloud.means
     waiting, done = [np.arange(len(means))], list[np.ndarray]()
     while waiting:
@@ -127,10 +119,6 @@ def _packed_rotation(quats: np.ndarray) -> np.ndarray:
 
 def decode(data: bytes, path: Path) -> Cloud:
     """Read compressed PLY.
-
-    Args:
-        data: the file's bytes.
-        path: its name, for errors.
 
     Raises:
         PopError: it is damaged or cut off; names the element.

@@ -38,10 +38,6 @@ def encode(cloud: Cloud) -> bytes:
 def decode(data: bytes, path: Path) -> Cloud:
     """Read `.splat`.
 
-    Args:
-        data: the file's bytes.
-        path: its name, for errors.
-
     Raises:
         PopError: its size is no multiple of 32 bytes, or a row cannot be drawn; names the row.
     """

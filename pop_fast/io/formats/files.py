@@ -112,16 +112,7 @@ def encoded(
 
 
 def decoded(name: str, data: bytes, path: Path = Path("memory")) -> Stored:
-    """Read a splat from a file's bytes.
-
-    Args:
-        name: of the format.
-        data: the bytes.
-        path: their name, for errors.
-
-    Raises:
-        PopError: the bytes are damaged; names the field.
-    """
+    """Read a splat of a format from a file's bytes, whose errors name `path`."""
     if name == PLY:
         params, header = params_of_ply(data, path), header_of(data, path)
         return Stored(params, asks_for_antialiasing(header), Frame.of_comments(header.comments, path))
@@ -139,24 +130,14 @@ def save_as(
     antialiased: bool = False,
     frame: Frame | None = None,
 ) -> int:
-    """Write a splat in a format, atomically.
-
-    Returns:
-        The number of bytes.
-
-    Raises:
-        PopError: as `encoded`, or the file cannot be written.
-    """
+    """Write a splat in a format, atomically; returns the number of bytes."""
     data = encoded(name, params, antialiased, frame)
     write_atomically(path, lambda file: file.write(data))
     return len(data)
 
 
 def load_splat_file(path: str | os.PathLike[str]) -> Stored:
-    """Read a splat in any format.
-
-    Args:
-        path: the file; for SOG in a folder that folder, or its meta.json.
+    """Read a splat in any format from its file; for SOG in a folder from that folder, or its meta.json.
 
     Raises:
         PopError: the file is absent, of an unknown kind or damaged; names the field.

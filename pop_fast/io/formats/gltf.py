@@ -42,15 +42,7 @@ def encode(cloud: Cloud) -> bytes:
 
 
 def encode_spz(cloud: Cloud, sh_step: float = spz.SH_STEP) -> bytes:
-    """Write .glb with an SPZ stream; the order of the Gaussians is kept.
-
-    Args:
-        cloud: what to write.
-        sh_step: as of `spz.encode`.
-
-    Raises:
-        PopError: as `spz.encode`.
-    """
+    """Write .glb with an SPZ stream, as `spz.encode` does; the order of the Gaussians is kept."""
     return _glb(cloud.turned("z"), {}, spz.encode(replace(cloud, frame=None), version=2, sh_step=sh_step))
 
 
@@ -125,10 +117,6 @@ def _extras(cloud: Cloud) -> dict[str, Any]:
 
 def decode(data: bytes, path: Path) -> Cloud:
     """Read the first splat of a .glb file, with float32 attributes or an SPZ stream.
-
-    Args:
-        data: the file's bytes.
-        path: its name, for errors.
 
     Raises:
         PopError: it is damaged, holds no splat, stores it in a way that is not known here, or moves it by a node;

@@ -91,10 +91,6 @@ class _Section:
 def decode(data: bytes, path: Path) -> Cloud:
     """Read KSPLAT.
 
-    Args:
-        data: the file's bytes.
-        path: its name, for errors.
-
     Raises:
         PopError: it is damaged, cut off, or of another version; names the field.
     """

@@ -39,12 +39,7 @@ _BLOCK: Final = 2**23
 def codebook(values: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
     """Choose 256 numbers near which values lie: Lloyd's algorithm in one dimension, from between quantiles and a grid.
 
-    Args:
-        values: [M]
-        weights: how much the square of each one's error counts, 0 or more; all the same where absent. [M]
-
-    Returns:
-        Rising. float32 [256]
+    `weights` say how much the square of each one's error counts, all the same where absent. Rising. float32 [256]
     """
     if len(values) == 0:
         return np.zeros(_CODES, np.float32)
@@ -81,7 +76,7 @@ def row_palette(rows: np.ndarray, weights: np.ndarray, count: int) -> tuple[np.n
         count: palette rows, at most.
 
     Returns:
-        The palette, float32 [C, D] with C of `count` or less, and every row's index in it. int64 [N]
+        The palette, float32 [C, D], and every row's index in it. int64 [N]
     """
     all_rows = torch.from_numpy(np.ascontiguousarray(rows, np.float32))
     all_weights = torch.from_numpy(np.ascontiguousarray(weights, np.float32))
@@ -146,15 +141,7 @@ _WRITE_AGAIN: Final = "copy or write the file again"
 
 
 def encode(cloud: Cloud, shared_by: int = _SHARED_BY) -> bytes:
-    """Write SOG; the order of the Gaussians is kept, and should be one where neighbours are close.
-
-    Args:
-        cloud: what to write.
-        shared_by: Gaussians for a row of the palette of colours, as far as its size allows.
-
-    Returns:
-        The bytes of the ZIP file.
-    """
+    """Write SOG, a row of the palette of colours for `shared_by` Gaussians, which should be ordered by place."""
     n = len(cloud)
     width = max(1, math.isqrt(max(n - 1, 0)) + 1)
     height = max(1, -(-n // width))
@@ -236,10 +223,6 @@ def _zipped(meta: Mapping[str, Any], images: Mapping[str, np.ndarray]) -> bytes:
 def decode(data: bytes, path: Path) -> Cloud:
     """Read SOG, as one file.
 
-    Args:
-        data: the file's bytes.
-        path: its name, for errors.
-
     Raises:
         PopError: it is damaged, of another version, or an image does not fit; names the entry.
     """
@@ -252,14 +235,7 @@ def decode(data: bytes, path: Path) -> Cloud:
 
 
 def decode_folder(path: Path) -> Cloud:
-    """Read SOG whose images lie as files in the folder of its meta.json.
-
-    Args:
-        path: meta.json.
-
-    Raises:
-        PopError: as `decode`, or a file is absent.
-    """
+    """Read SOG whose images lie as files in the folder of its meta.json; see `decode`."""
     try:
         held = sum(image.stat().st_size for image in path.parent.glob("*.webp"))
     except OSError as error:

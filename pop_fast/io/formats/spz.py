@@ -77,9 +77,6 @@ def encode(cloud: Cloud, version: int = 3, sh_step: float = SH_STEP) -> bytes:
         version: 2, 3 or 4; 2 has other rotations, and 4 is compressed otherwise.
         sh_step: what the coefficients of a Gaussian of typical visibility are multiples of, in 1/128; 1 to 64.
 
-    Returns:
-        The file's bytes.
-
     Raises:
         PopError: a centre is too far from the origin for 24 bits, or version 4's package is not installed.
     """
@@ -106,11 +103,7 @@ def encode(cloud: Cloud, version: int = 3, sh_step: float = SH_STEP) -> bytes:
 
 
 def _zstandard() -> ModuleType:
-    """Return the package, which only version 4 needs.
-
-    Raises:
-        PopError: it is not installed.
-    """
+    """Return the package, which only version 4 needs; a PopError says that it is not installed."""
     try:
         import zstandard
     except ImportError as error:
@@ -166,16 +159,7 @@ def _typical(visibility: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class _Head:
-    """What a header promises.
-
-    Attributes:
-        version: 2 to 4.
-        n: Gaussians.
-        degree: of the colours.
-        bits: of a centre's fraction.
-        flags: as the format has them.
-        streams: of version 4, how many there are.
-    """
+    """What a header promises: of `bits` of a centre's fraction, and in version 4 so many streams."""
 
     version: int
     n: int
@@ -192,10 +176,6 @@ class _Head:
 
 def decode(data: bytes, path: Path) -> Cloud:
     """Read SPZ.
-
-    Args:
-        data: the file's bytes.
-        path: its name, for errors.
 
     Raises:
         PopError: it is damaged, cut off, or of another version; names the field.
