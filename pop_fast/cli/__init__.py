@@ -265,17 +265,10 @@ T = TypeVar("T")
 
 
 def parse(kind: type[T], argv: Sequence[str], command: str, default: T | None = None, examples: str = "") -> T:
-    """Read the words after `pop COMMAND` into a dataclass.
+    """Read the words after `pop COMMAND` into a dataclass, whose docstring is the description.
 
-    Args:
-        kind: the dataclass; its docstring is the description.
-        argv: the words.
-        command: the subcommand's name, for usage lines.
-        default: values that words override, for dataclasses without defaults of their own.
-        examples: shown under the description, one a line.
-
-    Raises:
-        SystemExit: 0 after --help, 2 after bad usage (tyro has then said what is wrong).
+    `default` are values that words override, for dataclasses without defaults of their own. SystemExit ends it: 0 after
+    --help, 2 after bad usage, when tyro has said what is wrong.
     """
     import tyro
 

@@ -80,11 +80,7 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _part(args: Args, job: Job) -> Part:
-    """Find which part of the run is asked for.
-
-    Raises:
-        PopError: it has no such block or round.
-    """
+    """Find which part of the run is asked for; a PopError says that it has no such block or round."""
     from pop_fast.blocks.jobs import parts_of
 
     if args.part == "train" and args.block not in job.names:
@@ -136,10 +132,6 @@ def _options(folder: Path, own: TrainConfig) -> Any:
     """Return the options of `pop train` that a block's training is done with.
 
     They are those of a user's own training of the block's folder, without what the merged result has instead.
-
-    Args:
-        folder: the run's.
-        own: the settings of the training.
     """
     from pop_fast.cli.train import arguments
     from pop_fast.cli.train_options import as_begun, check_output

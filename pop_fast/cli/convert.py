@@ -83,11 +83,7 @@ def _output(args: Args, name: str, stored: Stored, config: TrainConfig) -> Outpu
 
 
 def _training_frame(source: Path, stored: Stored) -> np.ndarray | None:
-    """Return the training frame from the capture's; None where the splat is in the capture's own frame.
-
-    Raises:
-        PopError: it is in the training frame, and nothing says how that came from the capture's.
-    """
+    """Return the training frame from the capture's; None where the splat is in the capture's own frame."""
     if stored.frame is None or stored.frame.name == "capture":
         return None
     if stored.frame.transform is None:

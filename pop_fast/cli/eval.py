@@ -70,11 +70,7 @@ def run(argv: Sequence[str]) -> int:
 
 
 def measured(splat: Splat, options: CaptureOptions, nets: Sequence[LPIPS]) -> tuple[str, dict[str, Any]]:
-    """Measure a splat on the held-out views of its capture, and return the capture's name and the numbers.
-
-    Raises:
-        PopError: no capture is known, it cannot be read, holds no view out, or its images are too small.
-    """
+    """Measure a splat on the held-out views of its capture, and return the capture's name and the numbers."""
     from pop_fast.train.evaluate import too_small
     from pop_fast.train.views import ViewTensors
 

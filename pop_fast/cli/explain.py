@@ -112,11 +112,7 @@ def _explain(args: Args, at: tuple[int, int] | None) -> int:
 
 
 def parse_pixel(text: str) -> tuple[int, int]:
-    """Read "X,Y".
-
-    Raises:
-        PopError: it is something else.
-    """
+    """Read "X,Y"."""
     try:
         x, y = (int(word) for word in text.split(","))
     except ValueError:
@@ -125,11 +121,7 @@ def parse_pixel(text: str) -> tuple[int, int]:
 
 
 def chosen_view(capture: Capture, which: str) -> View:
-    """Find a view by its place or by its name.
-
-    Raises:
-        PopError: there is none such.
-    """
+    """Find a view by its place or by its name."""
     named = [view for view in capture.views if which in (view.name, Path(view.name).name, Path(view.name).stem)]
     if len(named) == 1:
         return named[0]

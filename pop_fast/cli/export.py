@@ -129,11 +129,7 @@ class _Opened:
 
 
 def planned_file(args: Args) -> tuple[Path, str]:
-    """Return the file to write and its format, which must agree.
-
-    Raises:
-        PopError: nothing says the format, the name is another's, or the place may not be written to.
-    """
+    """Return the file to write and its format, which must agree."""
     if args.out is None and args.to is None:
         raise PopError("nothing says what to write; give --out FILE or --to FORMAT")
     if args.out is None:
@@ -156,11 +152,7 @@ def file_name(stem: str, to: str) -> str:
 
 
 def file_format(out: Path, to: str | None) -> str:
-    """Return the format that a file is to be written in, by its name or as `--to` says.
-
-    Raises:
-        PopError: they do not agree, or neither says it.
-    """
+    """Return the format that a file is to be written in, by its name or as `--to` says; they must agree."""
     from pop_fast.io.formats import named_format
 
     is_page = out.suffix.lower() in (".html", ".htm")
@@ -184,11 +176,7 @@ def note_lost_frame(out: Path, name: str, frame: Frame | None) -> None:
 
 
 def check_file(out: Path, source: Path, overwrite: bool) -> None:
-    """Check that one file may be written where it is asked for.
-
-    Raises:
-        PopError: something is in the way that is not to be replaced, or it is the splat itself.
-    """
+    """Refuse a file that is not to be replaced, or is the splat itself."""
     if out.is_dir():
         raise PopError(f"{out}: a folder of this name is in the way; choose another --out")
     if out.exists() and source.exists() and out.samefile(source):
@@ -219,11 +207,7 @@ def _write(out: Path, data: bytes) -> int:
 
 
 def _output_frame(splat: Splat, args: Args) -> tuple[np.ndarray | None, Frame | None]:
-    """Return what `to_capture_frame` is given to move the splat into the file's frame, and that frame.
-
-    Returns:
-        The similarity [4, 4], or None where nothing moves; the frame, or None where nothing says which it is.
-    """
+    """Return the similarity [4, 4] into the file's frame, or None where nothing moves, and that frame, if it is known."""
     from pop_fast.io.ply import Frame
 
     now, transform = frame_of_splat(splat, args), known_transform(splat, args)
@@ -297,11 +281,6 @@ class FinishOptions(LimitOptions):
 
 def finish(folder: Path, capture: Capture, options: Any) -> int:
     """Write what surrounds a run whose results are complete, which they stay whatever becomes of it.
-
-    Args:
-        folder: the result folder.
-        capture: in the training frame.
-        options: what has the attributes of `FinishOptions`.
 
     Returns:
         The exit status: 0, or 1 where something could not be written, or 130 after Ctrl-C.

@@ -86,11 +86,7 @@ class LimitOptions:
         return self.without_floaters or any(limit is not None for limit in limits)
 
     def check(self) -> None:
-        """Refuse what cannot be before anything is loaded.
-
-        Raises:
-            PopError: names the option.
-        """
+        """Refuse what cannot be before anything is loaded."""
         if self.min_opacity is not None and not 0.0 <= self.min_opacity <= 1.0:
             raise PopError(f"--min-opacity {self.min_opacity:g} must be in [0, 1]")
         if self.crop is not None and not all(a <= b for a, b in zip(self.crop[:3], self.crop[3:], strict=True)):
@@ -178,24 +174,14 @@ class Output:
 
 @dataclass
 class Limited:
-    """What limits have left.
-
-    Attributes:
-        params: raw parameters, in the training frame.
-        level: of coarseness that they are to be written at.
-        said: a line for every limit that left something out.
-    """
+    """What limits have left: raw parameters, the level of coarseness to write them at, and what was said of it."""
 
     params: dict[str, Tensor]
     level: int = 0
     said: list[str] = field(default_factory=list)
 
     def keep(self, kept: Tensor, what: str) -> None:
-        """Keep the Gaussians that are marked.
-
-        Raises:
-            PopError: none is.
-        """
+        """Keep the Gaussians that are marked; a PopError refuses to keep none."""
         before, after = len(kept), int(kept.sum())
         self.said.append(f"{what}: {after:,} of {before:,} Gaussians kept")
         if after == 0 and before > 0:
@@ -204,19 +190,7 @@ class Limited:
 
 
 def limited(shown: Shown, limits: LimitOptions, output: Output) -> Limited:
-    """Leave out what the limits say.
-
-    Args:
-        shown: the splat.
-        limits: the options.
-        output: the file that is made of it.
-
-    Returns:
-        What is left, its Gaussians in their order.
-
-    Raises:
-        PopError: a limit cannot be met, or no Gaussian is left.
-    """
+    """Leave out what the limits say of the splat that becomes a file; what is left keeps its order."""
     from pop_fast.density import shrink
 
     left = Limited(shown.params)

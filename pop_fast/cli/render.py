@@ -94,11 +94,7 @@ def _render(args: Args, video: VideoFile | None) -> int:
 
 
 def check_path(path: str) -> None:
-    """Check the path that was asked for before the long work begins.
-
-    Raises:
-        PopError: it is neither a name that is known nor a file that was recorded.
-    """
+    """Check the path that was asked for before the long work begins."""
     from pop_fast.view.paths import PATHS
 
     if path in ("views", *PATHS):
@@ -114,11 +110,7 @@ def check_path(path: str) -> None:
 
 
 def planned_video(args: Args) -> VideoFile | None:
-    """Check the video that was asked for before the long work begins.
-
-    Raises:
-        PopError: its name, its rate or its place will not do, or it is there and may not be replaced.
-    """
+    """Check the video that was asked for before the long work begins."""
     if args.video is None:
         return None
     from pop_fast.view.paths import VideoFile

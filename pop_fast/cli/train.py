@@ -220,7 +220,7 @@ def train_capture(
     ranks: Ranks | None = None,
     chooses: bool = False,
 ) -> int:
-    """Train on a capture, finish the result and report on it.
+    """Train on a capture, finish the result and report on it; return the exit status.
 
     Args:
         config: the settings.
@@ -229,9 +229,6 @@ def train_capture(
         argv: the words after `pop train`, for commands.json.
         ranks: the processes that train together.
         chooses: choose the schedule by the speed of this machine.
-
-    Returns:
-        The exit status.
     """
     from pop_fast.train.commands import COMMANDS_FILE, commands_text
     from pop_fast.train.load_result import RECORD, read_record, record_text
@@ -289,11 +286,7 @@ def _trained(training: TrainingRun, folder: Path, capture: Capture, options: Any
 
 
 def report(folder: Path) -> int:
-    """Write the report of a run whose results are complete, which they stay whatever becomes of it.
-
-    Returns:
-        The exit status: 0, or 1 where it could not be written, or 130 after Ctrl-C.
-    """
+    """Write the report of a run whose results are complete, which they stay; return the exit status: 0, 1 or 130."""
     left = f"the results in {folder} are complete, and pop report {folder} writes it"
     try:
         from pop_fast.view.report import write_report
@@ -311,11 +304,7 @@ def report(folder: Path) -> int:
 
 
 def arguments(argv: Sequence[str]) -> tuple[TrainConfig, Any]:
-    """Read the words after `pop train` into settings of the run and of what surrounds it.
-
-    Raises:
-        PopError: a setting is out of range.
-    """
+    """Read the words after `pop train` into settings of the run and of what surrounds it."""
     words = rename_aliases(argv)
     short_help = "--help" in words or "-h" in words
     words = ["--help" if word == "--help-all" else word for word in words]
@@ -333,13 +322,7 @@ def arguments(argv: Sequence[str]) -> tuple[TrainConfig, Any]:
 
 
 def _arguments_type(base: TrainConfig, plan: dict[str, Any], short: bool) -> type:
-    """Make the class that tyro reads: every setting of `TrainConfig`, or only those that the short help shows.
-
-    Args:
-        base: the defaults.
-        plan: what they come from, as far as it was said.
-        short: hide what `_SHOWN` does not name.
-    """
+    """Make the class that tyro reads: every setting of `TrainConfig`, or only those that the short help shows."""
     kinds = typing.get_type_hints(Given)
     kinds["method"] = Literal[(*METHODS, *ALIASES)]
     columns: list[Any] = [(name, kinds[name], plan.get(name, getattr(Given, name))) for name in PLAN]
@@ -374,11 +357,7 @@ def _arguments_type(base: TrainConfig, plan: dict[str, Any], short: bool) -> typ
 
 
 def check_backend(config: TrainConfig) -> None:
-    """Refuse a backend that cannot run here, or not with these settings, before the minutes of loading, not after.
-
-    Raises:
-        PopError: says why and what to do.
-    """
+    """Refuse a backend that cannot run here, or not with these settings, before the minutes of loading."""
     reason = why_not_trained(require_backend(config.backend), config)
     if reason is not None:
         raise PopError(reason)

@@ -24,15 +24,7 @@ _NEED_ALL = ("without_floaters", "final_prune", "max_gaussians", "target_mb")
 
 
 def check_blocks(config: TrainConfig, options: Any) -> None:
-    """Refuse what cannot be trained in blocks, before anything is loaded.
-
-    Args:
-        config: the settings.
-        options: those of `pop train`.
-
-    Raises:
-        PopError: names the option, the reason and what to do.
-    """
+    """Refuse what cannot be trained in blocks, by the option, the reason and what to do, before anything is loaded."""
     if options.blocks is None:
         _check_without(config, options)
         return
@@ -83,11 +75,7 @@ def _check_without(config: TrainConfig, options: Any) -> None:
 
 
 def _job(config: TrainConfig, options: Any) -> Job:
-    """Gather what is asked for; what is not said of rounds is as a run that is resumed was begun.
-
-    Raises:
-        PopError: an option is out of range, or job.json is damaged.
-    """
+    """Gather what is asked for; what is not said of rounds is as a run that is resumed was begun."""
     from pop_fast.blocks.plan import DEFAULT_ROUNDS, ROUND_SHARE, Job, read_job
 
     begun = read_job(Path(config.result_dir)) if options.resume else None
@@ -106,17 +94,7 @@ def _job(config: TrainConfig, options: Any) -> Job:
 
 
 def train_in_blocks(config: TrainConfig, options: Any, chosen: str, argv: Sequence[str]) -> int:
-    """Divide the capture where that is not done yet, and do the parts of the run that are not done yet.
-
-    Args:
-        config: the settings; every block is trained with them.
-        options: those of `pop train`.
-        chosen: a line on the backend.
-        argv: the words after `pop train`, for commands.json.
-
-    Returns:
-        The exit status.
-    """
+    """Divide the capture where that is not done yet, do the parts of the run that are left, return the exit status."""
     from pop_fast.blocks.jobs import gpus_for, has_snakemake, marker_of, profile_folder, run_in_turn, run_workflow
     from pop_fast.blocks.plan import FOLDER, read_plan
     from pop_fast.io.atomic import FolderLock
@@ -164,11 +142,7 @@ def train_in_blocks(config: TrainConfig, options: Any, chosen: str, argv: Sequen
 
 
 def _begun(folder: Path, config: TrainConfig, job: Job) -> Job | None:
-    """Read what a run that is resumed was begun with, or None where nothing is there.
-
-    Raises:
-        PopError: it is another run: names what differs.
-    """
+    """Read what a run that is resumed was begun with, or None where nothing is there; it must not differ."""
     from pop_fast.blocks.plan import read_job
     from pop_fast.train.config import first_difference
     from pop_fast.train.engines import engine_of

@@ -117,16 +117,7 @@ def plan_of(words: Sequence[str]) -> dict[str, Any]:
 
 
 def overrides(args: Any, base: TrainConfig, words: Sequence[str]) -> dict[str, Any]:
-    """Return the settings that the words name, also where what they say is the default.
-
-    Args:
-        args: what the words were parsed into, with the attributes of `base`.
-        base: the defaults.
-        words: the words.
-
-    Returns:
-        Values by dotted name, as `TrainConfig.of` takes them.
-    """
+    """Return the settings that the words name, also where what they say is the default, for `TrainConfig.of`."""
     named = {_dashed(word).partition("=")[0].removeprefix("--") for word in words if word.startswith("--")}
     found: dict[str, Any] = {}
     for name, value, default in _settings(args, base):
@@ -162,17 +153,7 @@ _USUAL_SIDE: Final = 1600
 
 
 def check_early(config: TrainConfig, source: Source, images: str | None, ranks: Ranks | None) -> None:
-    """Refuse what would end a run after its photographs were read, before their cameras are searched for.
-
-    Args:
-        config: the settings.
-        source: where cameras come from, as `load_capture` takes it.
-        images: the folder of the capture with the photographs, likewise.
-        ranks: the processes that train together.
-
-    Raises:
-        PopError: names the option, and the photograph or file.
-    """
+    """Refuse what would end a run after its photographs were read, before their cameras are searched for."""
     for name, files in (("--lpips-vgg", config.lpips_vgg), ("--lpips-alex", config.lpips_alex)):
         for file in files:
             if not Path(file).is_file():
@@ -222,11 +203,7 @@ def takes_hours(config: TrainConfig) -> bool:
 
 
 def check_output(folder: Path, options: Any) -> None:
-    """Refuse an output folder that cannot be written to before the minutes of loading, not after.
-
-    Raises:
-        PopError: as `ResultFolder.check`, or both --resume and --overwrite were given.
-    """
+    """Refuse an output folder that cannot be written to before the minutes of loading, not after."""
     if options.resume and options.overwrite:
         raise PopError("--resume and --overwrite exclude each other; choose one")
     from pop_fast.train.results import ResultFolder
@@ -236,15 +213,7 @@ def check_output(folder: Path, options: Any) -> None:
 
 
 def as_begun(folder: Path, options: Any) -> Any:
-    """Read the capture of a resumed run as it was read before, where the command does not say.
-
-    Args:
-        folder: the result folder.
-        options: those of `pop train`; without `resume` it is returned as it is.
-
-    Raises:
-        PopError: capture.json is damaged.
-    """
+    """Read the capture of a run that is resumed as it was read before, where the command does not say."""
     from pop_fast.train.load_result import read_record
 
     record = read_record(folder) if options.resume else None
@@ -260,13 +229,7 @@ def as_begun(folder: Path, options: Any) -> Any:
 
 
 def record_of(capture: Capture, options: Any, chosen: Sequence[str] = ()) -> CaptureRecord:
-    """Return what capture.json says of a capture that was read as the options of `pop train` say.
-
-    Args:
-        capture: as it was read.
-        options: those of `pop train`.
-        chosen: what the run chose for itself, in sentences.
-    """
+    """Return what capture.json says of a capture that was read by these options, and of what the run chose."""
     from pop_fast.train.load_result import CaptureRecord
 
     return CaptureRecord(
@@ -353,8 +316,7 @@ def photographs_of(config: TrainConfig, options: Any) -> list[Path]:
 def with_length(config: TrainConfig, capture: Capture, options: Any) -> tuple[TrainConfig, tuple[str, ...]]:
     """Choose terms and schedule of a run that chooses for itself, by the photographs and the speed of this machine.
 
-    Returns:
-        The settings, and lines that say what is to come, and why; none where the run is resumed as it was begun.
+    With lines that say what is to come, and why; none where the run is resumed as it was begun.
     """
     from pop_fast.data.photo_quality import exposure_stops
     from pop_fast.io.heartbeat import Heartbeat

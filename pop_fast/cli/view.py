@@ -116,11 +116,7 @@ def announce(viewer: LiveViewer) -> None:
 
 
 def check_address(host: str, port: int) -> None:
-    """Refuse an address that the viewer cannot listen on, within a second or so.
-
-    Raises:
-        PopError: the port is none, viser is absent, or the address is not this machine's.
-    """
+    """Refuse an address that the viewer cannot listen on, within a second or so."""
     if not 0 < port < 65536:
         raise PopError(f"port is {port}; give --port a number from 1 to 65535")
     from pop_fast.view.live.guard import listen
@@ -157,10 +153,6 @@ class LiveView:
 
 
 def check_viewer(options: Any) -> None:
-    """Refuse a viewer that cannot be before the minutes of loading, not after.
-
-    Raises:
-        PopError: viser is absent, or the address cannot be listened on.
-    """
+    """Refuse a viewer that cannot be before the minutes of loading, not after."""
     if options.view:
         check_address(options.view_host, options.view_port)

@@ -212,7 +212,7 @@ class PinholeCamera:
 
 
 def require_colmap() -> Any:
-    """Import pycolmap, which knows the other camera models, and finds cameras; a CaptureError says that it is absent."""
+    """Import pycolmap, which knows the other camera models, and finds cameras; a CaptureError where it is absent."""
     first = "pycolmap" not in sys.modules
     try:
         import pycolmap

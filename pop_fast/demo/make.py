@@ -222,18 +222,7 @@ _EXPOSURE = 0.75
 
 
 def render_view(scene: DemoScene, viewmat: np.ndarray, K: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Take a picture.
-
-    Args:
-        scene: what to look at.
-        viewmat: world -> camera. [4, 4]
-        K: intrinsics, px. [3, 3]
-        width: px.
-        height: px.
-
-    Returns:
-        uint8 [height, width, 3], gamma 2.2.
-    """
+    """Take a picture of size width x height px with a camera, world -> camera. uint8 [height, width, 3], gamma 2.2"""
     image = np.zeros((height, width, 3), np.float32)
     for top in range(0, height, _PATCH):
         for left in range(0, width, _PATCH):
@@ -243,12 +232,7 @@ def render_view(scene: DemoScene, viewmat: np.ndarray, K: np.ndarray, width: int
 
 
 def first_hits(scene: DemoScene, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find what rays from one point meet first.
-
-    Args:
-        scene: what they may meet.
-        origin: [3]
-        directions: unit, float32 [3, M].
+    """Find what rays from one point [3] along unit directions, float32 [3, M], meet first.
 
     Returns:
         Distances (infinity for the sky) float32 [M], and indices into `scene.shapes`, -1 for the ground, int64 [M].

@@ -184,11 +184,7 @@ def _sprinkles(generator: np.random.Generator) -> np.ndarray:
 
 
 def make_scene(seed: int) -> DemoScene:
-    """Set the scene: the same seed gives the same scene, another one other textures, turns and places.
-
-    Args:
-        seed: of every random choice.
-    """
+    """Set the scene: the same seed gives the same scene, another one other textures, turns and places."""
     generator = np.random.default_rng([seed, 1])
     clouds, fine = _Noise(generator, 1.6), _Noise(generator, 0.9)
     palette = np.concatenate([_rgb(c) for c in ("c9a27e", "b58463", "d8c3a0", "a9a49b", "bd9f8a")], axis=1).T

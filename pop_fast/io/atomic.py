@@ -77,7 +77,7 @@ def check_place(path: Path) -> None:
 
 
 def write_atomically(path: str | os.PathLike[str], writer: Callable[[BinaryIO], object]) -> None:
-    """Write one file whole or not at all; missing parent folders are made, and `writer` is called once with a binary file.
+    """Write one file whole or not at all; missing parents are made, and `writer` is called once with a binary file.
 
     Raises:
         PopError: the operating system refused (disk full, no permission, ...); names the file and what to do. The

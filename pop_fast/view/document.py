@@ -29,14 +29,9 @@ _WORKERS: Final = " blob:; worker-src blob:"
 
 
 def document(title: str, style: str, body: str, script: str, framed: str = "") -> str:
-    """Lay out a page.
+    """Lay out a page of a title as text, a style sheet, HTML for `main`, and the one script that may run in it.
 
-    Args:
-        title: as text; it is escaped.
-        style: its style sheet.
-        body: what stands in `main`, as HTML.
-        script: the one script that may run in it.
-        framed: the one that may run in its frames, which may start workers; empty for none.
+    `framed` is the script that may run in its frames, which may start workers; empty for none.
     """
     allowed = " ".join(f"'sha256-{_digest(text)}'" for text in (script, framed) if text)
     policy = _POLICY.format(scripts=allowed) + (_WORKERS if framed else "")
@@ -59,13 +54,9 @@ def _digest(text: str) -> str:
 
 
 def element(tag: str, body: str = "", title: str = "", **attributes: object) -> str:
-    """Write one element.
+    """Write one element, with a title that browsers show under the pointer.
 
-    Args:
-        tag: its name.
-        body: SVG inside it.
-        title: shown by browsers under the pointer.
-        attributes: `kind` becomes `class`, `_` becomes `-`, numbers are rounded to 0.1.
+    In attributes `kind` becomes `class`, `_` becomes `-`, and numbers are rounded to 0.1.
     """
     words = [tag]
     for name, value in attributes.items():
@@ -87,16 +78,9 @@ def path(d: str, kind: str, title: str = "", **attributes: object) -> str:
 
 
 def card(title: str, legend: str, width: int, height: int, body: str, kind: str = "chart", data: str = "") -> str:
-    """Write a figure: a title with its legend, and an SVG drawing under it.
+    """Write a figure: a title with its legend, and an SVG drawing of a size in its own units under it.
 
-    Args:
-        title: the heading.
-        legend: HTML beside the heading.
-        width: of the drawing, in its own units.
-        height: likewise.
-        body: the SVG.
-        kind: CSS classes of the figure.
-        data: JSON that the page's script reads.
+    `kind` are CSS classes of the figure, `data` is JSON that the page's script reads.
     """
     extra = f' data-chart="{escape(data)}"' if data else ""
     drawing = element("svg", body, role="img", aria_label=title, viewBox=f"0 0 {width} {height}")
@@ -112,14 +96,9 @@ _LANE: Final = 5
 
 @dataclass(frozen=True)
 class Series:
-    """One line of a chart.
+    """One line of a chart: iterations, and values, where NaN leaves a gap.
 
-    Attributes:
-        name: what the legend says.
-        x: iterations.
-        y: values, as many as x; NaN leaves a gap.
-        color: CSS colour, usually `var(--c1)`.
-        dots: draw points joined by a thin line instead of a line (for values that are measured now and then).
+    With `dots`, points are joined by a thin line in the place of a line, for values that are measured now and then.
     """
 
     name: str
@@ -144,8 +123,6 @@ class Chart:
     """A chart to draw.
 
     Attributes:
-        title: the heading above the plot.
-        series: the lines.
         x_stop: the last iteration of the axis.
         windows: shaded stretches.
         marks: iterations with a dashed line (opacity resets).
@@ -295,13 +272,8 @@ def _line(series: Series, axes: _Axes) -> str:
 def draw_histogram(title: str, shares: Sequence[float], top: float, color: str, notes: Sequence[str]) -> str:
     """Draw an opacity histogram: equal bins over [0, 1], bar heights as shares of all Gaussians.
 
-    Args:
-        title: the heading.
-        shares: share of Gaussians in each bin, in [0, 1].
-        top: the share at the top of the axis, the same in charts that stand side by side; a taller bar is cut off
-            there and its share written next to it.
-        color: CSS colour of the bars.
-        notes: short remarks under the title.
+    `top` is the share at the top of the axis, the same in charts that stand side by side; a taller bar is cut off there
+    and its share written next to it.
     """
     width, height, left, right, ceiling, bottom = 320, 180, 40, 8, 8, 24
     plot_w, plot_h, floor = width - left - right, height - bottom - ceiling, height - bottom

@@ -43,13 +43,6 @@ def orbit(viewmats: np.ndarray, n_frames: int) -> np.ndarray:
     Where they stand all round it is a full circle. Else it goes from the middle of their arc to one end, to the other
     and back, so that nothing is shown from where no photograph was taken. Cameras that look at no one point, as on a
     walk or in a room, have nothing to turn about: the path then glides through them, from the first to the last.
-
-    Args:
-        viewmats: cameras of the capture in the order of their names, world -> camera. [M, 4, 4]
-        n_frames: cameras on the path.
-
-    Returns:
-        Cameras on the path, world -> camera. [n_frames, 4, 4]
     """
     if not look_at_one_point(viewmats):
         passed = np.linspace(0, len(viewmats) - 1, min(len(viewmats), max(2, n_frames // _GLIDE)))
@@ -67,13 +60,9 @@ def orbit(viewmats: np.ndarray, n_frames: int) -> np.ndarray:
 
 
 def camera_arc(angles: np.ndarray) -> tuple[float, float] | None:
-    """Find the arc that cameras stand on: the circle without its largest gap.
+    """Find the arc that cameras stand on by their angles, radians: the circle without its largest gap.
 
-    Args:
-        angles: where they stand about the point they look at, radians. [M]
-
-    Returns:
-        The middle and half the width of the arc, radians; None where no gap stands out, for a full circle.
+    Its middle and half its width, radians; None where no gap stands out, for a full circle.
     """
     around = np.sort(np.mod(angles, 2.0 * np.pi))
     gaps = np.diff(around, append=around[0] + 2.0 * np.pi)
@@ -87,15 +76,7 @@ def camera_arc(angles: np.ndarray) -> tuple[float, float] | None:
 
 
 def ellipse(viewmats: np.ndarray, n_frames: int) -> np.ndarray:
-    """Circle on the ellipse that the cameras themselves spread over, rising and sinking once a turn.
-
-    Args:
-        viewmats: cameras of the capture, world -> camera. [M, 4, 4]
-        n_frames: cameras on the path.
-
-    Returns:
-        Cameras on the path, world -> camera, evenly spaced along the ellipse. [n_frames, 4, 4]
-    """
+    """Circle on the ellipse that the cameras themselves spread over, rising and sinking once a turn."""
     up, focus = mean_up(viewmats), focus_point(viewmats)
     offsets = camera_centers(viewmats) - focus
     flat = offsets - (offsets @ up)[:, None] * up
@@ -112,15 +93,7 @@ def ellipse(viewmats: np.ndarray, n_frames: int) -> np.ndarray:
 
 
 def interpolate(viewmats: np.ndarray, n_frames: int) -> np.ndarray:
-    """Glide through the given cameras in order: cubic splines through centres and rotations.
-
-    Args:
-        viewmats: cameras of the capture in the order to visit, world -> camera. [M, 4, 4], M >= 2
-        n_frames: cameras on the path; its first and last are the given first and last.
-
-    Returns:
-        Cameras on the path, world -> camera. [n_frames, 4, 4]
-    """
+    """Glide through two or more cameras, from the first to the last: cubic splines through centres and rotations."""
     if len(viewmats) < 2:
         raise ValueError(f"viewmats has {len(viewmats)} cameras; a path through them needs at least 2")
     knots = np.arange(len(viewmats), dtype=np.float64)
@@ -130,6 +103,7 @@ def interpolate(viewmats: np.ndarray, n_frames: int) -> np.ndarray:
     return _viewmats(rotations, centers)
 
 
+# of cameras of a capture [M, 4, 4], in the order of their names, so many on a path; world -> camera
 PATHS: Final[dict[str, Callable[[np.ndarray, int], np.ndarray]]] = {
     "orbit": orbit,
     "ellipse": ellipse,
@@ -195,10 +169,6 @@ class VideoFile:
     Raises:
         PopError: at once, for a name or a rate that no video can have; when frames are added, for one of another size;
             when the block ends, for a file that does not play to its last frame. `path` is then as it was.
-
-    Example:
-        with VideoFile(Path("path.webm"), fps=30) as video:
-            video.add(frame)  # uint8 [H, W, 3], RGB
     """
 
     def __init__(self, path: Path, fps: float = 30.0) -> None:

@@ -78,7 +78,7 @@ class Cloud:
 
     @classmethod
     def of(cls, params: Mapping[str, Tensor], antialiased: bool = False, frame: Frame | None = None) -> Cloud:
-        """Take over raw parameters, as `checked_params` does; colour degrees in which all coefficients are 0 are left out."""
+        """Take over raw parameters; colour degrees in which all coefficients are exactly 0 are left out."""
         arrays = checked_params(dict(params))
         quats = arrays["quats"].astype(np.float64)
         quats /= np.linalg.norm(quats, axis=1, keepdims=True)
@@ -167,7 +167,7 @@ def morton_order(means: np.ndarray) -> np.ndarray:
 
 
 def drop_largest(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Leave out the component of the largest magnitude of unit quaternions, after a change of sign that makes it positive.
+    """Leave out the component of the largest magnitude of unit quaternions, after a change of sign that makes it > 0.
 
     Returns:
         Which was left out, int64 [N], and the others in order, within sqrt(1/2) of 0. float64 [N, 3]

@@ -25,12 +25,9 @@ from pop_ref.records import Splats
 
 @dataclass(frozen=True)
 class Flip:
-    """One decision, D1 to D8, that two renderers take differently.
+    """One decision, D1 to D8, that two renderers take differently at a Gaussian.
 
     Attributes:
-        decision: its label.
-        gaussian: which it is about.
-        depth: of that Gaussian.
         first: what the one does, with operand and threshold.
         second: what the other does.
         more: how many entries behind it also meet another fate, most of them in consequence.
@@ -45,14 +42,9 @@ class Flip:
 
 
 def first_flip(ids: np.ndarray, walks: tuple[Walk, Walk], profiles: tuple[Profile, Profile]) -> Flip | None:
-    """Find where two walks over the same candidates part, from the front.
+    """Find where two walks over the same candidates part, from the front; `ids` are the Gaussians of their rows.
 
     Entries that one list holds only to skip them are no parting: they change nothing.
-
-    Args:
-        ids: Gaussian of every row of both walks' splats.
-        walks: the two.
-        profiles: their constants.
     """
     flips = list(_flips(ids, walks, profiles))
     if flips:
@@ -169,7 +161,6 @@ class Difference:
     """What `difference` found.
 
     Attributes:
-        names: of the two.
         lines: the result in words.
         region: left, top, width and height of what was compared, px.
         n_colors: pixels whose colours 8 bits can tell apart.
@@ -199,19 +190,9 @@ class Difference:
 
 
 def difference(scene: ExplainedView, a: str, b: str, x: int, y: int) -> Difference:
-    """Compare two renderers on a view, and at a pixel.
+    """Compare two renderers, profiles or backends, on a view, and at a pixel.
 
     The oracle is slow, so where it is one of the two only the pixel's tile is compared.
-
-    Args:
-        scene: the view.
-        a: a profile or a backend.
-        b: another one.
-        x: column of the pixel.
-        y: row of the pixel.
-
-    Raises:
-        PopError: a name is neither a profile nor a backend that can run here.
     """
     width, height = scene.view.width, scene.view.height
     left, top = x // TILE_SIZE * TILE_SIZE, y // TILE_SIZE * TILE_SIZE

@@ -18,14 +18,9 @@ Box = tuple[int, int, int, int]
 
 
 def stage(e: PixelExplanation, rows: Sequence[Row], picture: np.ndarray, box: Box, inner: Box | None) -> str:
-    """Lay ellipses and the pixel's mark over a picture.
+    """Lay ellipses and the pixel's mark over a picture of the part `box` of the view: left, top, width and height, px.
 
-    Args:
-        e: the explanation.
-        rows: the splats to draw, the heaviest first.
-        picture: uint8, of the part `box` of the view.
-        box: left, top, width and height, px.
-        inner: a part to outline, or None for a close-up.
+    The heaviest splats come first; `inner` is a part to outline, or None for a close-up.
     """
     floor = PROFILES[e.profile].alpha_floor
     # the heaviest is drawn last, on top, where the pointer finds it
@@ -107,13 +102,7 @@ _ZOOM = (21, 81)  # px, the smallest and the largest close-up
 
 
 def page(e: PixelExplanation, maps: Sequence[Map], differences: Sequence[str] = ()) -> str:
-    """Lay out the page.
-
-    Args:
-        e: the explanation.
-        maps: of the same view, `view_maps`' and any others.
-        differences: lines that tell where two renderers part, if that was asked.
-    """
+    """Lay out the page, with maps of the same view, and lines that tell where two renderers part, if that was asked."""
     pictures = {entry.name: entry.picture for entry in maps}
     drawn = sorted(e.blended, key=lambda row: -row.weight)[:_DRAWN]
     body = "".join(

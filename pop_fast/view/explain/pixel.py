@@ -83,15 +83,7 @@ def oracle_splats(scene: ExplainedView, ids: np.ndarray, profile: Profile) -> Sp
 
 
 def walk(scene: ExplainedView, splats: Splats, x: int, y: int, profile: Profile) -> Walk:
-    """Blend one pixel from its tile's list and note every entry's fate.
-
-    Args:
-        scene: the view.
-        splats: all that can be in the pixel's tile, in index order.
-        x: column of the pixel.
-        y: row of the pixel.
-        profile: every constant.
-    """
+    """Blend one pixel from its tile's list of splats, in index order, and note every entry's fate."""
     columns = rows_from_splats(splats)
     order = tile_list(scene, splats, x, y, profile)
     pixel = composite_pixel(order, columns, x + 0.5, y + 0.5, list(scene.config.background), profile)
@@ -208,11 +200,7 @@ def explain_pixel(
 
 
 def check_inside(view: View, x: int, y: int) -> None:
-    """Refuse a pixel outside the image.
-
-    Raises:
-        PopError: it is; says which coordinate, and its range.
-    """
+    """Refuse a pixel outside the image; the PopError says which coordinate, and its range."""
     for name, value, size in (("x", x, view.width), ("y", y, view.height)):
         if not 0 <= value < size:
             raise PopError(
@@ -450,12 +438,7 @@ _HEAD_POP = "        POP"
 
 
 def table(explanation: PixelExplanation, everything: bool = False) -> str:
-    """Lay out the explanation.
-
-    Args:
-        explanation: of one pixel.
-        everything: all entries; else those that matter, and one line for each stretch of faint ones.
-    """
+    """Lay out the explanation: all entries, or those that matter, and one line for each stretch of faint ones."""
     e = explanation
     has_pop = e.lambda_pop > 0.0
     lines = [*_above(e), "", _HEAD + _HEAD_POP * has_pop, "-" * WIDTH]

@@ -119,10 +119,6 @@ def explain_view(
         config: profile, background, antialiasing and objective; the defaults (POP's objective) when None.
         sh_degree: highest colour band, all of them when None.
         step: the training step the parameters are of, which decides the loss and whether POP was on.
-
-    Raises:
-        ValueError: the image is too small for SSIM, or a parameter is not finite; says which.
-        PopError: there are no Gaussians.
     """
     config = TrainConfig() if config is None else config
     raw = {name: tensor.detach().double() for name, tensor in params.items()}
@@ -203,15 +199,7 @@ _UP, _DOWN = (255, 140, 60), (80, 140, 255)
 
 @dataclass(frozen=True, eq=False)
 class Map:
-    """One picture of a view.
-
-    Attributes:
-        name: of the file, without suffix.
-        title: what it shows.
-        about: how to read it.
-        picture: uint8 [H, W, 3]
-        scale: colours, first and last value of the scale; None where colours are not numbers.
-    """
+    """One picture of a view, uint8 [H, W, 3]; `scale` is None, or colours, first and last value of the scale."""
 
     name: str
     title: str

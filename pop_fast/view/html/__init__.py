@@ -29,15 +29,7 @@ _MOST: Final = 60
 
 @dataclass(frozen=True)
 class PageCamera:
-    """A pinhole camera.
-
-    Attributes:
-        name: what the page shows of it.
-        viewmat: world -> camera, y down, z forward. [4, 4]
-        K: intrinsics, px. [3, 3]
-        width: px
-        height: px
-    """
+    """A pinhole camera: its name, world -> camera [4, 4] with y down and z forward, intrinsics [3, 3] and size, px."""
 
     name: str
     viewmat: np.ndarray
@@ -143,7 +135,7 @@ def page_of(
     title: str,
     level: int = 0,
 ) -> bytes:
-    """Make the page.
+    """Make the page's bytes.
 
     It draws as the training's rasterizer does: the same projection, low-pass, cut-offs of alpha and background, colours
     to degree 3. It loses what SPZ loses, ends no pixel early, and holds sums of layers in half precision.
@@ -155,12 +147,6 @@ def page_of(
         sh_degree: highest colour band to draw.
         title: of the page.
         level: how coarsely view dependence is written, as of SPZ.
-
-    Returns:
-        The file's bytes.
-
-    Raises:
-        PopError: the splat does not fit into SPZ.
     """
     drawn = {**params, "shN": params["shN"][:, : (sh_degree + 1) ** 2 - 1]}
     scene = _scene(params["means"].detach().cpu(), cameras, config)

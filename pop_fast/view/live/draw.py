@@ -45,14 +45,9 @@ class Drawing:
 
 
 class SplatScene:
-    """Gaussians that are drawn again and again.
+    """Gaussians that are drawn again and again: raw parameters, which are not changed, by a config and a backend.
 
-    Args:
-        params: raw parameters; not changed, and not kept in another form.
-        config: background, profile and antialiasing are read.
-        sh_degree: highest active colour band.
-        backend: what renders.
-        world_transform: world = world_transform @ the capture's own frame, a similarity. [4, 4]
+    `world_transform` is the similarity, world = world_transform @ the capture's own frame. [4, 4]
     """
 
     def __init__(
@@ -136,13 +131,7 @@ def scene_of(run: TrainingRun, world_transform: np.ndarray) -> SplatScene:
 
 
 def follow(viewer: LiveViewer, run: TrainingRun, world_transform: np.ndarray) -> None:
-    """Draw what is due of a run, on its own thread; call it between steps.
-
-    Args:
-        viewer: what shows it.
-        run: the training.
-        world_transform: of its capture.
-    """
+    """Draw what is due of a run, on its own thread; call it between steps."""
     # without a browser it costs nothing
     if not viewer.watched:
         return
@@ -164,8 +153,6 @@ class ViewState:
     Attributes:
         viewmat: world -> camera, OpenCV. [4, 4]
         fov_y: angle from the upper to the lower edge, radians.
-        width: px
-        height: px
         mode: what is drawn: the render, dominant Gaussians, how opaque pixels are, or their depth.
         min_opacity: Gaussians of less are left out.
         crop: those with centres outside are left out; in the capture's own frame.
@@ -252,12 +239,7 @@ class RecordedPath:
     def along(self, n_frames: int, world_transform: np.ndarray) -> list[KeyCamera]:
         """Glide through the cameras: cubic splines through places, rotations and the logarithm of the focal length.
 
-        Args:
-            n_frames: cameras on the path; its first and last are the recorded ones. A single camera stays.
-            world_transform: world = world_transform @ the capture's own frame. [4, 4]
-
-        Returns:
-            Cameras of the world.
+        The first and the last are the recorded ones, in the world; a single camera stays.
         """
         viewmats = np.stack([from_capture(c.viewmat, world_transform) for c in self.cameras])
         if len(viewmats) == 1:
@@ -281,11 +263,7 @@ def from_capture(viewmat: np.ndarray, world_transform: np.ndarray) -> np.ndarray
 
 
 def read_path(path: Path) -> RecordedPath:
-    """Read a recorded path.
-
-    Raises:
-        PopError: it is not one; names the entry.
-    """
+    """Read a recorded path; a PopError names the entry that is none of one."""
     content = read_json(path, _FIX)
     if content.get("kind") != _KIND or content.get("frame") != "capture":
         raise PopError(f"{path}: is not a camera path of 'pop view' (kind {content.get('kind')!r}); {_FIX}")

@@ -29,7 +29,7 @@ class Panel:
         title: in the names of files.
         box: what holds nearly all Gaussians, in the capture's own frame.
         world_transform: world = world_transform @ the capture's own frame. [4, 4]
-        rules: is given what each control may be set to, by viser's name of it; see `pop_fast.view.live.guard`.
+        rules: is given what each control may be set to; see `pop_fast.view.live.guard`.
         held: wraps what is called when a control is used, and deals with its errors.
     """
 

@@ -92,13 +92,9 @@ class Pace:
         self._stale = False
 
     def size(self, kind: Kind, width: int, height: int, longest: int) -> tuple[int, int]:
-        """Choose a picture's width and height, px, of the window's shape.
+        """Choose a picture's width and height, px, of the window's shape: quick ones are as large as the time allows.
 
-        Args:
-            kind: quick ones are as large as the time allows.
-            width: of the window, px.
-            height: likewise.
-            longest: the longer side of a sharp picture, px.
+        `longest` is the longer side of a sharp picture, px.
         """
         width, height = max(width, 1), max(height, 1)
         scale = min(1.0, longest / max(width, height))
@@ -124,23 +120,13 @@ class Stand:
 
 
 def stands_of(cameras: Sequence[PageCamera], photos: Sequence[np.ndarray | None], means: Any) -> list[Stand]:
-    """Make places to look from of cameras and their photographs.
-
-    Args:
-        cameras: one or more.
-        photos: as many, uint8 [H, W, 3] or None.
-        means: centres of the Gaussians. [N, 3]
-    """
+    """Make places to look from of cameras and their photographs, uint8 [H, W, 3] or None."""
     distances = view_distances(cameras, means)
     return [Stand(*entry) for entry in zip(cameras, distances, photos, strict=True)]
 
 
 def require_viser() -> Any:
-    """Import viser.
-
-    Raises:
-        PopError: it is absent or broken; says how to get it.
-    """
+    """Import viser; a PopError says how to get it where it is absent or broken."""
     try:
         # by name: type checkers run without it
         return importlib.import_module("viser")
@@ -160,13 +146,6 @@ class LiveViewer:
 
     Raises:
         PopError: viser is absent, or the address cannot be listened on.
-
-    Example:
-        with LiveViewer(scene, stands, "garden") as viewer:
-            print(viewer.url)
-            while True:
-                viewer.wait()
-                viewer.draw_due()
     """
 
     def __init__(
@@ -226,13 +205,9 @@ class LiveViewer:
         self._wake.clear()
 
     def draw_due(self, share: float = 1.0) -> int:
-        """Draw what is due, at most one picture a browser; an error closes the browser's view.
+        """Draw what is due, at most one picture a browser, and return how many; an error closes the browser's view.
 
-        Args:
-            share: of the time that drawing may take; until it is so much, nothing is drawn.
-
-        Returns:
-            How many pictures were drawn.
+        Drawing may take a share of the time; until it is so much, nothing is drawn.
         """
         begun = time.monotonic()
         if begun < self._free_at:

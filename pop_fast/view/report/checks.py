@@ -112,17 +112,7 @@ def write_checks(
     backend: Any,
     step: int,
 ) -> Checks:
-    """Measure a splat and write what a report shows of it.
-
-    Args:
-        folder: the result folder.
-        capture: in the frame of the splat.
-        params: raw parameters.
-        config: of the run.
-        sh_degree: highest active colour band.
-        backend: what renders.
-        step: the last step taken, from 0; it names the files.
-    """
+    """Measure a splat, whose last step names the files, and write what a report shows of it."""
     results = ResultFolder(folder)
 
     def looked(view: View, chosen: Mapping[str, Tensor] = params) -> Layers:
@@ -186,12 +176,7 @@ def _keep_picture(results: ResultFolder, stem: str, view: View, layers: Layers) 
 def near_limit(view: View, points: np.ndarray) -> float | None:
     """Give the camera z up to which nothing was photographed: half that of the nearest points in the picture.
 
-    Args:
-        view: the camera.
-        points: of the capture, world. [P, 3]
-
-    Returns:
-        The limit, world units; None where too few points are in the picture to tell.
+    None where too few of the points [P, 3] are in the picture to tell.
     """
     # a row of numbers for each axis: of hundreds of views and as many thousand points, that takes a fifth of the time
     seen = view.viewmat[:3, :3] @ points.T + view.viewmat[:3, 3:]
@@ -213,20 +198,10 @@ def nearer_than(params: Mapping[str, Tensor], view: View, limit: float) -> dict[
 
 
 def are_floaters(means: Tensor, capture: Capture, test_every: int) -> Tensor:
-    """Tell which centres stand in the picture of a photograph's or the orbit's camera where nothing was photographed.
+    """Tell which centres [N, 3] stand in the picture of a photograph's or the orbit's camera too near to it. bool [N]
 
-    What reaches into such a picture from outside of it stays: of that, much is seen well by other photographs.
-
-    Args:
-        means: world. [N, 3]
-        capture: in the same frame, with its own sparse points.
-        test_every: as `Capture.train_views`; held-out cameras look too.
-
-    Returns:
-        bool [N]
-
-    Raises:
-        PopError: the points are random ones, which say nothing of where things are.
+    What reaches into such a picture from outside of it stays: of that, much is seen well by other photographs. Held-out
+    cameras look too. Random points say nothing of where things are, and a PopError says so.
     """
     if _RANDOM in capture.source:
         raise PopError(f"{capture.name}: has no sparse points of its own, without which floaters are not told from it")
@@ -246,11 +221,7 @@ def are_floaters(means: Tensor, capture: Capture, test_every: int) -> Tensor:
 
 def stops_between(photo: np.ndarray, render: np.ndarray) -> float:
     """Tell how much brighter a photograph is than a render, in stops: the median over pixels that are neither very dark
-    nor nearly white; 0 where there are none.
-
-    Args:
-        photo: in [0, 1]. [P, 3]
-        render: likewise. [P, 3]
+    nor nearly white; 0 where there are none. Both are in [0, 1]. [P, 3]
     """
     theirs, ours = photo.mean(axis=1), render.mean(axis=1)
     telling = (np.minimum(ours, theirs) > _DARK) & (np.maximum(ours, theirs) < 1.0 - _DARK)
@@ -260,12 +231,8 @@ def stops_between(photo: np.ndarray, render: np.ndarray) -> float:
 def misfit_share(view: View, render: np.ndarray) -> float:
     """Tell which share of a photograph is far from its render while most of it is near: what moved, or mirrors.
 
-    Args:
-        view: the photograph; what its mask leaves out does not count.
-        render: in [0, 1]. [H, W, 3]
-
-    Returns:
-        Blocks whose mean error is six times the median block's and 0.06 or more, of all blocks.
+    Blocks whose mean error is six times the median block's and 0.06 or more, of all blocks; what a mask leaves out does
+    not count.
     """
     error = np.abs(render - view.image[..., :3] / np.float32(255.0)).mean(axis=2)
     kept = np.ones_like(error) if view.mask is None else view.mask.astype(error.dtype)
@@ -343,11 +310,7 @@ def _film(path: Path, views: Sequence[View], looked: Any) -> None:
 
 
 def read_checks(path: Path) -> Checks:
-    """Read checks_step{step}.json.
-
-    Raises:
-        PopError: it is damaged; names the entry.
-    """
+    """Read checks_step{step}.json; a PopError names the entry that is damaged."""
     entry = read_json(path, _FIX)
     by_view = {"held_out", "stops", "floaters", "orbit_floaters", "misfits"}
     for name, value in entry.items():

@@ -306,12 +306,7 @@ def sizes_section(table: Sequence[Sequence[str]]) -> str:
 
 
 def views_section(views: Sequence[ReportView], n_held_out: int | None) -> str:
-    """Show held-out views.
-
-    Args:
-        views: the worst first.
-        n_held_out: how many were measured, more than have pictures perhaps.
-    """
+    """Show held-out views, the worst first, of all that were measured."""
     if not views:
         return ""
     errors = [pictures.error_magnitude(view.render, view.photo) for view in views]

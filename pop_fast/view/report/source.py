@@ -464,11 +464,7 @@ _KINDS: Final[Mapping[str, tuple[type, ...]]] = {
 
 
 def checked_encodings(entries: Any, where: str, fix: str) -> list[dict[str, Any]]:
-    """Check the entry `encodings` of the statistics.
-
-    Raises:
-        PopError: it is not what `pop train` writes; names the entry.
-    """
+    """Check the entry `encodings` of the statistics."""
     if not isinstance(entries, list):
         raise PopError(f"{where}: encodings is {type(entries).__name__}; it must be a list; {fix}")
     for index, entry in enumerate(entries):
@@ -489,15 +485,7 @@ def encoding_heads(encodings: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
 
 
 def encoding_rows(encodings: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    """Return the cells of a table of encodings, under `encoding_heads`.
-
-    Args:
-        encodings: entries of the statistics, as `pop_fast.train.encodings.Encoding` makes them.
-
-    Returns:
-        A row a format: its name, MB, bytes a Gaussian, size as a share of the PLY's, PSNR and how far it is from the
-        PLY's.
-    """
+    """Return a row a format: name, MB, bytes a Gaussian, size as a share of the PLY's, PSNR and how far from the PLY's."""
     whole = next((entry for entry in encodings if entry["format"] == "ply"), None)
     rows = []
     for entry in encodings:
@@ -511,14 +499,7 @@ def encoding_rows(encodings: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...
 
 
 def write_report(result_dir: str | Path) -> Path:
-    """Write report.html into a result folder, from the files in it alone.
-
-    Returns:
-        The page's path.
-
-    Raises:
-        PopError: the folder is not a result of `pop train`, or one of its files cannot be read.
-    """
+    """Write report.html into a result folder, from the files in it alone, and return its path."""
     folder = Path(result_dir)
     # a name that is no text is shown with escapes
     html = page(read_result(folder)).encode("utf-8", "backslashreplace")
