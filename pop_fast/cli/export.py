@@ -207,7 +207,7 @@ def _write(out: Path, data: bytes) -> int:
 
 
 def _output_frame(splat: Splat, args: Args) -> tuple[np.ndarray | None, Frame | None]:
-    """Return the similarity [4, 4] into the file's frame, or None where nothing moves, and that frame, if it is known."""
+    """Return the similarity [4, 4] into the file's frame, or None where nothing moves; and that frame, where known."""
     from pop_fast.io.ply import Frame
 
     now, transform = frame_of_splat(splat, args), known_transform(splat, args)

@@ -485,7 +485,7 @@ def encoding_heads(encodings: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
 
 
 def encoding_rows(encodings: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    """Return a row a format: name, MB, bytes a Gaussian, size as a share of the PLY's, PSNR and how far from the PLY's."""
+    """Return a row a format: name, MB, bytes a Gaussian, share of the PLY's size, PSNR and how far from the PLY's."""
     whole = next((entry for entry in encodings if entry["format"] == "ply"), None)
     rows = []
     for entry in encodings:
