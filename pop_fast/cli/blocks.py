@@ -51,7 +51,6 @@ class Args:
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "blocks", examples=_EXAMPLES)
     from pop_fast.blocks.plan import read_job
     from pop_fast.train.load_result import CaptureRecord, read_record

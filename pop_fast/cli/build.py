@@ -53,7 +53,6 @@ class CudaArgs:
 
 
 def run_cpu(argv: Sequence[str]) -> int:
-    """Run `pop build-cpu`."""
     args = parse(CpuArgs, argv, "build-cpu", examples=_CPU_EXAMPLES)
     library = _built(lambda: build(args.verbose))
     reason = why_not()
@@ -64,7 +63,6 @@ def run_cpu(argv: Sequence[str]) -> int:
 
 
 def run_cuda(argv: Sequence[str]) -> int:
-    """Run `pop build-cuda`."""
     args = parse(CudaArgs, argv, "build-cuda", examples=_CUDA_EXAMPLES)
     print(_built(lambda: build_cuda(list(args.arch) or None, args.jobs, verbose=args.verbose)))
     return 0

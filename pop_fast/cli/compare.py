@@ -35,7 +35,6 @@ class Args(CaptureArguments):
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "compare", examples=_EXAMPLES)
     if not args.results:
         raise PopError("nothing to compare; name one or more result folders")

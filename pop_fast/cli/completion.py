@@ -50,7 +50,6 @@ class Args:
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "completion", examples=_EXAMPLES)
     words = {name: options_of(name) for name in COMMANDS}
     print(fish(words) if args.shell == "fish" else bash(words, args.shell == "zsh"), end="")

@@ -45,7 +45,6 @@ class Args(LimitOptions):
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "convert", examples=_EXAMPLES)
     args.check()
     if args.score not in ("auto", "visibility"):
@@ -72,7 +71,6 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _output(args: Args, name: str, stored: Stored, config: TrainConfig) -> Output:
-    """Return what is made of raw parameters."""
     if name == HTML:
         from pop_fast.view.html import page_of
 

@@ -35,7 +35,6 @@ class Args:
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "data check")
     from pop_fast.data.unpack import capture_folder
 
@@ -63,7 +62,7 @@ def run(argv: Sequence[str]) -> int:
 def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
     """Examine a capture, or photographs alone; all findings in reading order."""
     from pop_fast.data import check_dataset
-    from pop_fast.data.photo_quality import CaptureFinding, about_quality, measure_file, number
+    from pop_fast.data.photo_quality import CaptureFinding, about_quality, bad, measure_file, number, warn
     from pop_fast.data.sfm import photo_folder, photographs
     from pop_fast.machine import memory_bytes
 
@@ -74,7 +73,7 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
         shown, damage = _each(files, lambda path: measure_file(path, path.relative_to(folder).as_posix()), lambda p: p)
         findings = [
             *check_dataset.about_bare(root, shown),
-            *(CaptureFinding("bad", "photographs", problem) for problem in damage),
+            *(bad("photographs", problem) for problem in damage),
         ]
         return [*findings, *about_quality(shown)]
     shots, cloud = listing.shots, listing.cloud
@@ -82,7 +81,7 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
     inside = "" if listing.made_from == where else f" in {where}"
     what = f"{len(shots)} {number(len(shots), 'view', 'views')} from the {listing.made_from}{inside}"
     findings = [CaptureFinding("ok" if len(shots) > 1 else "bad", "poses", what)]
-    findings += [CaptureFinding("warn", "poses", note) for note in listing.notes]
+    findings += [warn("poses", note) for note in listing.notes]
     findings += check_dataset.about_cameras(shots)
     findings += check_dataset.about_spacing(shots)
     paths = {id(shot): check_dataset.file_of(root, shot) for shot in shots}
@@ -90,7 +89,7 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
         shots, lambda shot: check_dataset.read_photo(shot, paths[id(shot)], cloud), lambda shot: paths[id(shot)]
     )
     findings += check_dataset.about_photos(photos, root)
-    findings += [CaptureFinding("bad", "photographs", problem) for problem in damage]
+    findings += [bad("photographs", problem) for problem in damage]
     findings += about_quality([photo.shown for photo in photos if photo.shown is not None])
     findings += check_dataset.about_drift(photos)
     findings += check_dataset.about_masks(photos, root)

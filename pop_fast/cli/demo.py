@@ -35,7 +35,6 @@ class Args:
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "demo", examples=_EXAMPLES)
     from pop_fast.demo import make_demo
     from pop_fast.io.heartbeat import bars

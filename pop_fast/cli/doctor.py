@@ -112,7 +112,6 @@ class Args:
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "doctor")
     findings = [*packages(), *machine()]
     if not any(finding.name == "torch" and finding.state == "missing" for finding in findings):
@@ -143,7 +142,6 @@ def packages() -> Iterator[DoctorLine]:
 
 
 def machine() -> Iterator[DoctorLine]:
-    """Tell processor, cores and memory."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     yield DoctorLine("processor", "ok", f"{machine_name()}, {cores} usable core{'s' if cores != 1 else ''}")
     total, free = memory_bytes()

@@ -50,7 +50,6 @@ class Args(CaptureArguments):
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "eval", examples=_EXAMPLES)
     if args.json is not None:
         check_file(args.json)

@@ -58,7 +58,6 @@ class Args(CaptureArguments):
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "explain", examples=_EXAMPLES)
     at = None if args.pixel is None else parse_pixel(args.pixel)
     if at is None and (args.maps is None or args.html or args.json or args.diff):
@@ -112,7 +111,6 @@ def _explain(args: Args, at: tuple[int, int] | None) -> int:
 
 
 def parse_pixel(text: str) -> tuple[int, int]:
-    """Read "X,Y"."""
     try:
         x, y = (int(word) for word in text.split(","))
     except ValueError:
@@ -121,7 +119,6 @@ def parse_pixel(text: str) -> tuple[int, int]:
 
 
 def chosen_view(capture: Capture, which: str) -> View:
-    """Find a view by its place or by its name."""
     named = [view for view in capture.views if which in (view.name, Path(view.name).name, Path(view.name).stem)]
     if len(named) == 1:
         return named[0]

@@ -69,7 +69,6 @@ class Args(LimitOptions, CaptureArguments):
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "export", examples=_EXAMPLES)
     args.check()
     if args.layout == "inria":
@@ -118,7 +117,6 @@ class _Opened:
 
     @property
     def known(self) -> bool:
-        """Tell whether there is one to load."""
         return self._options.capture is not None or bool(self.config.data and Path(self.config.data).is_dir())
 
     def capture(self) -> tuple[Capture, TrainConfig]:
@@ -162,7 +160,6 @@ def file_format(out: Path, to: str | None) -> str:
 
 
 def say_written(out: Path, count: int, size: int) -> None:
-    """Print what was written: so many Gaussians and bytes."""
     print(f"{count:,} Gaussians, {size / 1e6:.2f} MB -> {out}")
 
 
@@ -187,7 +184,6 @@ def check_file(out: Path, source: Path, overwrite: bool) -> None:
 
 
 def _output(args: Args, out: Path, name: str, splat: Splat, opened: _Opened) -> Output:
-    """Return what is made of raw parameters in the splat's frame."""
     if name == HTML:
         from pop_fast.view.html import cameras_of, page_of
 

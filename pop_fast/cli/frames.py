@@ -34,7 +34,6 @@ class Args:
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "frames", examples=_EXAMPLES)
     from pop_fast.data.unpack import take_frames
     from pop_fast.io.heartbeat import bars

@@ -101,7 +101,6 @@ class Args:
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     action = parse(Args, argv, "learn", examples=_EXAMPLES).action
     if isinstance(action, Class):
         return _class(action)

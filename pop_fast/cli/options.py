@@ -81,7 +81,6 @@ class LimitOptions:
 
     @property
     def any(self) -> bool:
-        """Tell whether something may be left out."""
         limits = (self.min_opacity, self.crop, self.final_prune, self.max_gaussians, self.target_mb)
         return self.without_floaters or any(limit is not None for limit in limits)
 
@@ -142,7 +141,6 @@ class Output:
 
     @property
     def levels(self) -> int:
-        """See `pop_fast.train.compact.Coding`."""
         from pop_fast.io.formats import levels
 
         return levels(self._format)
@@ -312,7 +310,6 @@ def _means_of_capture(params: dict[str, Tensor], shown: Shown) -> Tensor:
 
 
 def _floaters(shown: Shown, params: Mapping[str, Tensor]) -> Tensor:
-    """Tell which Gaussians are floaters."""
     if shown.photographed is None:
         raise PopError("floaters are found from the places of the photographs; give --capture DIR")
     from pop_fast.view.report.checks import are_floaters
@@ -322,7 +319,6 @@ def _floaters(shown: Shown, params: Mapping[str, Tensor]) -> Tensor:
 
 
 def _scores(shown: Shown, params: Mapping[str, Tensor], score: Score) -> Tensor:
-    """Return the scores of all Gaussians."""
     from pop_fast.density import shrink
 
     if score == "visibility":

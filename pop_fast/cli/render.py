@@ -54,7 +54,6 @@ class Args(CaptureArguments):
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "render", examples=_EXAMPLES)
     if args.out is None and args.video is None:
         raise PopError("nothing to write; give --out DIR for pictures, --video FILE for a video, or both")
@@ -94,7 +93,6 @@ def _render(args: Args, video: VideoFile | None) -> int:
 
 
 def check_path(path: str) -> None:
-    """Check the path that was asked for before the long work begins."""
     from pop_fast.view.paths import PATHS
 
     if path in ("views", *PATHS):

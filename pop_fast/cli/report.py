@@ -27,7 +27,6 @@ class Args(CaptureArguments):
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "report")
     if args.check:
         _check(args)

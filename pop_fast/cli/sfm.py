@@ -41,7 +41,6 @@ class Args:
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "sfm", examples=_EXAMPLES)
     from pop_fast.data import run_sfm
     from pop_fast.data.sfm import photo_folder

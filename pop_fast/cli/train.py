@@ -134,7 +134,6 @@ class _Run(BlocksOptions, FinishOptions):
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     config, options, chooses = _asked(argv)
     folder = Path(config.result_dir)
     options.check()

@@ -56,7 +56,6 @@ _NAMED: Final = 8  # names that a line gives
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     action = parse(Args, argv, "vectors", examples=_EXAMPLES).action
     if isinstance(action, Check):
         return _check(action)

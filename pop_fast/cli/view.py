@@ -46,7 +46,6 @@ class Args(CaptureArguments):
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "view", examples=_EXAMPLES)
     from pop_fast.train.environment import reproducible
 
@@ -107,7 +106,6 @@ def stands_of_capture(capture: Capture, test_every: int, means: Any) -> list[Any
 
 
 def announce(viewer: LiveViewer) -> None:
-    """Print where the viewer is."""
     from pop_fast.view.live.server import LOOPBACK
 
     print(f"viewer: {viewer.url}", flush=True)
@@ -134,7 +132,6 @@ class LiveView:
         self._viewer: LiveViewer | None = None
 
     def start(self, run: TrainingRun) -> None:
-        """Start the server, and print where it is."""
         from pop_fast.view.live.draw import scene_of
         from pop_fast.view.live.server import LiveViewer
 

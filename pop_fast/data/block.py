@@ -34,7 +34,6 @@ _FIX: Final = "remove the folder with all blocks, and start 'pop train --blocks'
 
 
 def find_block(folder: Path) -> bool:
-    """Tell whether a folder is a block."""
     return (folder / _LIST).is_file()
 
 

@@ -204,7 +204,6 @@ class Model:
 
 @cache
 def model_names() -> dict[int, str]:
-    """List COLMAP's camera models by their number."""
     models = require_colmap().CameraModelId.__members__.items()
     return {int(model): name for name, model in models if int(model) >= 0}
 
@@ -219,7 +218,6 @@ def model_name(number: int) -> str | None:
 
 @cache
 def parameter_count(name: str) -> int:
-    """Tell how many parameters a camera model has."""
     if name in PINHOLES:
         return max(PINHOLES[name][1]) + 1
     models = require_colmap()
@@ -366,7 +364,6 @@ def count_images_text(path: Path) -> int:
 
 
 def read_text(folder: Path) -> Model:
-    """Read `cameras.txt`, `images.txt` and `points3D.txt`."""
     cameras = [_text_camera(line) for line in _records(folder / "cameras.txt", _CAMERA)]
     images = [_text_image(line) for line in _image_lines(folder / "images.txt")]
     points = [_text_point(line) for line in _records(folder / "points3D.txt", _TEXT_POINT)]

@@ -121,7 +121,6 @@ def _directions(count: int) -> np.ndarray:
 
 
 def _parts(transform: np.ndarray) -> tuple[float, np.ndarray]:
-    """Split a similarity into its scale and its rotation."""
     if transform.shape != (4, 4) or not np.all(np.isfinite(transform)):
         raise PopError(f"transform has shape {list(transform.shape)} or NaN; it must be a finite 4x4 similarity")
     determinant = float(np.linalg.det(transform[:3, :3]))

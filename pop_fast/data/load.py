@@ -16,14 +16,23 @@ from zipfile import is_zipfile
 import numpy as np
 
 from pop_fast.data.block import BLOCK, find_block, read_block
-from pop_fast.data.capture import Capture, Listing, PosedImage, Progress, SparsePoints, View, held_out
+from pop_fast.data.capture import (
+    Capture,
+    Listing,
+    PosedImage,
+    Progress,
+    SparsePoints,
+    View,
+    held_out,
+    normalizing_transform,
+    transform_points,
+    transform_viewmats,
+)
 from pop_fast.data.colmap import find_models, read_model
-from pop_fast.data.exports import EXPORTS, find_export, read_export
-from pop_fast.data.normalize import normalizing_transform, transform_points, transform_viewmats
+from pop_fast.data.exports import EXPORTS, find_export, find_transforms, read_export, read_transforms
 from pop_fast.data.read_images import PhotoOptions, read_views
 from pop_fast.data.sfm import photo_folder, photographs, run_sfm
 from pop_fast.data.sfm_files import SfmOptions, read_upright
-from pop_fast.data.transforms import find_transforms, read_transforms
 from pop_fast.errors import CaptureError
 from pop_fast.io.image_header import read_size
 from pop_fast.io.images import VIDEO_SUFFIXES, find_image, unreadable_photographs

@@ -15,15 +15,15 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import combinations
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 import cv2
 import numpy as np
 
-from pop_fast.data.capture import Capture
-from pop_fast.data.normalize import camera_centers
+from pop_fast.data.capture import Capture, camera_centers
 from pop_fast.errors import CaptureError
 from pop_fast.io.image_header import Exif, read_exif
 from pop_fast.io.images import read_image
@@ -45,6 +45,7 @@ class CaptureFinding:
     text: str
 
 
+ok, warn, bad = (partial(CaptureFinding, state) for state in get_args(State))
 # sharpness is compared at this size, at which two photographs of one scene look alike
 _SIDE: Final = 512
 # of a photograph's neighbours by name; sharpness is a variance, so a fifth of it is less than half the detail
@@ -97,7 +98,6 @@ class Shown:
 
 
 def measure_file(path: Path, name: str) -> Shown:
-    """Decode a photograph and measure it."""
     try:
         return measure(path, read_image(path), name)
     except CaptureError as error:
@@ -162,17 +162,16 @@ def about_quality(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
 
 
 def about_number(count: int) -> Iterator[CaptureFinding]:
-    """Tell that there are few photographs."""
     if count < FEW:
         fix = f"{FEW} to 200 that overlap by two thirds show a scene from all sides"
-        yield CaptureFinding("warn", "photographs", f"{count} {number(count, 'is', 'are')} few; {fix}")
+        yield warn("photographs", f"{count} {number(count, 'is', 'are')} few; {fix}")
 
 
 def _about_camera(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     kinds = Counter(one.exif.camera for one in shown if one.exif.camera)
     lenses = Counter(round(one.exif.focal, 1) for one in shown if one.exif.focal)
     if not kinds and not lenses:
-        yield CaptureFinding("ok", "EXIF", "no camera noted its lens or its exposure")
+        yield ok("EXIF", "no camera noted its lens or its exposure")
         return
     named = ", ".join(f"{count} x {kind}" for kind, count in kinds.most_common(3))
     focal = ", ".join(f"{mm:g} mm" for mm, _ in lenses.most_common(4))
@@ -180,15 +179,14 @@ def _about_camera(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     without = [one.name for one in shown if not one.exif.focal]
     if without:
         fix = "where photographs were edited, use the originals: cameras are found more surely from a known lens"
-        yield CaptureFinding(
-            "warn",
+        yield warn(
             "EXIF",
             f"{len(without)} {number(len(without), 'has', 'have')} no focal length, {some(without)}; {fix}",
         )
     if len(kinds) > 1 or len(lenses) > 1:
-        yield CaptureFinding("warn", "EXIF", f"{text}: several lenses or zooms; one fixed lens is placed more surely")
+        yield warn("EXIF", f"{text}: several lenses or zooms; one fixed lens is placed more surely")
     else:
-        yield CaptureFinding("ok", "EXIF", text)
+        yield ok("EXIF", text)
 
 
 def _about_blur(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
@@ -199,9 +197,9 @@ def _about_blur(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     if blurred:
         fix = "out of focus or shaken: leave them out"
         what = f"{len(blurred)} {number(len(blurred), 'is', 'are')} far less sharp than those around them"
-        yield CaptureFinding("warn", "blur", f"{what}, {some(blurred)}; {fix}")
+        yield warn("blur", f"{what}, {some(blurred)}; {fix}")
     else:
-        yield CaptureFinding("ok", "blur", "all about as sharp as those around them")
+        yield ok("blur", "all about as sharp as those around them")
 
 
 def _about_exposure(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
@@ -209,19 +207,18 @@ def _about_exposure(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     bright = [one.name for one in shown if one.bright > _CLIPPED]
     for names, what in ((dark, "black"), (bright, "white")):
         if names:
-            yield CaptureFinding(
-                "warn",
+            yield warn(
                 "exposure",
                 f"{len(names)} {number(len(names), 'is', 'are')} over a quarter pure {what}, {some(names)}",
             )
     stops = exposure_stops([one.exif for one in shown])
     fix = "lock the exposure, or train with --exposure: without it training takes one brightness for all"
     if stops is not None and stops > DRIFT_STOPS:
-        yield CaptureFinding("warn", "exposure", f"exposures differ by {stops:.1f} stops; {fix}")
+        yield warn("exposure", f"exposures differ by {stops:.1f} stops; {fix}")
     elif not dark and not bright:
         levels = [one.brightness for one in shown]
         known = "" if stops is None else f"within {stops:.1f} stops, "
-        yield CaptureFinding("ok", "exposure", f"{known}mean brightness {min(levels):.0f} to {max(levels):.0f} of 255")
+        yield ok("exposure", f"{known}mean brightness {min(levels):.0f} to {max(levels):.0f} of 255")
 
 
 def exposure_stops(noted: Sequence[Exif]) -> float | None:
@@ -234,9 +231,7 @@ def _about_copies(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     digests = Counter(one.digest for one in shown)
     copies = [one.name for one in shown if digests[one.digest] > 1]
     if copies:
-        yield CaptureFinding(
-            "warn", "duplicates", f"{len(copies)} are the same file more than once, {some(copies)}; keep one"
-        )
+        yield warn("duplicates", f"{len(copies)} are the same file more than once, {some(copies)}; keep one")
     thumbs = np.stack([one.thumb for one in shown])
     alike: list[str] = []
     for i in range(len(shown) - 1):
@@ -245,17 +240,15 @@ def _about_copies(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
         alike += [f"{shown[i].name} and {other.name}" for other in others if other.digest != shown[i].digest]
     if alike:
         fix = "they add nothing, from the same place"
-        yield CaptureFinding(
-            "warn",
+        yield warn(
             "duplicates",
             f"{len(alike)} {number(len(alike), 'pair looks', 'pairs look')} the same, {some(alike)}; {fix}",
         )
     if not copies and not alike:
-        yield CaptureFinding("ok", "duplicates", "none")
+        yield ok("duplicates", "none")
 
 
 def some(names: Sequence[str]) -> str:
-    """Name the first of some photographs."""
     return "first " + ", ".join(names[:3])
 
 
@@ -280,14 +273,14 @@ def about_use(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
         are = number(len(plain), "is of one colour all over", "are of one colour all over")
         text = f"{len(plain)} of {len(shown)} photographs {are} (black, white or covered), {some(plain)}"
         if left < 2:
-            yield CaptureFinding("bad", "photographs", f"no cameras could be found: {text}; {FIX}")
+            yield bad("photographs", f"no cameras could be found: {text}; {FIX}")
             return
-        yield CaptureFinding("warn", "photographs", f"{text}; leave {number(len(plain), 'it', 'them')} out")
+        yield warn("photographs", f"{text}; leave {number(len(plain), 'it', 'them')} out")
     useful = [one for one in shown if float(one.thumb.std()) >= _PLAIN]
     comparable = 2 <= len(useful) <= _COMPARED and all(len(one.features[0]) >= _ENOUGH for one in useful)
     if comparable and not any(_share_something(one, other) for one, other in combinations(useful, 2)):
         text = f"no two of the {len(useful)} photographs show the same thing"
-        yield CaptureFinding("bad", "photographs", f"no cameras could be found: {text}; {FIX}")
+        yield bad("photographs", f"no cameras could be found: {text}; {FIX}")
 
 
 def about_mixed_sizes(shown: Sequence[Shown]) -> CaptureFinding | None:
@@ -298,7 +291,7 @@ def about_mixed_sizes(shown: Sequence[Shown]) -> CaptureFinding | None:
     listed = ", ".join(f"{count} of {w}x{h} px" for (w, h), count in sizes.most_common(3))
     more = f" and {len(sizes) - 3} more" if len(sizes) > 3 else ""
     text = f"mixed cameras: the photographs have {len(sizes)} sizes ({listed}{more}), and each is taken as another lens"
-    return CaptureFinding("warn", "cameras", f"{text}; one camera, not zoomed or cropped, is placed more surely")
+    return warn("cameras", f"{text}; one camera, not zoomed or cropped, is placed more surely")
 
 
 def _share_something(one: Shown, other: Shown) -> bool:

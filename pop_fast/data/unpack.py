@@ -10,7 +10,6 @@ video decides and writes, so that no more than one frame is held.
 from __future__ import annotations
 
 import errno
-import os
 import shutil
 import zipfile
 import zlib
@@ -26,7 +25,7 @@ from pop_fast.data.capture import Progress
 from pop_fast.data.photo_quality import look_the_same, sharpness, thumbnail
 from pop_fast.errors import CaptureError, PopError
 from pop_fast.io.atomic import folder_atomically
-from pop_fast.io.images import SILENT, VIDEO_SUFFIXES, set_log_level
+from pop_fast.io.images import QUIET, VIDEO_SUFFIXES
 from pop_fast.io.read_back import PICTURE, check_members, check_memory
 
 _FIX = "unpack it yourself, and give the folder"
@@ -206,13 +205,8 @@ def _is_ours(file: Path, pattern: str) -> bool:
 def _open(path: Path) -> Any:
     if not path.is_file():
         raise CaptureError(f"{path}: no such file; give a video")
-    # ffmpeg's own words about a damaged file; what matters is raised as one line
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    level = set_log_level(SILENT)
-    try:
+    with QUIET:
         video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    finally:
-        set_log_level(level)
     if not video.isOpened():
         raise CaptureError(f"{path}: is no video that OpenCV can read; {_CONVERT}")
     width, height = (int(video.get(size)) for size in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))

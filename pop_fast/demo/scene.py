@@ -121,7 +121,6 @@ def _marble(noise: _Noise, p: np.ndarray, n: np.ndarray) -> np.ndarray:
 
 
 def _crate(noise: _Noise, size: float, p: np.ndarray, n: np.ndarray) -> np.ndarray:
-    """Boards with grain, framed by four battens on every side."""
     flat = np.abs(n[2]) > 0.5
     u = np.where(np.abs(n[0]) > 0.5, p[1], p[0]) / size + 0.5
     v = np.where(flat, p[1] / size + 0.5, p[2] / size)
@@ -136,7 +135,6 @@ def _crate(noise: _Noise, size: float, p: np.ndarray, n: np.ndarray) -> np.ndarr
 
 
 def _die(face: str, pip: str, size: float, p: np.ndarray, n: np.ndarray) -> np.ndarray:
-    """A die: one to six pips on its sides."""
     layouts = ([(0, 0)], [(-1, -1), (1, 1)], [(-1, -1), (0, 0), (1, 1)], [(-1, -1), (-1, 1), (1, -1), (1, 1)])
     five = [*layouts[3], (0, 0)]
     six = [*layouts[3], (-1, 0), (1, 0)]

@@ -341,7 +341,6 @@ class FolderLock:
 
     @property
     def held(self) -> bool:
-        """Tell whether this object holds the lock."""
         return self._handle is not None
 
     def take(self) -> None:

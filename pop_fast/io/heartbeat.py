@@ -49,7 +49,6 @@ class Heartbeat:
         self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
 
     def say(self, text: str) -> None:
-        """Set what the next line tells."""
         self._text = text
 
     def __enter__(self) -> Heartbeat:

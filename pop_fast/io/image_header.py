@@ -27,7 +27,6 @@ T = TypeVar("T")
 
 
 def can_read_heif() -> bool:
-    """Tell whether pillow-heif is installed."""
     return find_spec("pillow_heif") is not None
 
 

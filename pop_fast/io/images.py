@@ -194,34 +194,36 @@ def inline_png(image: np.ndarray, longest: int) -> str:
 
 
 # of OpenCV's log, as a number because OpenCV 4 has no name for it in Python
-SILENT: Final = 0
+_SILENT: Final = 0
 
 
-def set_log_level(level: int) -> int:
+def _set_log_level(level: int) -> int:
     """Set the level of OpenCV's own log, by the function's name in OpenCV 4 or in 5, and return the level before."""
     return (cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel)(level)  # type: ignore[attr-defined]
 
 
 class _Quiet:
-    """Keep OpenCV's own log off the terminal while any thread decodes: what matters of it is raised as one line."""
+    """Keep the log of OpenCV and ffmpeg off the terminal in any thread: what matters of it is raised as one line."""
 
     def __init__(self) -> None:
         self._lock, self._inside, self._level = threading.Lock(), 0, 0
 
     def __enter__(self) -> None:
+        # ffmpeg's own words about a damaged file
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
         with self._lock:
             if self._inside == 0:
-                self._level = set_log_level(SILENT)
+                self._level = _set_log_level(_SILENT)
             self._inside += 1
 
     def __exit__(self, *_: object) -> None:
         with self._lock:
             self._inside -= 1
             if self._inside == 0:
-                set_log_level(self._level)
+                _set_log_level(self._level)
 
 
-_QUIET = _Quiet()
+QUIET: Final = _Quiet()
 
 
 def _decode(path: Path) -> np.ndarray:
@@ -243,7 +245,7 @@ def _decode(path: Path) -> np.ndarray:
         raise CaptureError(f"{path}: is no image that states its size as PNG, JPEG, WebP, TIFF and BMP do; {FIX}")
     try:
         # IMREAD_UNCHANGED keeps alpha and 16 bit, and leaves the EXIF orientation alone
-        with _QUIET:
+        with QUIET:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None

@@ -75,7 +75,6 @@ def save_ply(
 
 
 def ply_bytes(params: dict[str, torch.Tensor], antialiased: bool = False, frame: Frame | None = None) -> bytes:
-    """Return what `save_ply` writes."""
     return _file(checked_params(params), antialiased, frame)
 
 

@@ -237,7 +237,7 @@ def choose_terms(capture: Capture, config: TrainConfig, stops: float | None) -> 
     """
     import numpy as np
 
-    from pop_fast.data.normalize import neighbour_degrees
+    from pop_fast.data.capture import neighbour_degrees
     from pop_fast.data.photo_quality import DRIFT_STOPS, UNEVEN, exposures_of
 
     trained = capture.train_views(config.test_every)

@@ -45,7 +45,6 @@ def document(title: str, style: str, body: str, script: str, framed: str = "") -
 
 
 def asset(folder: str, name: str) -> str:
-    """Return a text file of a folder of this one."""
     return files("pop_fast.view").joinpath(folder, name).read_text(encoding="utf-8")
 
 
@@ -68,12 +67,10 @@ def element(tag: str, body: str = "", title: str = "", **attributes: object) -> 
 
 
 def text(x: float, y: float, words: str, anchor: str = "start") -> str:
-    """Write a text element."""
     return element("text", escape(words), x=float(x), y=float(y), text_anchor=anchor)
 
 
 def path(d: str, kind: str, title: str = "", **attributes: object) -> str:
-    """Write a path element of one CSS class."""
     return element("path", "", title, kind=kind, d=d, **attributes)
 
 

@@ -23,10 +23,10 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from pop_fast.data.normalize import camera_centers, focus_point, look_at_one_point
+from pop_fast.data.capture import camera_centers, focus_point, look_at_one_point
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import file_atomically
-from pop_fast.io.images import SILENT, set_log_level
+from pop_fast.io.images import QUIET
 
 # an orbit keeps out of a gap between cameras that is as wide as this and so many times wider than any other
 _WIDE_GAP: Final = np.pi / 2.0
@@ -194,7 +194,7 @@ class VideoFile:
 
     def __enter__(self) -> VideoFile:
         self._part = self._steps.enter_context(file_atomically(self.path))
-        self._steps.enter_context(_quiet())
+        self._steps.enter_context(QUIET)
         self._steps.push(self._finish)
         return self
 
@@ -251,23 +251,12 @@ class VideoFile:
 @cache
 def has_h264() -> bool:
     """Tell whether this build of OpenCV can write H.264, by writing a frame."""
-    with tempfile.TemporaryDirectory(prefix="pop_video_") as folder, _quiet():
+    with tempfile.TemporaryDirectory(prefix="pop_video_") as folder, QUIET:
         code = cv2.VideoWriter.fourcc(*_CODECS[".mp4"])
         writer = cv2.VideoWriter(str(Path(folder, "probe.mp4")), code, 30.0, (64, 64))
         works = writer.isOpened()
         writer.release()
         return works
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep the log of OpenCV and ffmpeg off the terminal: what goes wrong is found by playing the file, and raised."""
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    level = set_log_level(SILENT)
-    try:
-        yield
-    finally:
-        set_log_level(level)
 
 
 @contextmanager

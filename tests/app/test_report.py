@@ -18,8 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pop_fast.data import load_capture
-from pop_fast.data.capture import View
-from pop_fast.data.normalize import neighbour_degrees
+from pop_fast.data.capture import View, neighbour_degrees
 from pop_fast.errors import PopError
 from pop_fast.io import pictures
 from pop_fast.io.pictures import colormap_table, depth_picture, depth_range

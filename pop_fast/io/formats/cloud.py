@@ -62,7 +62,6 @@ class Cloud:
 
     @property
     def degree(self) -> int:
-        """Highest colour degree."""
         return COEFFICIENTS.index(self.rest.shape[1])
 
     @property
@@ -110,7 +109,6 @@ class Cloud:
         return {name: torch.from_numpy(np.array(value, np.float32)) for name, value in arrays.items()}
 
     def take(self, rows: np.ndarray) -> Cloud:
-        """Return the Gaussians of these rows, in this order."""
         return replace(self, **{name: getattr(self, name)[rows] for name in _FIELDS})
 
     def turned(self, axis: str) -> Cloud:

@@ -216,7 +216,6 @@ def _from_attributes(content: Mapping[str, Any], body: bytes, attributes: Mappin
 
 
 def _part(content: Mapping[str, Any], body: bytes, index: int, path: Path) -> bytes:
-    """Return a buffer view of the binary chunk."""
     entry = content["bufferViews"][index]
     if entry.get("buffer", 0) != 0 or "uri" in content["buffers"][0]:
         raise PopError(f"{path}: bufferViews[{index}] lies outside of the file; pack it into one .glb")

@@ -12,7 +12,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import struct
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -25,6 +24,7 @@ from torch import Tensor
 
 from pop_fast.errors import PopError
 from pop_fast.io.formats.cloud import COEFFICIENTS, Cloud, drop_largest, logits_of_bytes, restore_largest, to_bytes
+from pop_fast.io.image_header import size_of
 from pop_fast.io.ply import KEY, Frame
 from pop_fast.io.read_back import check_members, check_memory
 
@@ -244,7 +244,6 @@ def decode_folder(path: Path) -> Cloud:
 
 
 def _unzipped(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
-    """Return an entry."""
     size = archive.getinfo(name).file_size
     if name == META and size > _LARGEST_META:
         raise PopError(f"{path}: {META} has {size} bytes; {_WRITE_AGAIN}")
@@ -252,7 +251,6 @@ def _unzipped(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
 
 
 def _file(folder: Path, name: str, path: Path) -> bytes:
-    """Return a file of the folder."""
     if Path(name).name != name:
         raise PopError(f"{path}: names the file {name!r}, which is not in its folder; put it there, and name it so")
     try:
@@ -331,7 +329,8 @@ def _rest(meta: Mapping[str, Any], pixels: Any, path: Path) -> np.ndarray:
 
 def _pixels(data: bytes, name: str, least: int, path: Path) -> np.ndarray:
     """Return an image's pixels in reading order, with four channels. uint8 [M, 4]"""
-    width, height = _size(data)
+    sound = len(data) >= 32 and data[:4] == b"RIFF" and (data[12:16] != b"VP8L" or data[20] == 0x2F)
+    width, height = (size_of(data) if sound else None) or (0, 0)
     if width * height < least:
         raise PopError(f"{path}: {name} is {width}x{height} pixels; {least} are needed: {_WRITE_AGAIN}")
     if width * height > 4 * least + 2**16:
@@ -343,20 +342,3 @@ def _pixels(data: bytes, name: str, least: int, path: Path) -> np.ndarray:
     # where all are opaque, there may be no fourth channel
     fourth = image[..., 3].reshape(-1, 1) if image.shape[2] == 4 else np.full((len(flat), 1), 255, np.uint8)
     return np.concatenate([flat, fourth], axis=1)
-
-
-def _size(data: bytes) -> tuple[int, int]:
-    """Return the width and the height that a WebP file states, 0 where it is none."""
-    if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(data) < 32:
-        return 0, 0
-    kind = data[12:16]
-    if kind == b"VP8L" and data[20] == 0x2F:
-        bits = struct.unpack("<I", data[21:25])[0]
-        return (bits & 0x3FFF) + 1, ((bits >> 14) & 0x3FFF) + 1
-    if kind == b"VP8X":
-        width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
-        return width, height
-    if kind == b"VP8 ":
-        width, height = struct.unpack("<HH", data[26:30])
-        return width & 0x3FFF, height & 0x3FFF
-    return 0, 0

@@ -93,7 +93,6 @@ def light_bar(e: PixelExplanation) -> str:
 
 
 def css_color(color: Sequence[float]) -> str:
-    """Write a colour as #rrggbb, clamped."""
     return "#" + "".join(f"{round(255 * min(max(c, 0.0), 1.0)):02x}" for c in color)
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -18,7 +17,7 @@ from pop_fast.data.capture import View
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.images import write_png
-from pop_fast.io.pictures import error_magnitude, error_scale, id_colors
+from pop_fast.io.pictures import colormap_table, error_magnitude, error_scale, id_colors
 from pop_fast.stages.covariance import opacities_from_logits, scales_from_log_scales
 from pop_fast.stages.losses import photometric
 from pop_fast.stages.polarization import importance_mask, pop_loss_vjp
@@ -64,7 +63,6 @@ class ExplainedView:
 
     @property
     def background(self) -> Tensor:
-        """Colour behind everything. float64 [3]"""
         return torch.tensor(self.config.background, dtype=torch.float64)
 
     @property
@@ -209,7 +207,6 @@ class Map:
 
 
 def view_maps(scene: ExplainedView) -> list[Map]:
-    """Draw all maps of a view."""
     info = scene.info
     render, photo = as_uint8(scene.image.numpy()), scene.view.image
     error = error_magnitude(render, photo)
@@ -267,9 +264,7 @@ def write_maps(maps: list[Map], folder: Path) -> None:
 
 def scaled(name: str, title: str, about: str, values: np.ndarray, colors: str, top: float, low: float = 0.0) -> Map:
     """Colour numbers [H, W] by one of matplotlib's scales; NaN is grey."""
-    from matplotlib import colormaps
-
-    table = np.round(colormaps[colors](np.linspace(0.0, 1.0, 256))[:, :3] * 255.0).astype(np.uint8)
+    table = colormap_table(colors)
     known = np.isfinite(values)
     level = (np.where(known, values, low) - low) / max(top - low, 1e-12)
     picture = table[np.clip(np.round(level * 255.0), 0, 255).astype(np.uint8)]
@@ -347,8 +342,3 @@ def crop(picture: np.ndarray, x: int, y: int, side: int) -> tuple[np.ndarray, in
     left = min(max(x - side // 2, 0), max(width - side, 0))
     top = min(max(y - side // 2, 0), max(height - side, 0))
     return np.ascontiguousarray(picture[top : top + side, left : left + side]), left, top
-
-
-def enlarged(picture: np.ndarray, factor: int) -> np.ndarray:
-    """Enlarge a picture pixel by pixel."""
-    return cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)

@@ -17,8 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pop_fast.data.capture import View
-from pop_fast.data.normalize import focus_point, look_at_one_point
+from pop_fast.data.capture import View, focus_point, look_at_one_point
 from pop_fast.io.formats import encoded
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.views import evenly

@@ -65,7 +65,6 @@ class SplatScene:
         self._chosen: tuple[tuple[float, Box | None], Tensor | None, dict[str, Tensor]] | None = None
 
     def draw(self, state: ViewState) -> Drawing:
-        """Draw a state."""
         rows, params = self._selection(state.min_opacity, state.crop)
         n, whole = len(params["means"]), len(self.params["means"])
         shown = f"{n:,} Gaussians" if n == whole else f"{n:,} of {whole:,} Gaussians"
@@ -232,7 +231,6 @@ class RecordedPath:
     cameras: tuple[KeyCamera, ...]
 
     def text(self) -> str:
-        """Return what the file holds."""
         entries = [{"viewmat": c.viewmat.tolist(), "fov_y_degrees": float(np.degrees(c.fov_y))} for c in self.cameras]
         return json.dumps({"kind": _KIND, "frame": "capture", "cameras": entries}, indent=2) + "\n"
 

@@ -89,7 +89,6 @@ class Panel:
 
     @property
     def mode(self) -> Mode:
-        """What is to be drawn."""
         return self._mode.value
 
     @property
@@ -111,11 +110,9 @@ class Panel:
         return (x0, y0, z0, x1, y1, z1)
 
     def say(self, text: str) -> None:
-        """Show a line above the controls."""
         self._status.content = text
 
     def take_screenshot(self) -> bool:
-        """Tell whether a screenshot was asked for since this was last called."""
         wanted, self._wanted = self._wanted, False
         return wanted
 
@@ -127,13 +124,11 @@ class Panel:
         self._send(f"{self._title}_{self._taken:03d}.png", data.tobytes())
 
     def record(self) -> None:
-        """Add the camera that is shown to the path."""
         if self.now is not None and len(self._path) < _LONGEST_PATH:
             self._path.append(KeyCamera(self.now.viewmat, self.now.fov_y))
         self._count()
 
     def save_path(self) -> None:
-        """Hand the path to the browser."""
         if self._path:
             self._send(f"{self._title}_path.json", path_of(self._path, self._world_transform).text().encode())
 

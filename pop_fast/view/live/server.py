@@ -53,7 +53,6 @@ class Pace:
         self._seconds_per_pixel: float | None = None
 
     def moved(self, now: float) -> None:
-        """Note that the camera moved."""
         self._moved_at, self._stale = now, True
 
     def changed(self) -> None:
@@ -188,7 +187,6 @@ class LiveViewer:
 
     @property
     def watched(self) -> bool:
-        """Whether a browser is connected."""
         return bool(self._views)
 
     def show(self, scene: SplatScene, note: str = "") -> None:
@@ -217,7 +215,6 @@ class LiveViewer:
         return drawn
 
     def close(self) -> None:
-        """End the server."""
         with redirect_stdout(io.StringIO()):
             self._server.stop()
 

@@ -16,8 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pop_fast.data.capture import Capture, View
-from pop_fast.data.normalize import neighbour_degrees
+from pop_fast.data.capture import Capture, View, neighbour_degrees
 from pop_fast.data.photo_quality import GAMMA
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically

@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from pop_fast.data.normalize import FAR_APART
+from pop_fast.data.capture import FAR_APART
 from pop_fast.data.photo_quality import FEW
 from pop_fast.train.automatic import LOOKS
 from pop_fast.view.document import Window

@@ -43,7 +43,6 @@ _CHARTS: Final = (
 
 
 def page(data: ReportData) -> str:
-    """Lay out the whole page."""
     body = "".join(
         [
             f"<header><h1>{escape(data.title)}</h1><p>{escape(data.subtitle)}</p></header>",
@@ -191,7 +190,6 @@ _UNCHECKED: Final = (
 
 
 def verdict_section(findings: Sequence[Finding], checked: bool) -> str:
-    """Say how the run went."""
     if not findings and checked:
         return ""
     rows = "".join(
@@ -207,7 +205,6 @@ def _to_type(finding: Finding) -> str:
 
 
 def orbit_section(orbit: tuple[str, bytes] | None) -> str:
-    """Show the orbit."""
     if orbit is None:
         return ""
     path, data = orbit
@@ -223,7 +220,6 @@ def orbit_section(orbit: tuple[str, bytes] | None) -> str:
 
 
 def open_section(links: Sequence[tuple[str, str, int]]) -> str:
-    """Link the files beside the report."""
     if not links:
         return ""
     rows = "".join(
@@ -234,7 +230,6 @@ def open_section(links: Sequence[tuple[str, str, int]]) -> str:
 
 
 def command_section(commands: Sequence[tuple[str, str]]) -> str:
-    """Give what was typed."""
     if not commands:
         return ""
     lines = "".join(
@@ -258,7 +253,6 @@ _LARGEST: Final = 16 * 2**20
 
 
 def viewer_script() -> str:
-    """Return the script of the page that shows the splat."""
     return asset("html", "viewer.js")
 
 

@@ -212,7 +212,6 @@ def read_view(path: Path) -> dict[str, np.ndarray]:
 
 
 def headline(stats: Mapping[str, Any]) -> list[Tile]:
-    """Choose the numbers at the top of the page."""
     tiles: list[Tile] = []
     for key, label, form, unit in (("psnr", "PSNR", "{:.2f}", "dB"), ("ssim", "SSIM", "{:.4f}", "")):
         if stats.get(key) is not None:
@@ -430,7 +429,6 @@ def _steps(taken: int, planned: Any) -> str:
 
 
 def threads_of(stats: Mapping[str, Any]) -> str:
-    """Write how many threads a run had."""
     return f"{stats['threads']} thread{'' if stats['threads'] == 1 else 's'}"
 
 
