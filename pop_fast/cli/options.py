@@ -102,41 +102,27 @@ class LimitOptions:
 
 @dataclass(frozen=True)
 class Shown:
-    """A splat in its training frame with what it can be scored by.
+    """A splat in its training frame with what it can be scored by."""
 
-    Attributes:
-        params: raw parameters.
-        sh_degree: highest active colour band.
-        config: how it is drawn.
-        world_transform: the training frame from the capture's; None where they are the same.
-        photographed: opens its capture, and gives the settings to look at it with; None where none is known.
-        checkpoint: that it was read from, if any.
-    """
-
-    params: dict[str, Tensor]
-    sh_degree: int
-    config: TrainConfig
-    world_transform: np.ndarray | None
+    params: dict[str, Tensor]  # raw parameters
+    sh_degree: int  # highest active colour band
+    config: TrainConfig  # how it is drawn
+    world_transform: np.ndarray | None  # the training frame from the capture's; None where they are the same
+    # opens its capture, and gives the settings to look at it with; None where none is known
     photographed: Callable[[], tuple[Capture, TrainConfig]] | None
-    checkpoint: Path | None = None
+    checkpoint: Path | None = None  # that it was read from, if any
 
 
 @dataclass(frozen=True)
 class Output:
-    """The file that a splat becomes.
+    """The file that a splat becomes."""
 
-    Attributes:
-        name: of its format, or "html".
-        antialiased: to be drawn with antialiasing.
-        frame: the world that the file is in, where it is known.
-        transform: what `to_capture_frame` moves the splat into that by; None where nothing moves. [4, 4]
-        page: makes a page of raw parameters, at a level of coarseness.
-    """
-
-    name: str
-    antialiased: bool = False
-    frame: Frame | None = None
+    name: str  # of its format, or "html"
+    antialiased: bool = False  # to be drawn with antialiasing
+    frame: Frame | None = None  # the world that the file is in, where it is known
+    # what `to_capture_frame` moves the splat into that by; None where nothing moves. [4, 4]
     transform: np.ndarray | None = None
+    # makes a page of raw parameters, at a level of coarseness
     page: Callable[[Mapping[str, Tensor], int], bytes] | None = None
 
     @property

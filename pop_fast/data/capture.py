@@ -173,31 +173,20 @@ def held_out(splits: Sequence[Split | None], test_every: int) -> list[bool]:
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """One listed photograph.
+    """One listed photograph."""
 
-    Attributes:
-        name: as listed; unique, and what views are sorted by.
-        folder: the image folder, relative to the capture; "" for the capture itself.
-        file: relative name in that folder; the extension may differ from the file's.
-        camera: a `PinholeCamera` or `pycolmap.Camera`, or None where only the field of view is known.
-        viewmat: world -> camera, rigid. float64 [4, 4]
-        angle_x: horizontal field of view in radians, where `camera` is None.
-        mask: the mask file that the list names, if any.
-        split: the list's own assignment, if any.
-        turns: quarter turns clockwise that make the photograph upright; `camera` and `viewmat` are those of its pixels
-            as they are stored.
-        seen: rows of the sparse points that it sees; None where that is not known. int32 [M]
-    """
-
-    name: str
-    folder: str
-    file: str
-    camera: Any
-    viewmat: np.ndarray
-    angle_x: float | None = None
-    mask: Path | None = None
-    split: Split | None = None
+    name: str  # as listed; unique, and what views are sorted by
+    folder: str  # the image folder, relative to the capture; "" for the capture itself
+    file: str  # relative name in that folder; the extension may differ from the file's
+    camera: Any  # a `PinholeCamera` or `pycolmap.Camera`, or None where only the field of view is known
+    viewmat: np.ndarray  # world -> camera, rigid. float64 [4, 4]
+    angle_x: float | None = None  # horizontal field of view in radians, where `camera` is None
+    mask: Path | None = None  # the mask file that the list names, if any
+    split: Split | None = None  # the list's own assignment, if any
+    # quarter turns clockwise that make the photograph upright; `camera` and `viewmat` are those of its pixels
+    # as they are stored
     turns: int = 0
+    # rows of the sparse points that it sees; None where that is not known. int32 [M]
     seen: np.ndarray | None = None
 
 
@@ -214,27 +203,17 @@ class SparsePoints:
 
 @dataclass(frozen=True, eq=False)
 class Listing:
-    """What a capture lists, its photographs not read.
+    """What a capture lists, its photographs not read."""
 
-    Attributes:
-        root: the folder that the photographs' folders are in.
-        path: the file or model that lists them, for messages.
-        shots: where each was taken.
-        cloud: sparse points; None where there are none.
-        made_from: what kind of list it is.
-        notes: one line each.
-        transform: the training frame, where that is decided already; None normalizes. float64 [4, 4]
-        sfm_seconds: how long the cameras were searched for, where that was done now.
-    """
-
-    root: Path
-    path: Path
-    shots: list[PosedImage]
-    cloud: SparsePoints | None
-    made_from: str
-    notes: list[str] = field(default_factory=list)
+    root: Path  # the folder that the photographs' folders are in
+    path: Path  # the file or model that lists them, for messages
+    shots: list[PosedImage]  # where each was taken
+    cloud: SparsePoints | None  # sparse points; None where there are none
+    made_from: str  # what kind of list it is
+    notes: list[str] = field(default_factory=list)  # one line each
+    # the training frame, where that is decided already; None normalizes. float64 [4, 4]
     transform: np.ndarray | None = None
-    sfm_seconds: float | None = None
+    sfm_seconds: float | None = None  # how long the cameras were searched for, where that was done now
 
 
 # of a point from the middle of all, times the median camera distance

@@ -164,41 +164,26 @@ def _cloud(path: Path, model: Model) -> SparsePoints:
 
 @dataclass(frozen=True, eq=False)
 class ImageRecord:
-    """One image with a pose.
+    """One image with a pose."""
 
-    Attributes:
-        where: the record in its file, for messages.
-        quat: rotation world -> camera, wxyz, as stored. float64 [4]
-        translation: world -> camera. float64 [3]
-        image_id: by which tracks name it.
-    """
-
-    where: str
-    quat: np.ndarray
-    translation: np.ndarray
+    where: str  # the record in its file, for messages
+    quat: np.ndarray  # rotation world -> camera, wxyz, as stored. float64 [4]
+    translation: np.ndarray  # world -> camera. float64 [3]
     camera_id: int
     name: str
-    image_id: int
+    image_id: int  # by which tracks name it
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Cameras, images and points of a model.
+    """Cameras, images and points of a model."""
 
-    Attributes:
-        cameras: as `pop_fast.data.cameras.make_camera` makes them, by id.
-        images: in the order of the file.
-        point_ids: uint64 [P]
-        xyz: float64 [P, 3]
-        rgb: uint8 [P, 3]
-        tracks: ids of the images that see each point, which need not all be in `images`; empty where it has no track.
-    """
-
-    cameras: dict[int, Any]
-    images: list[ImageRecord]
-    point_ids: np.ndarray
-    xyz: np.ndarray
-    rgb: np.ndarray
+    cameras: dict[int, Any]  # as `pop_fast.data.cameras.make_camera` makes them, by id
+    images: list[ImageRecord]  # in the order of the file
+    point_ids: np.ndarray  # uint64 [P]
+    xyz: np.ndarray  # float64 [P, 3]
+    rgb: np.ndarray  # uint8 [P, 3]
+    # ids of the images that see each point, which need not all be in `images`; empty where it has no track
     tracks: list[np.ndarray]
 
 

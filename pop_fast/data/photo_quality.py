@@ -343,15 +343,10 @@ def levels_at(image: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Exposures:
-    """How much brighter each photograph is than the median one.
+    """How much brighter each photograph is than the median one."""
 
-    Attributes:
-        stops: NaN where a photograph shares fewer than 20 points with others. float64 [V]
-        errors: standard errors of these, by how far the points scatter. float64 [V]
-    """
-
-    stops: np.ndarray
-    errors: np.ndarray
+    stops: np.ndarray  # NaN where a photograph shares fewer than 20 points with others. float64 [V]
+    errors: np.ndarray  # standard errors of these, by how far the points scatter. float64 [V]
 
     @property
     def drift(self) -> float | None:

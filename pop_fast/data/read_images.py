@@ -35,11 +35,7 @@ from pop_fast.io.images import find_image, in_threads, read_image, read_mask, so
 
 @dataclass(frozen=True)
 class PhotoOptions:
-    """How photographs are read; see `pop_fast.data.load_capture`.
-
-    Attributes:
-        part: the list is a part of what its folder holds, so that masks may be there and none of them be its own.
-    """
+    """How photographs are read; see `pop_fast.data.load_capture`."""
 
     factor: int = 1
     masks: bool = True
@@ -47,6 +43,7 @@ class PhotoOptions:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     images: str | None = None
     resize: Literal["area", "bicubic"] = "area"
+    # the list is a part of what its folder holds, so that masks may be there and none of them be its own
     part: bool = False
 
 
@@ -330,14 +327,10 @@ _SLACK = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Undistortion:
-    """A resampling of photographs of one camera at one size.
+    """A resampling of photographs of one camera at one size."""
 
-    Attributes:
-        K: intrinsics of the pinhole camera, px. float64 [3, 3]
-        maps: where to sample the photograph, px with centres at integers; None for the identity. 2 x float32 [H, W]
-    """
-
-    K: np.ndarray
+    K: np.ndarray  # intrinsics of the pinhole camera, px. float64 [3, 3]
+    # where to sample the photograph, px with centres at integers; None for the identity. 2 x float32 [H, W]
     maps: tuple[np.ndarray, np.ndarray] | None
 
     def image(self, image: np.ndarray) -> np.ndarray:

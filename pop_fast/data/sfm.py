@@ -228,19 +228,12 @@ _LONGEST: Final = 300
 
 @dataclass(frozen=True)
 class Search:
-    """What to search.
+    """What to search."""
 
-    Attributes:
-        photos: the folder that messages name.
-        work: a folder of the search's own, with the photographs in `images`; the model is written to `best`.
-        names: of the photographs.
-        options: with `single_camera` decided.
-    """
-
-    photos: str
-    work: str
-    names: list[str]
-    options: SfmOptions
+    photos: str  # the folder that messages name
+    work: str  # a folder of the search's own, with the photographs in `images`; the model is written to `best`
+    names: list[str]  # of the photographs
+    options: SfmOptions  # with `single_camera` decided
 
     @property
     def database(self) -> Path:

@@ -127,19 +127,12 @@ _JPEG_QUALITY: Final = 97
 
 @dataclass(frozen=True)
 class Taken:
-    """What was taken out of a video.
+    """What was taken out of a video."""
 
-    Attributes:
-        folder: holds the photographs.
-        frames: their numbers in the video, from 0.
-        of: frames that the video has.
-        alike: stretches without a photograph, because nothing had moved.
-    """
-
-    folder: Path
-    frames: tuple[int, ...]
-    of: int
-    alike: int
+    folder: Path  # holds the photographs
+    frames: tuple[int, ...]  # their numbers in the video, from 0
+    of: int  # frames that the video has
+    alike: int  # stretches without a photograph, because nothing had moved
 
 
 @dataclass

@@ -21,17 +21,11 @@ _TERRACE = 2.7
 
 @dataclass(frozen=True, eq=False)
 class DemoScene:
-    """Objects on a ground at z = 0, and the light.
+    """Objects on a ground at z = 0, and the light."""
 
-    Attributes:
-        shapes: what stands on the ground.
-        ground: albedo of the ground; normals are passed but not looked at.
-        sun: unit vector towards the middle of the sun. float32 [3]
-    """
-
-    shapes: tuple[Shape, ...]
-    ground: Paint
-    sun: np.ndarray
+    shapes: tuple[Shape, ...]  # what stands on the ground
+    ground: Paint  # albedo of the ground; normals are passed but not looked at
+    sun: np.ndarray  # unit vector towards the middle of the sun. float32 [3]
 
 
 class _Noise:
@@ -249,23 +243,14 @@ def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A solid with a surface.
+    """A solid with a surface."""
 
-    Attributes:
-        center: of the shape's own frame in the world. [3]
-        paint: albedo.
-        yaw: rotation about z, radians.
-        specular: strength of the highlight of the sun.
-        gloss: its exponent.
-        mirror: reflectance of the sky at normal incidence.
-    """
-
-    center: tuple[float, float, float]
-    paint: Paint
-    yaw: float = 0.0
-    specular: float = 0.1
-    gloss: float = 20.0
-    mirror: float = 0.0
+    center: tuple[float, float, float]  # of the shape's own frame in the world. [3]
+    paint: Paint  # albedo
+    yaw: float = 0.0  # rotation about z, radians
+    specular: float = 0.1  # strength of the highlight of the sun
+    gloss: float = 20.0  # its exponent
+    mirror: float = 0.0  # reflectance of the sky at normal incidence
     bound: float = field(init=False, default=0.0)
 
     def to_local(self, vectors: np.ndarray, is_point: bool) -> np.ndarray:

@@ -87,24 +87,16 @@ _HEAD: Final = 2**20
 
 @dataclass(frozen=True)
 class Exif:
-    """What a camera wrote into a photograph; None where it did not.
+    """What a camera wrote into a photograph; None where it did not."""
 
-    Attributes:
-        orientation: 1 as stored, 3 half a turn, 6 a quarter turn clockwise to be upright, 8 counterclockwise; 2, 4, 5
-            and 7 are mirrored.
-        camera: make and model.
-        exposure: seconds.
-        iso: sensitivity.
-        focal: focal length, mm.
-        focal_35mm: focal length of the same view on 35 mm film, mm.
-    """
-
+    # 1 as stored, 3 half a turn, 6 a quarter turn clockwise to be upright, 8 counterclockwise; 2, 4, 5 and 7
+    # are mirrored
     orientation: int = 1
-    camera: str | None = None
-    exposure: float | None = None
-    iso: float | None = None
-    focal: float | None = None
-    focal_35mm: float | None = None
+    camera: str | None = None  # make and model
+    exposure: float | None = None  # seconds
+    iso: float | None = None  # sensitivity
+    focal: float | None = None  # focal length, mm
+    focal_35mm: float | None = None  # focal length of the same view on 35 mm film, mm
 
 
 def read_size(path: Path) -> tuple[int, int] | None:

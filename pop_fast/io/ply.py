@@ -228,19 +228,12 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """What a PLY file says of itself.
+    """What a PLY file says of itself."""
 
-    Attributes:
-        order: "<" or ">" of a binary file, "" of an ASCII one.
-        elements: in the order of their rows.
-        comments: without the word "comment".
-        length: bytes up to the first row.
-    """
-
-    order: str
-    elements: tuple[Element, ...]
-    comments: tuple[str, ...]
-    length: int
+    order: str  # "<" or ">" of a binary file, "" of an ASCII one
+    elements: tuple[Element, ...]  # in the order of their rows
+    comments: tuple[str, ...]  # without the word "comment"
+    length: int  # bytes up to the first row
 
 
 def read_header(path: Path) -> Header:
@@ -443,14 +436,11 @@ KEY: Final = "pop_frame"
 
 @dataclass(frozen=True)
 class Frame:
-    """The world that a splat is in.
+    """The world that a splat is in."""
 
-    Attributes:
-        name: "capture" is the capture's own, "training" the one that `pop train` moves it into.
-        transform: similarity, training frame = transform @ capture's own frame; None where it is not known. [4, 4]
-    """
-
+    # "capture" is the capture's own, "training" the one that `pop train` moves it into
     name: Literal["capture", "training"]
+    # similarity, training frame = transform @ capture's own frame; None where it is not known. [4, 4]
     transform: tuple[tuple[float, ...], ...] | None = None
 
     @classmethod

@@ -117,25 +117,16 @@ class Window:
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart to draw.
-
-    Attributes:
-        x_stop: the last iteration of the axis.
-        windows: shaded stretches.
-        marks: iterations with a dashed line (opacity resets).
-        log: a logarithmic y axis.
-        zero: let the y axis start at zero.
-        unit: written after values under the pointer.
-    """
+    """A chart to draw."""
 
     title: str
     series: Sequence[Series]
-    x_stop: float
-    windows: Sequence[Window] = field(default_factory=tuple)
-    marks: Sequence[float] = field(default_factory=tuple)
-    log: bool = False
-    zero: bool = False
-    unit: str = ""
+    x_stop: float  # the last iteration of the axis
+    windows: Sequence[Window] = field(default_factory=tuple)  # shaded stretches
+    marks: Sequence[float] = field(default_factory=tuple)  # iterations with a dashed line (opacity resets)
+    log: bool = False  # a logarithmic y axis
+    zero: bool = False  # let the y axis start at zero
+    unit: str = ""  # written after values under the pointer
 
 
 def nice_ticks(low: float, high: float, n: int = 5) -> list[float]:

@@ -35,27 +35,16 @@ _FIELDS: Final = ("means", "log_scales", "quats", "logits", "sh0", "rest")
 
 @dataclass(frozen=True)
 class Cloud:
-    """Gaussians with raw parameters, float32.
+    """Gaussians with raw parameters, float32."""
 
-    Attributes:
-        means: centres, world units. [N, 3]
-        log_scales: [N, 3]
-        quats: wxyz, of norm 1. [N, 4]
-        logits: of the opacities. [N]
-        sh0: colour of degree 0. [N, 3]
-        rest: colours of the higher degrees. [N, 0|3|8|15, 3]
-        antialiased: to be drawn with antialiasing.
-        frame: the world that they are in, where it is known.
-    """
-
-    means: np.ndarray
-    log_scales: np.ndarray
-    quats: np.ndarray
-    logits: np.ndarray
-    sh0: np.ndarray
-    rest: np.ndarray
-    antialiased: bool = False
-    frame: Frame | None = None
+    means: np.ndarray  # centres, world units. [N, 3]
+    log_scales: np.ndarray  # [N, 3]
+    quats: np.ndarray  # wxyz, of norm 1. [N, 4]
+    logits: np.ndarray  # of the opacities. [N]
+    sh0: np.ndarray  # colour of degree 0. [N, 3]
+    rest: np.ndarray  # colours of the higher degrees. [N, 0|3|8|15, 3]
+    antialiased: bool = False  # to be drawn with antialiasing
+    frame: Frame | None = None  # the world that they are in, where it is known
 
     def __len__(self) -> int:
         return len(self.means)

@@ -90,35 +90,20 @@ _WRITE_AGAIN: Final = "copy or write the file again"
 
 @dataclass(frozen=True)
 class _Section:
-    """A section's header, its place, and the file's level.
+    """A section's header, its place, and the file's level."""
 
-    Attributes:
-        used: rows that hold a Gaussian.
-        rows: that there is room for.
-        capacity: Gaussians of a full bucket.
-        buckets: their number.
-        extent: of a bucket, world units.
-        bucket_bytes: of a bucket's centre; 0 where there are none.
-        steps: of a centre, from the bucket's to its border; 0 stands for the level's own.
-        full: buckets with `capacity` Gaussians.
-        partial: buckets with fewer.
-        degree: of the colours.
-        at: where the section begins.
-        level: of the file.
-    """
-
-    used: int
-    rows: int
-    capacity: int
-    buckets: int
-    extent: float
-    bucket_bytes: int
-    steps: int
-    full: int
-    partial: int
-    degree: int
-    at: int
-    level: int
+    used: int  # rows that hold a Gaussian
+    rows: int  # that there is room for
+    capacity: int  # Gaussians of a full bucket
+    buckets: int  # their number
+    extent: float  # of a bucket, world units
+    bucket_bytes: int  # of a bucket's centre; 0 where there are none
+    steps: int  # of a centre, from the bucket's to its border; 0 stands for the level's own
+    full: int  # buckets with `capacity` Gaussians
+    partial: int  # buckets with fewer
+    degree: int  # of the colours
+    at: int  # where the section begins
+    level: int  # of the file
 
     @property
     def row(self) -> np.dtype:

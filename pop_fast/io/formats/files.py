@@ -19,17 +19,11 @@ from pop_fast.io.ply import Frame, asks_for_antialiasing, header_of, params_of_p
 
 
 class Stored(NamedTuple):
-    """What a file holds.
+    """What a file holds."""
 
-    Attributes:
-        params: raw parameters, as `pop_fast.io.ply.load_ply` returns them.
-        antialiased: to be drawn with antialiasing.
-        frame: the world that they are in, where the file says it.
-    """
-
-    params: dict[str, Tensor]
-    antialiased: bool
-    frame: Frame | None
+    params: dict[str, Tensor]  # raw parameters, as `pop_fast.io.ply.load_ply` returns them
+    antialiased: bool  # to be drawn with antialiasing
+    frame: Frame | None  # the world that they are in, where the file says it
 
 
 def splat_suffixes() -> tuple[str, ...]:

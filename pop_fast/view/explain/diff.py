@@ -25,20 +25,14 @@ from pop_ref.records import Splats
 
 @dataclass(frozen=True)
 class Flip:
-    """One decision, D1 to D8, that two renderers take differently at a Gaussian.
-
-    Attributes:
-        first: what the one does, with operand and threshold.
-        second: what the other does.
-        more: how many entries behind it also meet another fate, most of them in consequence.
-    """
+    """One decision, D1 to D8, that two renderers take differently at a Gaussian."""
 
     decision: str
     gaussian: int
     depth: float
-    first: str
-    second: str
-    more: int = 0
+    first: str  # what the one does, with operand and threshold
+    second: str  # what the other does
+    more: int = 0  # how many entries behind it also meet another fate, most of them in consequence
 
 
 def first_flip(ids: np.ndarray, walks: tuple[Walk, Walk], profiles: tuple[Profile, Profile]) -> Flip | None:
@@ -158,30 +152,20 @@ class Side:
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """What `difference` found.
-
-    Attributes:
-        lines: the result in words.
-        region: left, top, width and height of what was compared, px.
-        n_colors: pixels whose colours 8 bits can tell apart.
-        n_dominant: pixels with another dominant Gaussian.
-        n_blended: pixels that blend another number of Gaussians.
-        largest: the largest difference of a channel.
-        at: the pixel `flip` is about: the one asked for, or the worst where that one does not differ.
-        flip: the first decision there that falls otherwise; None where values differ and no decision does.
-        maps: pictures of the region.
-    """
+    """What `difference` found."""
 
     names: tuple[str, str]
-    lines: tuple[str, ...]
-    region: tuple[int, int, int, int]
-    n_colors: int
-    n_dominant: int
-    n_blended: int
-    largest: float
+    lines: tuple[str, ...]  # the result in words
+    region: tuple[int, int, int, int]  # left, top, width and height of what was compared, px
+    n_colors: int  # pixels whose colours 8 bits can tell apart
+    n_dominant: int  # pixels with another dominant Gaussian
+    n_blended: int  # pixels that blend another number of Gaussians
+    largest: float  # the largest difference of a channel
+    # the pixel `flip` is about: the one asked for, or the worst where that one does not differ
     at: tuple[int, int]
+    # the first decision there that falls otherwise; None where values differ and no decision does
     flip: Flip | None
-    maps: tuple[Map, ...]
+    maps: tuple[Map, ...]  # pictures of the region
 
     def plain(self) -> dict[str, Any]:
         """Give everything but the pictures, for JSON."""

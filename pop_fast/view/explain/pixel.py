@@ -294,60 +294,36 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """One entry of the list that the pixel walks.
+    """One entry of the list that the pixel walks."""
 
-    Attributes:
-        rank: place in the list, from 0 at the front.
-        id: the Gaussian.
-        status: "blended", "skipped" (too faint here, the walk continues), "stopped" (it would have taken T to the stop:
-            not blended, the walk ends) or "hidden" (behind the end of the walk, never visited).
-        reason: the decision behind the status, with its label, operand and threshold; empty for plain blending.
-        depth: camera z, world units.
-        distance: from the pixel's centre to the splat's, px.
-        falloff: exp(-sigma), 1 at the splat's centre.
-        opacity: the Gaussian's activated opacity.
-        blend_opacity: the opacity that blends; differs from `opacity` only when antialiased.
-        alpha_raw: blend_opacity * falloff.
-        alpha: clamped to the ceiling (D6).
-        clamped: whether that changed it.
-        T: transmittance in front of the entry; None where the walk did not get that far.
-        weight: T alpha, 0 unless blended.
-        color: of the splat as this camera sees it.
-        cumulative: the pixel's colour up to and including this entry, without background.
-        dominant: whether it has the largest weight (D8).
-        v_alpha: derivative of the photometric loss with respect to this alpha.
-        v_opacity: likewise to the opacity, through this pixel alone (0 where the ceiling stops it, B3).
-        v_opacity_view: likewise through all pixels of the view.
-        v_opacity_pop: derivative of the weighted POP term; negative pulls the opacity up, positive pushes it down.
-        pixels_dominated: pixels of the view it dominates; over 0 means important to POP.
-        mean2d: screen centre, px.
-        conic: inverse screen covariance (xx, xy, yy), px^-2.
-    """
-
-    rank: int
-    id: int
+    rank: int  # place in the list, from 0 at the front
+    id: int  # the Gaussian
+    # "blended", "skipped" (too faint here, the walk continues), "stopped" (it would have taken T to the stop:
+    # not blended, the walk ends) or "hidden" (behind the end of the walk, never visited)
     status: Status
+    # the decision behind the status, with its label, operand and threshold; empty for plain blending
     reason: str
-    depth: float
-    distance: float
-    falloff: float
-    opacity: float
-    blend_opacity: float
-    alpha_raw: float
-    alpha: float
-    clamped: bool
-    T: float | None
-    weight: float
-    color: Triple
-    cumulative: Triple
-    dominant: bool
-    v_alpha: float
-    v_opacity: float
-    v_opacity_view: float
+    depth: float  # camera z, world units
+    distance: float  # from the pixel's centre to the splat's, px
+    falloff: float  # exp(-sigma), 1 at the splat's centre
+    opacity: float  # the Gaussian's activated opacity
+    blend_opacity: float  # the opacity that blends; differs from `opacity` only when antialiased
+    alpha_raw: float  # blend_opacity * falloff
+    alpha: float  # clamped to the ceiling (D6)
+    clamped: bool  # whether that changed it
+    T: float | None  # transmittance in front of the entry; None where the walk did not get that far
+    weight: float  # T alpha, 0 unless blended
+    color: Triple  # of the splat as this camera sees it
+    cumulative: Triple  # the pixel's colour up to and including this entry, without background
+    dominant: bool  # whether it has the largest weight (D8)
+    v_alpha: float  # derivative of the photometric loss with respect to this alpha
+    v_opacity: float  # likewise to the opacity, through this pixel alone (0 where the ceiling stops it, B3)
+    v_opacity_view: float  # likewise through all pixels of the view
+    # derivative of the weighted POP term; negative pulls the opacity up, positive pushes it down
     v_opacity_pop: float
-    pixels_dominated: int
-    mean2d: tuple[float, float]
-    conic: Triple
+    pixels_dominated: int  # pixels of the view it dominates; over 0 means important to POP
+    mean2d: tuple[float, float]  # screen centre, px
+    conic: Triple  # inverse screen covariance (xx, xy, yy), px^-2
 
     @property
     def pop(self) -> Literal["up", "down", "none"]:
@@ -363,51 +339,28 @@ class Row:
 
 @dataclass(frozen=True, kw_only=True)
 class PixelExplanation:
-    """Why one pixel has its colour; printed, it is a table.
+    """Why one pixel has its colour; printed, it is a table."""
 
-    Attributes:
-        view: the view's file name.
-        x: column of the pixel, from 0.
-        y: row of the pixel, from 0.
-        width: of the image, px.
-        height: of the image, px.
-        profile: the rasterizer's constants.
-        objective: the photometric loss in words.
-        loss: its value for the view.
-        lambda_pop: weight of the POP term; 0 when the objective has none.
-        pop_note: what there is to know about that term at the splat's step; may be empty.
-        n_gaussians: in the scene.
-        n_important: of these, dominant at some pixel of the view.
-        color: the pixel, background included, not clamped.
-        photo: the photograph there.
-        v_color: derivative of the photometric loss with respect to the pixel's colour.
-        background: colour behind everything.
-        T_final: share of the background.
-        dominant_id: the Gaussian with the largest weight, -1 where nothing was blended.
-        n_traversed: entries visited, the one that stopped the walk included.
-        rows: all entries of the pixel's tile, front to back.
-    """
-
-    view: str
-    x: int
-    y: int
-    width: int
-    height: int
-    profile: str
-    objective: str
-    loss: float
-    lambda_pop: float
-    pop_note: str
-    n_gaussians: int
-    n_important: int
-    color: Triple
-    photo: Triple
-    v_color: Triple
-    background: Triple
-    T_final: float
-    dominant_id: int
-    n_traversed: int
-    rows: tuple[Row, ...]
+    view: str  # the view's file name
+    x: int  # column of the pixel, from 0
+    y: int  # row of the pixel, from 0
+    width: int  # of the image, px
+    height: int  # of the image, px
+    profile: str  # the rasterizer's constants
+    objective: str  # the photometric loss in words
+    loss: float  # its value for the view
+    lambda_pop: float  # weight of the POP term; 0 when the objective has none
+    pop_note: str  # what there is to know about that term at the splat's step; may be empty
+    n_gaussians: int  # in the scene
+    n_important: int  # of these, dominant at some pixel of the view
+    color: Triple  # the pixel, background included, not clamped
+    photo: Triple  # the photograph there
+    v_color: Triple  # derivative of the photometric loss with respect to the pixel's colour
+    background: Triple  # colour behind everything
+    T_final: float  # share of the background
+    dominant_id: int  # the Gaussian with the largest weight, -1 where nothing was blended
+    n_traversed: int  # entries visited, the one that stopped the walk included
+    rows: tuple[Row, ...]  # all entries of the pixel's tile, front to back
 
     @property
     def blended(self) -> tuple[Row, ...]:

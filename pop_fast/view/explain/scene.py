@@ -29,37 +29,21 @@ TILE_SIZE = 16
 
 @dataclass(frozen=True, eq=False)
 class ExplainedView:
-    """A rendered view and the derivatives of its loss.
+    """A rendered view and the derivatives of its loss."""
 
-    Attributes:
-        view: camera, photograph and mask.
-        config: profile, background, antialiasing and objective are read.
-        sh_degree: highest active colour band.
-        step: the step the splat was taken at, or None.
-        gaussians: activated means, quats, scales, opacities, and sh. float64
-        image: the render, not clamped. float64 [H, W, 3]
-        info: rasterization's meta, unpacked, with dominance and counts.
-        loss: the photometric loss.
-        v_image: its derivative to the render. float64 [H, W, 3]
-        v_opacities: its derivative to the activated opacities. float64 [N]
-        counts: pixels inside the mask that each Gaussian dominates. int64 [N]
-        lambda_pop: weight of the POP term.
-        v_pop: derivative of the weighted POP term to the opacities. float64 [N]
-    """
-
-    view: View
-    config: TrainConfig
-    sh_degree: int
-    step: int | None
-    gaussians: dict[str, Tensor]
-    image: Tensor
-    info: Mapping[str, Any]
-    loss: float
-    v_image: Tensor
-    v_opacities: Tensor
-    counts: Tensor
-    lambda_pop: float
-    v_pop: Tensor
+    view: View  # camera, photograph and mask
+    config: TrainConfig  # profile, background, antialiasing and objective are read
+    sh_degree: int  # highest active colour band
+    step: int | None  # the step the splat was taken at, or None
+    gaussians: dict[str, Tensor]  # activated means, quats, scales, opacities, and sh. float64
+    image: Tensor  # the render, not clamped. float64 [H, W, 3]
+    info: Mapping[str, Any]  # rasterization's meta, unpacked, with dominance and counts
+    loss: float  # the photometric loss
+    v_image: Tensor  # its derivative to the render. float64 [H, W, 3]
+    v_opacities: Tensor  # its derivative to the activated opacities. float64 [N]
+    counts: Tensor  # pixels inside the mask that each Gaussian dominates. int64 [N]
+    lambda_pop: float  # weight of the POP term
+    v_pop: Tensor  # derivative of the weighted POP term to the opacities. float64 [N]
 
     @property
     def background(self) -> Tensor:

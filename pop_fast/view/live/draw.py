@@ -147,23 +147,16 @@ Box = tuple[float, float, float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class ViewState:
-    """A view that can be drawn.
+    """A view that can be drawn."""
 
-    Attributes:
-        viewmat: world -> camera, OpenCV. [4, 4]
-        fov_y: angle from the upper to the lower edge, radians.
-        mode: what is drawn: the render, dominant Gaussians, how opaque pixels are, or their depth.
-        min_opacity: Gaussians of less are left out.
-        crop: those with centres outside are left out; in the capture's own frame.
-    """
-
-    viewmat: np.ndarray
-    fov_y: float
+    viewmat: np.ndarray  # world -> camera, OpenCV. [4, 4]
+    fov_y: float  # angle from the upper to the lower edge, radians
     width: int
     height: int
+    # what is drawn: the render, dominant Gaussians, how opaque pixels are, or their depth
     mode: Mode = "colour"
-    min_opacity: float = 0.0
-    crop: Box | None = None
+    min_opacity: float = 0.0  # Gaussians of less are left out
+    crop: Box | None = None  # those with centres outside are left out; in the capture's own frame
 
     @property
     def K(self) -> np.ndarray:

@@ -58,42 +58,34 @@ _FIX: Final = "write it again with 'pop report --check', or remove the file"
 
 @dataclass(frozen=True)
 class Checks:
-    """What was measured.
+    """What was measured."""
 
-    Attributes:
-        photographs: training views there are.
-        train_psnr: mean over the training views that were rendered, dB.
-        train_measured: how many these are.
-        held_out_psnr: mean over the held-out views, dB; None where there are none.
-        held_out: of each of these views, as `judged_psnr` takes them, dB.
-        matched_psnr: the mean after each channel of each render was scaled to its photograph's brightness, dB.
-        neighbour_degrees: median over the training cameras of the angle to the nearest other one, seen from the point
-            that they look at.
-        stops: how much brighter each photograph is than its render, in stops of exposure, by view.
-        floaters: share of each held-out view's pixels (training views where none is held out) that Gaussians cover by a
-            tenth or more which are nearer than half the distance of the nearest points; empty without points.
-        orbit_floaters: the same of the views of the orbit, which stand between the photographs, by their number.
-        without_floaters: mean of `held_out` once Gaussians whose centres stand where floaters do are left out, dB; None
-            where there are none, or no such views.
-        misfits: share of each rendered training view that is far from its photograph where the rest is near.
-        steps: that were taken; None where an older version has measured.
-        exposures_learned: whether the run learned each training photograph's exposure, with which those views are
-            measured; `stops` are without.
-    """
-
-    photographs: int
-    train_psnr: float
-    train_measured: int
-    held_out_psnr: float | None = None
+    photographs: int  # training views there are
+    train_psnr: float  # mean over the training views that were rendered, dB
+    train_measured: int  # how many these are
+    held_out_psnr: float | None = None  # mean over the held-out views, dB; None where there are none
+    # of each of these views, as `judged_psnr` takes them, dB
     held_out: Mapping[str, float] = field(default_factory=dict)
+    # the mean after each channel of each render was scaled to its photograph's brightness, dB
     matched_psnr: float | None = None
+    # median over the training cameras of the angle to the nearest other one, seen from the point that they look
+    # at
     neighbour_degrees: float | None = None
+    # how much brighter each photograph is than its render, in stops of exposure, by view
     stops: Mapping[str, float] = field(default_factory=dict)
+    # share of each held-out view's pixels (training views where none is held out) that Gaussians cover by a
+    # tenth or more which are nearer than half the distance of the nearest points; empty without points
     floaters: Mapping[str, float] = field(default_factory=dict)
+    # the same of the views of the orbit, which stand between the photographs, by their number
     orbit_floaters: Mapping[str, float] = field(default_factory=dict)
+    # mean of `held_out` once Gaussians whose centres stand where floaters do are left out, dB; None where there
+    # are none, or no such views
     without_floaters: float | None = None
+    # share of each rendered training view that is far from its photograph where the rest is near
     misfits: Mapping[str, float] = field(default_factory=dict)
-    steps: int | None = None
+    steps: int | None = None  # that were taken; None where an older version has measured
+    # whether the run learned each training photograph's exposure, with which those views are measured; `stops`
+    # are without
     exposures_learned: bool = False
 
     @property
