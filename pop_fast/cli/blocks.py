@@ -15,12 +15,15 @@ from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED, parse
 from pop_fast.cli.train_blocks import merged_lines, plan_lines, round_lines
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
+from pop_fast.io.heartbeat import bars
+from pop_fast.train.choose import choose_backend
+from pop_fast.train.config import TrainConfig
+from pop_fast.train.load_result import RECORD, CaptureRecord, read_record, record_text
+from pop_fast.train.results import read_config
 
 if TYPE_CHECKING:
     from pop_fast.blocks.jobs import Part
     from pop_fast.blocks.plan import Job
-    from pop_fast.train.config import TrainConfig
-    from pop_fast.train.load_result import CaptureRecord
 
 _EXAMPLES: Final = """
     pop blocks train out/city 0_1            train one block, or resume it
@@ -53,8 +56,6 @@ class Args:
 def run(argv: Sequence[str]) -> int:
     args = parse(Args, argv, "blocks", examples=_EXAMPLES)
     from pop_fast.blocks.plan import read_job
-    from pop_fast.train.load_result import CaptureRecord, read_record
-    from pop_fast.train.results import read_config
 
     folder = args.result.absolute()
     job = read_job(folder)
@@ -96,7 +97,6 @@ def _part(args: Args, job: Job) -> Part:
 
 def _partition(folder: Path, config: TrainConfig, record: CaptureRecord, job: Job) -> int:
     from pop_fast.blocks.run import divide_capture
-    from pop_fast.io.heartbeat import bars
 
     with bars(config.progress) as progress:
         division = divide_capture(config, record, job, progress=progress)
@@ -111,7 +111,6 @@ def _train(folder: Path, config: TrainConfig, block: str, argv: Sequence[str]) -
     from pop_fast.blocks.plan import read_plan
     from pop_fast.blocks.run import config_of
     from pop_fast.cli.train import check_backend, train_capture
-    from pop_fast.train.choose import choose_backend
 
     if read_plan(folder) is None:
         raise PopError(f"{folder}: its capture is not divided yet; run pop blocks partition {folder}")
@@ -134,7 +133,6 @@ def _options(folder: Path, own: TrainConfig) -> Any:
     """
     from pop_fast.cli.train import arguments
     from pop_fast.cli.train_options import as_begun, check_output
-    from pop_fast.train.load_result import read_record
 
     record, place = read_record(folder), Path(own.result_dir)
     again = ["--resume"] if (place / "cfg.json").is_file() else []
@@ -153,8 +151,6 @@ def _train_round(folder: Path, config: TrainConfig, record: CaptureRecord, job: 
     from pop_fast.cli import printable
     from pop_fast.cli.train import check_backend, open_capture, summary
     from pop_fast.cli.train_options import record_of, resumption, stopped
-    from pop_fast.train.choose import choose_backend
-    from pop_fast.train.load_result import RECORD, record_text
 
     assert part.block is not None
     begun, names = time.perf_counter(), check_merged(folder, part.round)
@@ -194,7 +190,6 @@ def _merge(folder: Path, config: TrainConfig, record: CaptureRecord, job: Job, p
     from pop_fast.blocks.run import merge_capture
     from pop_fast.cli.export import FinishOptions, finish
     from pop_fast.cli.train import report, summary
-    from pop_fast.io.heartbeat import bars
 
     try:
         options = replace(FinishOptions(**job.finish), skip_checks=True)

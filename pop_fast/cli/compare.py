@@ -13,6 +13,8 @@ import tyro
 from pop_fast.cli import parse
 from pop_fast.cli.options import CaptureArguments
 from pop_fast.errors import PopError
+from pop_fast.train.load_result import load_splat
+from pop_fast.train.results import read_config
 
 _EXAMPLES: Final = """
     pop compare out/scene_pop out/scene_adc
@@ -54,7 +56,6 @@ def run(argv: Sequence[str]) -> int:
 
 def _stats(path: Path, args: Args) -> dict[str, Any]:
     """Return what a result's training left of numbers, or measure the file of a splat."""
-    from pop_fast.train.results import read_config
     from pop_fast.view.report.source import read_last_stats
 
     if path.is_file():
@@ -66,7 +67,6 @@ def _stats(path: Path, args: Args) -> dict[str, Any]:
 
 def _measured(path: Path, args: Args) -> dict[str, Any]:
     from pop_fast.cli.eval import measured
-    from pop_fast.train.load_result import load_splat
 
     capture, stats = measured(load_splat(path), args, [])
     return {**stats, "capture": capture, "method": path.name}

@@ -14,10 +14,11 @@ from pop_fast.cli import parse
 from pop_fast.cli.export import HTML, check_file, file_format, note_lost_frame, say_written
 from pop_fast.cli.options import FormatName, LimitOptions, Output, Shown, limited
 from pop_fast.errors import PopError
+from pop_fast.io.atomic import write_atomically
+from pop_fast.train.config import TrainConfig
 
 if TYPE_CHECKING:
     from pop_fast.io.formats import Stored
-    from pop_fast.train.config import TrainConfig
 
 _EXAMPLES: Final = """
     pop convert scene.ply scene.sog
@@ -49,9 +50,7 @@ def run(argv: Sequence[str]) -> int:
     args.check()
     if args.score not in ("auto", "visibility"):
         raise PopError(f"--score {args.score} needs the training views; 'pop export RESULT' knows them")
-    from pop_fast.io.atomic import write_atomically
     from pop_fast.io.formats import load_splat_file
-    from pop_fast.train.config import TrainConfig
 
     name = file_format(args.out, args.to)
     check_file(args.out, args.source, args.overwrite)

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import tyro
 
 from pop_fast.cli import parse, printable
+from pop_fast.io.heartbeat import bars
+from pop_fast.machine import memory_bytes
 
 if TYPE_CHECKING:
     from pop_fast.data.photo_quality import CaptureFinding
@@ -64,7 +66,6 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
     from pop_fast.data import check_dataset
     from pop_fast.data.photo_quality import CaptureFinding, about_quality, bad, measure_file, number, warn
     from pop_fast.data.sfm import photo_folder, photographs
-    from pop_fast.machine import memory_bytes
 
     listing = check_dataset.read_listing(root, images)
     if listing is None:
@@ -101,7 +102,6 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
 
 def _each(items: Sequence[T], read: Callable[[T], R], file_of: Callable[[T], Path | None]) -> tuple[list[R], list[str]]:
     """Read photographs, several at a time, with progress; what was read, and a line for each JPEG with damage."""
-    from pop_fast.io.heartbeat import bars
     from pop_fast.io.images import in_threads, jpeg_damage
 
     files = [path for path in map(file_of, items) if path is not None]

@@ -10,6 +10,7 @@ from typing import Annotated, Final
 import tyro
 
 from pop_fast.cli import parse
+from pop_fast.io.heartbeat import bars
 
 _EXAMPLES: Final = """
     pop demo scene && pop train scene --minutes 2
@@ -37,7 +38,6 @@ class Args:
 def run(argv: Sequence[str]) -> int:
     args = parse(Args, argv, "demo", examples=_EXAMPLES)
     from pop_fast.demo import make_demo
-    from pop_fast.io.heartbeat import bars
 
     with bars() as progress:
         folder = make_demo(

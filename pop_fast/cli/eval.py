@@ -15,10 +15,12 @@ from pop_fast.cli import parse
 from pop_fast.cli.options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import check_file, write_atomically
+from pop_fast.io.heartbeat import Heartbeat
+from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import CaptureOptions, Splat, load_splat
+from pop_fast.train.results import ResultFolder
 
 if TYPE_CHECKING:
-    from pop_fast.train.config import TrainConfig
     from pop_fast.train.lpips import LPIPS
     from pop_fast.train.views import ViewTensors
 
@@ -85,7 +87,6 @@ def measured(splat: Splat, options: CaptureOptions, nets: Sequence[LPIPS]) -> tu
 
 def measure_splat(splat: Splat, config: TrainConfig, views: list[ViewTensors], nets: Sequence[LPIPS]) -> dict[str, Any]:
     """Measure a splat on views; the numbers are those that training itself would write."""
-    from pop_fast.io.heartbeat import Heartbeat
     from pop_fast.train.environment import reproducible
     from pop_fast.train.evaluate import evaluate, population
     from pop_fast.train.gpu_proxy import renderer
@@ -107,7 +108,6 @@ def _nets(args: Args, config: TrainConfig) -> list[LPIPS]:
 
 
 def _record(folder: Path, step: int, stats: dict[str, Any]) -> None:
-    from pop_fast.train.results import ResultFolder
     from pop_fast.view.report import write_report
     from pop_fast.view.report.source import read_stats
 

@@ -2,37 +2,30 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import numpy as np
 import tyro
 
-from pop_fast.cli import parse
+from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED, describe, parse
 from pop_fast.cli.options import CaptureArguments, FormatName, LimitOptions, Output, Shown, limited, open_with_bars
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import check_folder, check_place
+from pop_fast.io.atomic import check_folder, check_place, write_atomically
+from pop_fast.io.heartbeat import Heartbeat
+from pop_fast.io.ply import Frame
+from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import Splat, frame_of_splat, load_splat, read_record
-
-if TYPE_CHECKING:
-    from pop_fast.data import Capture
-    from pop_fast.io.ply import Frame
-    from pop_fast.train.config import TrainConfig
-import dataclasses
-from dataclasses import fields
-from typing import TYPE_CHECKING, Any
-
-from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED, describe
+from pop_fast.train.results import ResultFolder
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from pop_fast.data import Capture
-    from pop_fast.train.config import TrainConfig
-    from pop_fast.train.load_result import Splat
 
 
 HTML: Final = "html"
@@ -196,16 +189,12 @@ def _output(args: Args, out: Path, name: str, splat: Splat, opened: _Opened) -> 
 
 
 def _write(out: Path, data: bytes) -> int:
-    from pop_fast.io.atomic import write_atomically
-
     write_atomically(out, lambda file: file.write(data))
     return len(data)
 
 
 def _output_frame(splat: Splat, args: Args) -> tuple[np.ndarray | None, Frame | None]:
     """Return the similarity [4, 4] into the file's frame, or None where nothing moves; and that frame, where known."""
-    from pop_fast.io.ply import Frame
-
     now, transform = frame_of_splat(splat, args), known_transform(splat, args)
     wanted = args.frame or ("capture" if splat.folder is not None else now)
     if wanted is None or wanted == (now or "capture"):
@@ -224,8 +213,6 @@ def _training_frame(splat: Splat, args: Args) -> np.ndarray | None:
 
 
 def _loaded_transform(splat: Splat, args: Args) -> np.ndarray:
-    from pop_fast.io.ply import Frame
-
     as_trained = replace(splat, frame=Frame("training"))
     return open_with_bars(as_trained, replace(args, own_frame=False, training_frame=False))[0].world_transform
 
@@ -295,9 +282,6 @@ def finish(folder: Path, capture: Capture, options: Any) -> int:
 
 
 def _finish(folder: Path, capture: Capture, options: FinishOptions) -> None:
-    from pop_fast.io.atomic import write_atomically
-    from pop_fast.io.ply import Frame
-    from pop_fast.train.load_result import load_splat
     from pop_fast.view.html import cameras_of, page_of
 
     splat = load_splat(folder)
@@ -339,7 +323,6 @@ def _finish(folder: Path, capture: Capture, options: FinishOptions) -> None:
 
 def checked(folder: Path, splat: Splat, capture: Capture, config: TrainConfig) -> None:
     """Render and measure what the report shows besides the results; see `pop_fast.view.report.checks`."""
-    from pop_fast.io.heartbeat import Heartbeat
     from pop_fast.train.environment import reproducible
     from pop_fast.train.gpu_proxy import renderer
     from pop_fast.view.report.checks import write_checks
@@ -356,7 +339,6 @@ def _sizes(folder: Path, splat: Splat, capture: Capture, params: dict[str, Tenso
     from pop_fast.train.encodings import measure_encodings
     from pop_fast.train.environment import reproducible
     from pop_fast.train.gpu_proxy import renderer
-    from pop_fast.train.results import ResultFolder
     from pop_fast.train.views import ViewTensors
     from pop_fast.view.report.source import encoding_heads, encoding_rows
 

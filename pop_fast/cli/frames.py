@@ -10,6 +10,7 @@ from typing import Annotated, Final
 import tyro
 
 from pop_fast.cli import parse
+from pop_fast.io.heartbeat import bars
 
 _EXAMPLES: Final = """
     pop frames walk.mp4                          writes walk_frames, up to 150 photographs
@@ -36,7 +37,6 @@ class Args:
 def run(argv: Sequence[str]) -> int:
     args = parse(Args, argv, "frames", examples=_EXAMPLES)
     from pop_fast.data.unpack import take_frames
-    from pop_fast.io.heartbeat import bars
 
     out = args.out or args.video.with_name(f"{args.video.stem}_frames")
     with bars() as progress:

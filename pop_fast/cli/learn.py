@@ -11,6 +11,7 @@ from typing import Annotated, Any, Final
 import tyro
 
 from pop_fast.cli import parse
+from pop_fast.io.atomic import file_atomically
 
 _EXAMPLES: Final = """
     pop learn start mine           write thirteen files to fill in
@@ -124,7 +125,6 @@ def _class(args: Class) -> int:
     from pop_ref.learn import needs_of_judging
 
     needs_of_judging()
-    from pop_fast.io.atomic import file_atomically
     from pop_ref.learn.grading import class_report, submissions
 
     grades = []

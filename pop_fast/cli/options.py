@@ -5,39 +5,31 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final, Literal
+
+import tyro
 
 from pop_fast.errors import PopError
 from pop_fast.io.formats import format_names
-from pop_fast.io.heartbeat import duration
+from pop_fast.io.heartbeat import bars, duration
+from pop_fast.io.ply import Frame
+from pop_fast.train.config import TrainConfig
+from pop_fast.train.load_result import CaptureOptions, Splat, open_capture
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import numpy as np
     from torch import Tensor
 
     from pop_fast.data import Capture
+    from pop_fast.data.load import Photographs
     from pop_fast.density.shrink import Score
-    from pop_fast.io.ply import Frame
     from pop_fast.train.compact import Compact, Tuner
-    from pop_fast.train.config import TrainConfig
 
     FormatName = str
 else:
     # what is registered when the program starts
     FormatName = Literal[(*format_names(), "html")]
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import tyro
-
-from pop_fast.train.load_result import CaptureOptions, Splat, open_capture
-
-if TYPE_CHECKING:
-    from pop_fast.data import Capture
-    from pop_fast.data.load import Photographs
-    from pop_fast.train.config import TrainConfig
 
 
 # views that scores are summed over, at most; of a larger capture, an even selection
@@ -216,7 +208,6 @@ def _fit_unseen(left: Limited, limits: LimitOptions, output: Output) -> None:
 
 def _fit_seen(left: Limited, limits: LimitOptions, output: Output, shown: Shown, score: Score) -> None:
     """Fit a splat into its bytes by what loses least in its training views, and tune what is left on them."""
-    from pop_fast.io.heartbeat import bars
     from pop_fast.train import compact
 
     capture, config, learned = _photographs(shown, left, limits.crop is not None)
@@ -340,7 +331,5 @@ def open_with_bars(
     splat: Splat, options: CaptureOptions, photographs: Photographs = "all"
 ) -> tuple[Capture, TrainConfig]:
     """Load the capture that a splat shows under progress bars; see `pop_fast.train.load_result.open_capture`."""
-    from pop_fast.io.heartbeat import bars
-
     with bars() as progress:
         return open_capture(splat, options, progress, photographs)

@@ -11,6 +11,7 @@ import tyro
 
 from pop_fast.cli import parse
 from pop_fast.cli.options import CaptureArguments, open_with_bars
+from pop_fast.train.load_result import load_splat
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +39,6 @@ def run(argv: Sequence[str]) -> int:
 
 def _check(args: Args) -> None:
     from pop_fast.cli.export import checked
-    from pop_fast.train.load_result import load_splat
 
     splat = load_splat(args.result)
     capture, config = open_with_bars(splat, args)

@@ -11,6 +11,7 @@ import tyro
 
 from pop_fast.cli import parse
 from pop_fast.data.sfm_files import SfmOptions
+from pop_fast.io.heartbeat import bars
 
 _EXAMPLES: Final = """
     pop sfm photos                 writes photos/sparse/0
@@ -44,7 +45,6 @@ def run(argv: Sequence[str]) -> int:
     args = parse(Args, argv, "sfm", examples=_EXAMPLES)
     from pop_fast.data import run_sfm
     from pop_fast.data.sfm import photo_folder
-    from pop_fast.io.heartbeat import bars
     from pop_fast.io.images import unreadable_photographs
 
     with bars() as progress:

@@ -40,9 +40,12 @@ from pop_fast.cli.train_options import (
 from pop_fast.cli.view import LiveView, check_viewer
 from pop_fast.data.sfm_files import SfmOptions
 from pop_fast.errors import PopError
+from pop_fast.io.heartbeat import bars, duration
 from pop_fast.train.automatic import begun, check_minutes
 from pop_fast.train.choose import check_gpus, choose_backend
+from pop_fast.train.commands import COMMANDS_FILE, commands_text
 from pop_fast.train.config import TrainConfig
+from pop_fast.train.load_result import RECORD, read_record, record_text
 from pop_fast.train.presets import ALIASES, AUTOMATIC, LOSSES, METHODS, Given
 from pop_fast.train.steps import why_not_trained
 from pop_ref.constants import PROFILES
@@ -183,7 +186,6 @@ def _in_a_folder(config: TrainConfig) -> TrainConfig:
     if not Path(config.data).is_file():
         return config
     from pop_fast.data.unpack import capture_folder
-    from pop_fast.io.heartbeat import bars
 
     with bars(config.progress) as progress:
         folder, said = capture_folder(Path(config.data), progress)
@@ -229,14 +231,10 @@ def train_capture(
         ranks: the processes that train together.
         chooses: choose the schedule by the speed of this machine.
     """
-    from pop_fast.train.commands import COMMANDS_FILE, commands_text
-    from pop_fast.train.load_result import RECORD, read_record, record_text
-
     folder, start = Path(config.result_dir), time.perf_counter()
     capture = _open_in_turn(config, options, ranks)
     searching = capture.sfm_seconds or 0.0
     loading = time.perf_counter() - start - searching
-    from pop_fast.io.heartbeat import duration
     from pop_fast.train.environment import keep_freed_memory
     from pop_fast.train.ranks import ALONE
     from pop_fast.train.training_run import TrainingRun
@@ -380,7 +378,6 @@ def open_capture(config: TrainConfig, options: Any) -> Capture:
     The cameras of bare photographs are found first.
     """
     from pop_fast.data.load import load_capture
-    from pop_fast.io.heartbeat import bars
     from pop_fast.lazy import background_import
 
     # a folder that is not there is said at once

@@ -13,11 +13,16 @@ from pop_fast.cli import EXIT_INTERRUPTED, printable
 from pop_fast.cli.export import FinishOptions, table_lines
 from pop_fast.cli.train_options import BlocksOptions
 from pop_fast.errors import PopError
+from pop_fast.io.atomic import FolderLock, write_atomically
+from pop_fast.io.heartbeat import bars
+from pop_fast.train.commands import COMMANDS_FILE, commands_text
+from pop_fast.train.config import TrainConfig, first_difference
+from pop_fast.train.load_result import RECORD, CaptureRecord, record_text
+from pop_fast.train.results import ResultFolder, read_config
 
 if TYPE_CHECKING:
     from pop_fast.blocks.plan import Job
     from pop_fast.blocks.run import Division
-    from pop_fast.train.config import TrainConfig
 
 # of what is written at the end, what looks at all training photographs, which the merge does not hold
 _NEED_ALL = ("without_floaters", "final_prune", "max_gaussians", "target_mb")
@@ -97,7 +102,6 @@ def train_in_blocks(config: TrainConfig, options: Any, chosen: str, argv: Sequen
     """Divide the capture where that is not done yet, do the parts of the run that are left, return the exit status."""
     from pop_fast.blocks.jobs import gpus_for, has_snakemake, marker_of, profile_folder, run_in_turn, run_workflow
     from pop_fast.blocks.plan import FOLDER, read_plan
-    from pop_fast.io.atomic import FolderLock
 
     folder, job = Path(config.result_dir), _job(config, options)
     config = replace(config, data=str(Path(config.data).absolute()))
@@ -144,9 +148,7 @@ def train_in_blocks(config: TrainConfig, options: Any, chosen: str, argv: Sequen
 def _begun(folder: Path, config: TrainConfig, job: Job) -> Job | None:
     """Read what a run that is resumed was begun with, or None where nothing is there; it must not differ."""
     from pop_fast.blocks.plan import read_job
-    from pop_fast.train.config import first_difference
     from pop_fast.train.engines import engine_of
-    from pop_fast.train.results import read_config
 
     before = read_job(folder)
     if before is None:
@@ -182,7 +184,6 @@ def _extend(folder: Path, before: Job, job: Job) -> None:
     """Let a run have more rounds than it was begun with; its merge is then the last one no more."""
     from pop_fast.blocks.jobs import marker_of
     from pop_fast.blocks.plan import JOB, job_text
-    from pop_fast.io.atomic import write_atomically
 
     if job.rounds > before.rounds:
         marker_of(folder, None, None).unlink(missing_ok=True)
@@ -192,8 +193,6 @@ def _extend(folder: Path, before: Job, job: Job) -> None:
 
 def _take_threads(folder: Path, config: TrainConfig) -> None:
     """Let the parts of a run that are not done yet have as many threads as are asked for now."""
-    from pop_fast.train.results import ResultFolder, read_config
-
     begun = read_config(folder)
     if begun.threads != config.threads:
         ResultFolder(folder).write_settings(replace(config, near_plane=begun.near_plane), {})
@@ -211,8 +210,6 @@ def _dividing(job: Job) -> dict[str, Any]:
 
 def _divided(config: TrainConfig, options: Any, job: Job) -> Division:
     from pop_fast.blocks.run import divide_capture
-    from pop_fast.io.heartbeat import bars
-    from pop_fast.train.load_result import CaptureRecord
 
     how = {"images": options.images, "missing": options.missing, "source": options.source}
     record = CaptureRecord(**how, masks=not options.ignore_masks)
@@ -230,9 +227,6 @@ def _begin(folder: Path, config: TrainConfig, options: Any, job: Job, division: 
 
     from pop_fast.blocks.plan import JOB, job_text
     from pop_fast.cli.train_options import record_of
-    from pop_fast.train.commands import COMMANDS_FILE, commands_text
-    from pop_fast.train.load_result import RECORD, record_text
-    from pop_fast.train.results import ResultFolder
 
     record = record_text(record_of(division.capture, options))
     beside = {RECORD: record, COMMANDS_FILE: commands_text(None, ["pop", "train", *argv]), JOB: job_text(job)}

@@ -15,17 +15,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import tyro
 
 from pop_fast.errors import PopError
-from pop_fast.io.image_header import read_size
+from pop_fast.io.heartbeat import Heartbeat
+from pop_fast.io.image_header import read_exif, read_size
 from pop_fast.train import automatic
 from pop_fast.train.choose import on_gpu
 from pop_fast.train.config import TrainConfig
+from pop_fast.train.load_result import CaptureRecord, read_record
 from pop_fast.train.presets import ALIASES, METHODS, PRESETS
+from pop_fast.train.results import ResultFolder
 
 if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.data.load import Source
-    from pop_fast.train.config import TrainConfig
-    from pop_fast.train.load_result import CaptureRecord
     from pop_fast.train.ranks import Ranks
 
 
@@ -206,16 +207,12 @@ def check_output(folder: Path, options: Any) -> None:
     """Refuse an output folder that cannot be written to before the minutes of loading, not after."""
     if options.resume and options.overwrite:
         raise PopError("--resume and --overwrite exclude each other; choose one")
-    from pop_fast.train.results import ResultFolder
-
     if ResultFolder(folder).check(options.resume, options.overwrite):
         print(f"note: {folder}: an --overwrite was cut short; the results that it had set aside are back")
 
 
 def as_begun(folder: Path, options: Any) -> Any:
     """Read the capture of a run that is resumed as it was read before, where the command does not say."""
-    from pop_fast.train.load_result import read_record
-
     record = read_record(folder) if options.resume else None
     if record is None:
         return options
@@ -230,8 +227,6 @@ def as_begun(folder: Path, options: Any) -> Any:
 
 def record_of(capture: Capture, options: Any, chosen: Sequence[str] = ()) -> CaptureRecord:
     """Return what capture.json says of a capture that was read by these options, and of what the run chose."""
-    from pop_fast.train.load_result import CaptureRecord
-
     return CaptureRecord(
         images=options.images,
         missing=options.missing,
@@ -319,8 +314,6 @@ def with_length(config: TrainConfig, capture: Capture, options: Any) -> tuple[Tr
     With lines that say what is to come, and why; none where the run is resumed as it was begun.
     """
     from pop_fast.data.photo_quality import exposure_stops
-    from pop_fast.io.heartbeat import Heartbeat
-    from pop_fast.io.image_header import read_exif
 
     given = config.given
     if given is None or given.steps_scaler is not None:

@@ -6,31 +6,28 @@ The splat is at rest, or of a training between its steps. A recorded path of cam
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from pop_fast.density.shrink import inside, opaque_enough
+from pop_fast.errors import PopError
 from pop_fast.io.pictures import colormap_table, depth_picture, depth_range, id_colors
+from pop_fast.io.read_back import read_json
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.views import Layers, render_layers
+from pop_fast.train.views import Layers, ViewTensors, render_layers
+from pop_fast.view.paths import interpolate
 
 if TYPE_CHECKING:
     from pop_fast.train.training_run import TrainingRun
     from pop_fast.view.live.server import LiveViewer
-import json
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Literal, get_args
 
-from pop_fast.errors import PopError
-from pop_fast.io.read_back import read_json
-from pop_fast.train.views import ViewTensors
-from pop_fast.view.paths import interpolate
 
 # what covers a pixel by less has no depth
 _SEEN = 0.1
