@@ -39,11 +39,7 @@ def why_torch_fails() -> str | None:
 
 
 def cuda_version() -> str | None:
-    """Return the version of CUDA that torch was built with, None for a CPU build.
-
-    Raises:
-        ImportError: torch does not say.
-    """
+    """Return the version of CUDA that torch was built with, None for a CPU build."""
     spec = importlib.util.spec_from_file_location("torch_version", _folder() / "version.py")
     if spec is None or spec.loader is None:
         raise ImportError("torch has no version.py")

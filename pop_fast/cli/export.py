@@ -83,7 +83,9 @@ def run(argv: Sequence[str]) -> int:
     left = limited(shown, args, output)
     for line in left.said:
         print(line)
-    say_written(out, len(left.params["means"]), _write(out, output.write(left.params, left.level)))
+    data = output.write(left.params, left.level)
+    write_atomically(out, lambda file: file.write(data))
+    say_written(out, len(left.params["means"]), len(data))
     return 0
 
 
@@ -186,11 +188,6 @@ def _output(args: Args, out: Path, name: str, splat: Splat, opened: _Opened) -> 
     transform, frame = _output_frame(splat, args)
     note_lost_frame(out, name, frame)
     return Output(name, splat.config.antialiased, frame, transform)
-
-
-def _write(out: Path, data: bytes) -> int:
-    write_atomically(out, lambda file: file.write(data))
-    return len(data)
 
 
 def _output_frame(splat: Splat, args: Args) -> tuple[np.ndarray | None, Frame | None]:

@@ -7,7 +7,7 @@ import os
 import sys
 import time
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
@@ -169,16 +169,16 @@ def _asked(argv: Sequence[str]) -> tuple[TrainConfig, Any, bool]:
     """Read the words; where they say no schedule, the run chooses for itself, unless it was begun with one."""
     if not chooses_for_itself(rename_aliases(argv)):
         config, options = arguments(argv)
-        return config, options, config.preset == AUTOMATIC and "max_steps" not in _said(config)
+        return (
+            config,
+            options,
+            config.preset == AUTOMATIC and "max_steps" not in (config.given.settings if config.given else {}),
+        )
     config, options = arguments(["--preset", AUTOMATIC, *argv])
     folder = Path(config.result_dir)
     if options.resume and (folder / "cfg.json").exists() and begun(folder) is None:
         return *arguments(argv), False
     return config, options, True
-
-
-def _said(config: TrainConfig) -> Mapping[str, Any]:
-    return {} if config.given is None else config.given.settings
 
 
 def _in_a_folder(config: TrainConfig) -> TrainConfig:
@@ -245,7 +245,8 @@ def train_capture(
     for note in capture.notes:
         print(f"note: {printable(note)}")
     config, told = with_length(config, capture, options) if chooses else (config, ())
-    print(printable(f"{capture.name}: {capture.source}; {_plan(config)}"))
+    plan = f"{config.method}, {config.max_steps:,} steps, seed {config.seed} -> {config.result_dir}"
+    print(printable(f"{capture.name}: {capture.source}; {plan}"))
     print(chosen)
     for line in told:
         print(line, flush=True)
@@ -397,10 +398,6 @@ def open_capture(config: TrainConfig, options: Any) -> Capture:
             sfm=options.sfm,
             seed=config.seed,
         )
-
-
-def _plan(config: TrainConfig) -> str:
-    return f"{config.method}, {config.max_steps:,} steps, seed {config.seed} -> {config.result_dir}"
 
 
 def summary(stats: dict[str, Any]) -> str:

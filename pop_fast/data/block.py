@@ -57,11 +57,7 @@ def write_block(folder: Path, listing: Listing) -> None:
 
 
 def read_block(folder: Path) -> Listing:
-    """Read a block.
-
-    Raises:
-        CaptureError: the capture is not where it was, or a file is damaged; names it.
-    """
+    """Read a block; a CaptureError says that its capture is not where it was, or names a file that is damaged."""
     path, points = folder / _LIST, folder / _POINTS
     content = _refused_as_capture(lambda: read_json(path, _FIX))
     try:

@@ -30,9 +30,10 @@ import json
 import math
 import xml.etree.ElementTree as ET
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, TypeAlias, cast
+from typing import Any, BinaryIO, Final, Literal, TypeAlias, cast
 
 import numpy as np
 
@@ -121,14 +122,18 @@ class _Similarity:
 
 def find_metashape(root: Path) -> Path | None:
     """Find a file of exported cameras, the first by name; None where there is none."""
-    for path in sorted(root.glob("*.xml")):
+    return _first(root, "*.xml", lambda file: b"<document" in (head := file.read(_HEAD)) and b"<chunk" in head)
+
+
+def _first(root: Path, pattern: str, is_one: Callable[[BinaryIO], bool]) -> Path | None:
+    """Find the first file by name that begins as one of a kind; what cannot be read is passed over."""
+    for path in sorted(root.glob(pattern)):
         try:
             with open(path, "rb") as file:
-                head = file.read(_HEAD)
+                if is_one(file):
+                    return path
         except OSError:
             continue
-        if b"<document" in head and b"<chunk" in head:
-            return path
     return None
 
 
@@ -251,15 +256,12 @@ _FILM: Final = 36.0
 
 def find_realitycapture(root: Path) -> Path | None:
     """Find a file of exported cameras, the first by name; None where there is none."""
-    for path in sorted(root.glob("*.csv")):
-        try:
-            with open(path, "rb") as file:
-                head = file.readline(4096).decode("utf-8-sig", "replace")
-        except OSError:
-            continue
-        if head.startswith("#name") and "heading" in head:
-            return path
-    return None
+
+    def is_one(file: BinaryIO) -> bool:
+        head = file.readline(_HEAD).decode("utf-8-sig", "replace")
+        return head.startswith("#name") and "heading" in head
+
+    return _first(root, "*.csv", is_one)
 
 
 def read_realitycapture(path: Path, root: Path, images: str) -> list[PosedImage]:

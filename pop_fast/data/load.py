@@ -352,7 +352,7 @@ def random_points(views: Sequence[View], count: int = 30_000, seed: int = 0) -> 
     kept: list[np.ndarray] = []
     for _ in range(_ROUNDS):
         points = middle + half * generator.uniform(-1.0, 1.0, (count, 3))
-        kept.append(points[_times_seen(points, views) >= 2])
+        kept.append(points[sum(in_picture(points, view).astype(np.int64) for view in views) >= 2])
         if sum(map(len, kept)) >= count:
             break
     xyz = np.concatenate(kept)[:count]
@@ -362,14 +362,6 @@ def random_points(views: Sequence[View], count: int = 30_000, seed: int = 0) -> 
         )
     color = np.mean([view.image.mean(axis=(0, 1)) for view in views], axis=0)
     return SparsePoints(xyz, np.tile(np.rint(color).astype(np.uint8), (len(xyz), 1)))
-
-
-def _times_seen(points: np.ndarray, views: Sequence[View]) -> np.ndarray:
-    """Count for every point the views that have it in front of them and inside the image. int64 [P]"""
-    seen = np.zeros(len(points), np.int64)
-    for view in views:
-        seen += in_picture(points, view)
-    return seen
 
 
 def in_picture(points: np.ndarray, view: View) -> np.ndarray:

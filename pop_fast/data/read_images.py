@@ -193,7 +193,10 @@ def _read(photo: _Photo, options: PhotoOptions, rectify: Any) -> View:
 def _placed(photo: _Photo, stored: tuple[int, int], rectify: Any) -> tuple[Undistortion, tuple[int, int], np.ndarray]:
     """Find how a photograph of a stored size is undistorted, the size that it is used in, and K of that."""
     width, height = stored
-    camera = photo.shot.camera or _camera_from_angle(photo.shot.angle_x or 1.0, width, height)
+    camera = photo.shot.camera
+    if camera is None:
+        focal = 0.5 * width / math.tan(0.5 * (photo.shot.angle_x or 1.0))
+        camera = make_camera(0, "PINHOLE", width, height, [focal, focal, width / 2, height / 2])
     _check_shape(photo.path, "the photograph", stored, "its camera", (camera.width, camera.height))
     try:
         rectification = rectify(camera, width, height)
@@ -250,12 +253,6 @@ def _upright(view: View, turns: int) -> View:
         upright = {name: None if a is None else np.ascontiguousarray(np.rot90(a, -1)) for name, a in pixels.items()}
         view = replace(view, **upright, K=turned, viewmat=np.stack([-y, x, *rest]))
     return view
-
-
-def _camera_from_angle(angle_x: float, width: int, height: int) -> Any:
-    focal = 0.5 * width / math.tan(0.5 * angle_x)
-    params = [focal, focal, width / 2, height / 2]
-    return make_camera(0, "PINHOLE", width, height, params)
 
 
 def _check_shape(path: Path, what: str, size: tuple[int, int], whose: str, other: tuple[int, int]) -> None:

@@ -238,12 +238,7 @@ def _chunk(data: bytes, at: int, name: bytes, form: str, name_at: int, length_at
 
 
 def _tags(data: bytes, base: int, offset: int | None = None) -> dict[int, Any]:
-    """Read one TIFF directory: by tag, a text or the first of its numbers.
-
-    Raises:
-        struct.error: it leads out of the file.
-        KeyError: no TIFF block begins at `base`.
-    """
+    """Read one TIFF directory: by tag, a text or the first of its numbers; struct.error and KeyError where there is none."""
     order = _TIFF[data[base : base + 4]]
     start = base + (struct.unpack_from(f"{order}I", data, base + 4)[0] if offset is None else offset)
     (count,) = struct.unpack_from(f"{order}H", data, start)

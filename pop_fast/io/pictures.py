@@ -19,6 +19,11 @@ def colormap_table(name: str = COLORMAP) -> np.ndarray:
     return np.round(colormaps[name](np.linspace(0.0, 1.0, 256))[:, :3] * 255.0).astype(np.uint8)
 
 
+def to_uint8(image: np.ndarray) -> np.ndarray:
+    """Round an image in [0, 1] to 8 bit, clamped."""
+    return np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
 def error_magnitude(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
     """Take each pixel's error: the mean over the channels of |image - photo|, in [0, 1]. [H, W] from uint8 [H, W, 3]"""
     return np.abs(image.astype(np.float32) - photo.astype(np.float32)).mean(axis=2) / 255.0

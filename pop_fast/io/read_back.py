@@ -142,11 +142,7 @@ def read_torch_file(path: Path, fix: str) -> Any:
 
 
 def _damage(file: Any) -> str | None:
-    """Say what is wrong with a zip of stored members, or None.
-
-    Raises:
-        Exception: of many kinds, when it is not a zip or the list of its members is damaged.
-    """
+    """Say what is wrong with a zip of stored members, or None; errors of many kinds come where it is none."""
     with zipfile.ZipFile(file) as archive:
         for member in archive.infolist():
             # torch.save never compresses; what does may come to any number of bytes when it is read

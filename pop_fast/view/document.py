@@ -33,7 +33,8 @@ def document(title: str, style: str, body: str, script: str, framed: str = "") -
 
     `framed` is the script that may run in its frames, which may start workers; empty for none.
     """
-    allowed = " ".join(f"'sha256-{_digest(text)}'" for text in (script, framed) if text)
+    digests = [hashlib.sha256(text.encode()).digest() for text in (script, framed) if text]
+    allowed = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
     policy = _POLICY.format(scripts=allowed) + (_WORKERS if framed else "")
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
@@ -46,10 +47,6 @@ def document(title: str, style: str, body: str, script: str, framed: str = "") -
 
 def asset(folder: str, name: str) -> str:
     return files("pop_fast.view").joinpath(folder, name).read_text(encoding="utf-8")
-
-
-def _digest(text: str) -> str:
-    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
 def element(tag: str, body: str = "", title: str = "", **attributes: object) -> str:

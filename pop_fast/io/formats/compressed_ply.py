@@ -118,11 +118,7 @@ def _packed_rotation(quats: np.ndarray) -> np.ndarray:
 
 
 def decode(data: bytes, path: Path) -> Cloud:
-    """Read compressed PLY.
-
-    Raises:
-        PopError: it is damaged or cut off; names the element.
-    """
+    """Read compressed PLY."""
     elements = _elements(data, path)
     if "chunk" not in elements or "vertex" not in elements:
         raise PopError(f"{path}: has no element 'chunk' or 'vertex': it is no compressed PLY")

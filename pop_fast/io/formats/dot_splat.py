@@ -48,11 +48,7 @@ def encode_splat(cloud: Cloud) -> bytes:
 
 
 def decode_splat(data: bytes, path: Path) -> Cloud:
-    """Read `.splat`.
-
-    Raises:
-        PopError: its size is no multiple of 32 bytes, or a row cannot be drawn; names the row.
-    """
+    """Read `.splat`."""
     if len(data) % _SPLAT_ROW.itemsize:
         raise PopError(
             f"{path}: has {len(data)} bytes, no multiple of {_SPLAT_ROW.itemsize}; copy or write the file again"
@@ -121,11 +117,7 @@ class _Section:
 
 
 def decode_ksplat(data: bytes, path: Path) -> Cloud:
-    """Read KSPLAT.
-
-    Raises:
-        PopError: it is damaged, cut off, or of another version; names the field.
-    """
+    """Read KSPLAT."""
     if len(data) < _HEADER_SIZE:
         raise PopError(f"{path}: is cut off in its header; {_WRITE_AGAIN}")
     major, minor, count, n, level, low, high = _HEADER.unpack_from(data)

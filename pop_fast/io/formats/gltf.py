@@ -91,8 +91,10 @@ def _glb(turned: Cloud, data: Mapping[str, bytes], stream: bytes | None) -> byte
         "mode": 0,
         "extensions": {NAME: extension},
     }
+    # what glTF has no place for
+    extras = {"antialiased": turned.antialiased, **({} if turned.frame is None else {KEY: turned.frame.entry()})}
     content: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "pop-splatting", "extras": _extras(turned)},
+        "asset": {"version": "2.0", "generator": "pop-splatting", "extras": extras},
         "extensionsUsed": used,
         **({} if stream is None else {"extensionsRequired": used}),
         "scene": 0,
@@ -110,18 +112,8 @@ def _glb(turned: Cloud, data: Mapping[str, bytes], stream: bytes | None) -> byte
     return _MAGIC + struct.pack("<II", 2, 12 + len(chunks)) + chunks
 
 
-def _extras(cloud: Cloud) -> dict[str, Any]:
-    """Return what the asset holds that glTF has no place for."""
-    return {"antialiased": cloud.antialiased, **({} if cloud.frame is None else {KEY: cloud.frame.entry()})}
-
-
 def decode(data: bytes, path: Path) -> Cloud:
-    """Read the first splat of a .glb file, with float32 attributes or an SPZ stream.
-
-    Raises:
-        PopError: it is damaged, holds no splat, stores it in a way that is not known here, or moves it by a node;
-            names the entry.
-    """
+    """Read the first splat of a .glb file, with float32 attributes or an SPZ stream."""
     content, body = _chunks(data, path)
     try:
         primitive = _splat(content, path)

@@ -221,11 +221,7 @@ def _zipped(meta: Mapping[str, Any], images: Mapping[str, np.ndarray]) -> bytes:
 
 
 def decode(data: bytes, path: Path) -> Cloud:
-    """Read SOG, as one file.
-
-    Raises:
-        PopError: it is damaged, of another version, or an image does not fit; names the entry.
-    """
+    """Read SOG, as one file."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             check_members(path, archive, len(data), _WRITE_AGAIN)

@@ -82,7 +82,8 @@ def encode(cloud: Cloud, version: int = 3, sh_step: float = SH_STEP) -> bytes:
     """
     turned = cloud.turned("x")
     bits = _fraction_bits(turned.means)
-    extensions = b"" if cloud.frame is None else _extension(_FRAME, json.dumps({KEY: cloud.frame.entry()}).encode())
+    world = b"" if cloud.frame is None else json.dumps({KEY: cloud.frame.entry()}).encode()
+    extensions = _EXTENSION.pack(_FRAME, len(world)) + world if world else b""
     flags = (_ANTIALIASED if cloud.antialiased else 0) | (_EXTENDED if extensions else 0)
     columns = [
         _centres(turned, bits).astype("<i4").reshape(-1, 1).view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),
@@ -109,10 +110,6 @@ def _zstandard() -> ModuleType:
     except ImportError as error:
         raise PopError(f"SPZ version 4 needs the package zstandard ({error}); pip install zstandard") from error
     return zstandard
-
-
-def _extension(kind: int, payload: bytes) -> bytes:
-    return _EXTENSION.pack(kind, len(payload)) + payload
 
 
 def _fraction_bits(means: np.ndarray) -> int:
@@ -175,11 +172,7 @@ class _Head:
 
 
 def decode(data: bytes, path: Path) -> Cloud:
-    """Read SPZ.
-
-    Raises:
-        PopError: it is damaged, cut off, or of another version; names the field.
-    """
+    """Read SPZ."""
     unpack = _of_streams if data[:4] == struct.pack("<I", MAGIC) else _of_gzip
     head, columns, extensions = unpack(data, path)
     n = head.n

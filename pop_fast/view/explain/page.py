@@ -112,8 +112,8 @@ def page(e: PixelExplanation, maps: Sequence[Map], differences: Sequence[str] = 
             _stages(e, drawn, pictures),
             _light(e),
             _walk(e),
-            _differences(differences),
-            _maps(maps),
+            f"<h2>Where two renderers part</h2><pre>{escape(chr(10).join(differences))}</pre>" if differences else "",
+            f'<h2>The view as maps</h2><div class="maps">{"".join(map(_map, maps))}</div>',
             "<footer>Written by <code>pop explain</code>; the numbers are the oracle's, in float64.</footer>",
         ]
     )
@@ -274,14 +274,6 @@ def _row(row: Row, chosen: bool, has_pop: bool) -> str:
 def _dot(color: Sequence[float]) -> str:
     values = " ".join(f"{c:.3f}" for c in color)
     return f'<span class="swatch" title="{values}" style="background:{css_color(color)}"></span>'
-
-
-def _differences(lines: Sequence[str]) -> str:
-    return f"<h2>Where two renderers part</h2><pre>{escape(chr(10).join(lines))}</pre>" if lines else ""
-
-
-def _maps(maps: Sequence[Map]) -> str:
-    return f'<h2>The view as maps</h2><div class="maps">{"".join(_map(entry) for entry in maps)}</div>'
 
 
 def _map(entry: Map) -> str:

@@ -448,14 +448,11 @@ def _line(row: Row, has_pop: bool) -> str:
     line += f"{number(row.falloff)} {number(row.opacity)} {number(row.alpha)}{'^' if row.clamped else ' '}"
     if row.T is None or row.status != "blended":
         return f"{line} {row.status}, {row.reason}"[:WIDTH]
+    pull = "-".rjust(10) if row.pop == "none" else f"{row.pop:4s} {abs(row.v_opacity_pop):.0e}"
     return (
         f"{line}{number(row.T)} {number(row.weight)}  {rgb(row.color)}  {rgb(row.cumulative)} "
-        f"{row.v_alpha:+9.1e} {row.v_opacity:+8.1e}{f' {_pop(row)}' * has_pop}"
+        f"{row.v_alpha:+9.1e} {row.v_opacity:+8.1e}{f' {pull}' * has_pop}"
     )
-
-
-def _pop(row: Row) -> str:
-    return "-".rjust(10) if row.pop == "none" else f"{row.pop:4s} {abs(row.v_opacity_pop):.0e}"
 
 
 def _folded(rows: Sequence[Row]) -> Iterator[str]:

@@ -17,7 +17,7 @@ from pop_fast.data.capture import View
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.images import write_png
-from pop_fast.io.pictures import colormap_table, error_magnitude, error_scale, id_colors
+from pop_fast.io.pictures import colormap_table, error_magnitude, error_scale, id_colors, to_uint8
 from pop_fast.stages.covariance import opacities_from_logits, scales_from_log_scales
 from pop_fast.stages.losses import photometric
 from pop_fast.stages.polarization import importance_mask, pop_loss_vjp
@@ -192,7 +192,7 @@ class Map:
 
 def view_maps(scene: ExplainedView) -> list[Map]:
     info = scene.info
-    render, photo = as_uint8(scene.image.numpy()), scene.view.image
+    render, photo = to_uint8(scene.image.numpy()), scene.view.image
     error = error_magnitude(render, photo)
     shares = _shares(scene)
     pulls = scaled(
@@ -254,11 +254,6 @@ def scaled(name: str, title: str, about: str, values: np.ndarray, colors: str, t
     picture = table[np.clip(np.round(level * 255.0), 0, 255).astype(np.uint8)]
     picture[~known] = _NONE
     return Map(name, title, about, picture, (colors, low, top))
-
-
-def as_uint8(image: np.ndarray) -> np.ndarray:
-    """Round an image in [0, 1] to 8 bit, clamped."""
-    return np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
 def _count(name: str, title: str, about: str, counts: np.ndarray) -> Map:

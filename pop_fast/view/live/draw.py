@@ -18,7 +18,7 @@ from torch import Tensor
 
 from pop_fast.density.shrink import inside, opaque_enough
 from pop_fast.errors import PopError
-from pop_fast.io.pictures import colormap_table, depth_picture, depth_range, id_colors
+from pop_fast.io.pictures import colormap_table, depth_picture, depth_range, id_colors, to_uint8
 from pop_fast.io.read_back import read_json
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.views import Layers, ViewTensors, render_layers
@@ -90,13 +90,14 @@ class SplatScene:
             whole = found if rows is None else np.append(rows.cpu().numpy(), -1)[found]
             return id_colors(whole), f"; {len(np.unique(whole[whole >= 0])):,} own a pixel, one colour each"
         if state.mode == "opacity":
-            level = np.round(255.0 * np.clip(layers.alpha, 0.0, 1.0)).astype(np.uint8)
-            return colormap_table("viridis")[level], f"; {layers.alpha.mean():.1%} opaque on average, yellow is all"
+            return colormap_table("viridis")[
+                to_uint8(layers.alpha)
+            ], f"; {layers.alpha.mean():.1%} opaque on average, yellow is all"
         if state.mode == "depth":
             depth = np.where(layers.alpha >= _SEEN, layers.depth / self._unit, np.nan)
             near, far = depth_range([depth])
             return depth_picture(depth, near, far), f"; depth {near:.3g} (yellow) to {far:.3g} units of the capture"
-        return np.round(np.clip(layers.image, 0.0, 1.0) * 255.0).astype(np.uint8), ""
+        return to_uint8(layers.image), ""
 
     def _selection(self, min_opacity: float, crop: Box | None) -> tuple[Tensor | None, dict[str, Tensor]]:
         """Return which rows are drawn, None for all, and their parameters."""
@@ -158,19 +159,14 @@ class ViewState:
     @property
     def K(self) -> np.ndarray:
         """Intrinsics, px, with square pixels and the axis in the middle. [3, 3]"""
-        return intrinsics(self.fov_y, self.width, self.height)
+        focal = self.height / (2.0 * np.tan(self.fov_y / 2.0))
+        return np.array([[focal, 0.0, self.width / 2.0], [0.0, focal, self.height / 2.0], [0.0, 0.0, 1.0]])
 
     def camera(self) -> ViewTensors:
         """Return the camera as renderers take it."""
         blank = torch.zeros((self.height, self.width, 3), dtype=torch.uint8)
         viewmat = torch.from_numpy(np.asarray(self.viewmat, np.float64)).float()[None]
         return ViewTensors("view", blank, None, viewmat, torch.from_numpy(self.K).float()[None])
-
-
-def intrinsics(fov_y: float, width: int, height: int) -> np.ndarray:
-    """Return the intrinsics of a camera with square pixels and its axis in the middle, px. [3, 3]"""
-    focal = height / (2.0 * np.tan(fov_y / 2.0))
-    return np.array([[focal, 0.0, width / 2.0], [0.0, focal, height / 2.0], [0.0, 0.0, 1.0]])
 
 
 def field_of_view(K: np.ndarray, height: int) -> float:

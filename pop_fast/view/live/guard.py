@@ -332,11 +332,7 @@ def is_any(host: str) -> bool:
 
 
 def listen(host: str, port: int, tries: int = 100) -> socket.socket:
-    """Listen on an address, or on the next free port where this one is in use.
-
-    Raises:
-        PopError: it cannot be listened on; within a second or so.
-    """
+    """Listen on an address, or on the next free port where this one is in use."""
     place, family = _resolved(host), socket.AF_INET
     if ":" in place:
         family = socket.AF_INET6

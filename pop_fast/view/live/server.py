@@ -23,7 +23,7 @@ import numpy as np
 
 from pop_fast.errors import PopError
 from pop_fast.view.html import view_distances
-from pop_fast.view.live.draw import SplatScene, ViewState, pose_of_viewmat, viewmat_of_pose
+from pop_fast.view.live.draw import SplatScene, ViewState, field_of_view, pose_of_viewmat, viewmat_of_pose
 from pop_fast.view.live.guard import Guard, is_any, listen
 from pop_fast.view.live.panel import Panel
 
@@ -276,8 +276,7 @@ def pose_at(stand: Stand) -> tuple[Any, Any, Any, float]:
     """Return position, look-at point, up direction and vertical angle (radians) of a place to look from."""
     camera = stand.camera
     forward, up = camera.viewmat[2, :3], -camera.viewmat[1, :3]
-    fov = float(2.0 * np.arctan2(camera.height / 2.0, camera.K[1, 1]))
-    return camera.eye, camera.eye + stand.distance * forward, up, fov
+    return camera.eye, camera.eye + stand.distance * forward, up, field_of_view(camera.K, camera.height)
 
 
 class _View:
@@ -373,7 +372,7 @@ class _View:
         wxyz, position = pose_of_viewmat(camera.viewmat)
         added = self._client.scene.add_camera_frustum(
             f"/cameras/{index}",
-            fov=float(2.0 * np.arctan2(camera.height / 2.0, camera.K[1, 1])),
+            fov=field_of_view(camera.K, camera.height),
             aspect=camera.width / camera.height,
             scale=0.06 * stand.distance,
             thickness=0.001 * stand.distance,

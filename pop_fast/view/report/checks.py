@@ -20,7 +20,7 @@ from pop_fast.data.capture import Capture, View, neighbour_degrees
 from pop_fast.data.photo_quality import GAMMA
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
-from pop_fast.io.pictures import fit
+from pop_fast.io.pictures import fit, to_uint8
 from pop_fast.io.read_back import read_json
 from pop_fast.stages.appearance import expose
 from pop_fast.train.config import TrainConfig
@@ -152,7 +152,9 @@ def write_checks(
     text = json.dumps(asdict(checks), indent=2) + "\n"
     target = folder / "report_data" / f"checks_step{step}.json"
     write_atomically(target, lambda file: file.write(text.encode()))
-    _film(folder / "videos" / f"orbit_step{step}.webm", turn, looked)
+    with VideoFile(folder / "videos" / f"orbit_step{step}.webm", _ORBIT_FPS) as video:
+        for view in turn:
+            video.add(to_uint8(looked(view).image))
     return checks
 
 
@@ -160,7 +162,7 @@ def _keep_picture(results: ResultFolder, stem: str, view: View, layers: Layers) 
     """Write what the report shows of a view that measurements kept no pictures of."""
     tensors = ViewTensors.of(view)
     found = measure(torch.from_numpy(layers.image), tensors.target(), tensors.mask)
-    render = np.round(np.clip(layers.image, 0.0, 1.0) * 255.0).astype(np.uint8)
+    render = to_uint8(layers.image)
     results.write_arrays(stem, name=view.name, render=render, photo=view.image, psnr=found.psnr, ssim=found.ssim)
 
 
@@ -292,12 +294,6 @@ def orbit_views(train: Sequence[View]) -> list[View]:
     blank = np.zeros((height, width, 3), np.uint8)
     path = camera_path("orbit", np.stack([view.viewmat for view in train]), _ORBIT_FRAMES)
     return [View(f"frame {i} of the orbit", blank, viewmat, K) for i, viewmat in enumerate(path)]
-
-
-def _film(path: Path, views: Sequence[View], looked: Any) -> None:
-    with VideoFile(path, _ORBIT_FPS) as video:
-        for view in views:
-            video.add(np.round(np.clip(looked(view).image, 0.0, 1.0) * 255.0).astype(np.uint8))
 
 
 def read_checks(path: Path) -> Checks:

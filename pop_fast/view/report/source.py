@@ -45,11 +45,7 @@ _SMOOTH: Final = 0.03  # width of the running means, as a share of the records
 
 
 def read_result(folder: Path) -> ReportData:
-    """Read all that the report shows of a result folder.
-
-    Raises:
-        PopError: the folder is not a result of `pop train`, or one of its files cannot be read.
-    """
+    """Read all that the report shows of a result folder."""
     config = read_config(folder)
     records = read_records(folder)
     stats = read_last_stats(folder)
@@ -59,9 +55,10 @@ def read_result(folder: Path) -> ReportData:
     dominant = _dominant(folder)
     changes = [record for record in records if "cloned" in record or "reset" in record]
     curves, checks = _curves(records, folder), _checks(folder)
+    held_out = f"{stats['views']} held-out views" if "views" in stats else ""
     return ReportData(
         title=f"{Path(config.data).resolve().name} · {method.split(' (')[0]}",
-        subtitle=" · ".join(filter(None, [method, _schedule_note(config), _views_note(stats), _machine(stats)])),
+        subtitle=" · ".join(filter(None, [method, _schedule_note(config), held_out, _machine(stats)])),
         headline=headline(stats),
         curves=curves,
         max_steps=config.max_steps,
@@ -193,21 +190,13 @@ def read_last_stats(folder: Path) -> dict[str, Any]:
 
 
 def read_stats(path: Path) -> dict[str, Any]:
-    """Read one file of statistics.
-
-    Raises:
-        PopError: it is damaged; names the entry.
-    """
+    """Read one file of statistics."""
     fix = "write it again with 'pop eval'"
     return check_record(read_json(path, fix), str(path), fix)
 
 
 def read_view(path: Path) -> dict[str, np.ndarray]:
-    """Read what a run has kept of a held-out view: its name, render, photo, psnr and ssim.
-
-    Raises:
-        PopError: the file is damaged; names the array.
-    """
+    """Read what a run has kept of a held-out view: its name, render, photo, psnr and ssim."""
     return read_arrays(path, _VIEW, _AGAIN)
 
 
@@ -257,10 +246,6 @@ def _schedule_note(config: TrainConfig) -> str:
     if given is None or given.scaler == 1.0:
         return steps
     return f"{steps} (preset {given.preset}, the paper's schedule times {given.scaler:g})"
-
-
-def _views_note(stats: Mapping[str, Any]) -> str:
-    return f"{stats['views']} held-out views" if "views" in stats else ""
 
 
 def _curves(records: Sequence[Mapping[str, Any]], folder: Path) -> dict[str, tuple[list[float], list[float]]]:
@@ -329,19 +314,14 @@ def _histograms(folder: Path, max_steps: int) -> Iterator[Histogram]:
 
 def _views(folder: Path) -> list[ReportView]:
     """Read the held-out views, the worst first."""
-    depths = dict(_depths(folder))
+    kept = (read_arrays(path, _DEPTH, _AGAIN) for path in _last_view_files(folder, "depth"))
+    depths = {str(found["name"]): found["depth"] for found in kept}
     views = []
     for path in _last_view_files(folder):
         a = read_view(path)
         name = str(a["name"])
         views.append(ReportView(name, a["render"], a["photo"], float(a["psnr"]), float(a["ssim"]), depths.get(name)))
     return sorted(views, key=lambda view: (view.psnr is None, view.psnr))
-
-
-def _depths(folder: Path) -> Iterator[tuple[str, np.ndarray]]:
-    for path in _last_view_files(folder, "depth"):
-        a = read_arrays(path, _DEPTH, _AGAIN)
-        yield str(a["name"]), a["depth"]
 
 
 def _dominant(folder: Path) -> tuple[str, np.ndarray, np.ndarray] | None:
@@ -404,6 +384,8 @@ def row(stats: Mapping[str, Any]) -> list[str]:
         return "–" if any(value is None for value in values) else form.format(*values)
 
     steps = stats.get("step")
+    taken, planned = (steps or 0) + 1, stats.get("max_steps")
+    unfinished = f" of {planned:,}, unfinished" if isinstance(planned, int) and taken < planned else ""
     method = str(stats.get("method", "–"))
     machine = [str(stats.get("machine", "–")), *([stats["backend"]] if stats.get("backend") else [])]
     machine += [threads_of(stats)] if "threads" in stats else []
@@ -411,7 +393,7 @@ def row(stats: Mapping[str, Any]) -> list[str]:
         str(stats.get("capture", "–")),
         METHODS[name].title.split(" (")[0] if (name := ALIASES.get(method, method)) in METHODS else method,
         "–" if not stats.get("lambda_pop") else f"{stats['lambda_pop']:g}",
-        "–" if steps is None else _steps(steps + 1, stats.get("max_steps")),
+        "–" if steps is None else f"{taken:,}{unfinished}",
         cell("{:.2f}", "psnr"),
         cell("{:.4f}", "ssim"),
         cell("{:,}", "num_GS"),
@@ -421,11 +403,6 @@ def row(stats: Mapping[str, Any]) -> list[str]:
         cell("{:,.0f}", "seconds"),
         ", ".join(machine),
     ]
-
-
-def _steps(taken: int, planned: Any) -> str:
-    """Write how many steps a row is of, and of how many where the run has not come to its end."""
-    return f"{taken:,}" if not isinstance(planned, int) or taken >= planned else f"{taken:,} of {planned:,}, unfinished"
 
 
 def threads_of(stats: Mapping[str, Any]) -> str:
