@@ -238,7 +238,7 @@ def _chunk(data: bytes, at: int, name: bytes, form: str, name_at: int, length_at
 
 
 def _tags(data: bytes, base: int, offset: int | None = None) -> dict[int, Any]:
-    """Read one TIFF directory: by tag, a text or the first of its numbers; struct.error and KeyError where there is none."""
+    """Read one TIFF directory: by tag, a text or the first of its numbers; struct.error, KeyError where none is."""
     order = _TIFF[data[base : base + 4]]
     start = base + (struct.unpack_from(f"{order}I", data, base + 4)[0] if offset is None else offset)
     (count,) = struct.unpack_from(f"{order}H", data, start)
