@@ -23,19 +23,11 @@ _LIBRARIES: Final = ("libtorch_python.so", "libtorch_python.dylib", "torch_pytho
 
 
 def why_torch_fails() -> str | None:
-    """Tell whether torch can be imported, from whether its library loads; None where it does.
+    """Tell whether torch can be imported, from whether its library loads: the error, or None where it does.
 
     Where the library does not load by itself, torch is imported: it knows more places to look for what it needs.
-
-    Returns:
-        The error, with its type's name, or None.
     """
-    try:
-        if not _loads():
-            importlib.import_module("torch")
-    except Exception as error:  # a broken install raises anything: OSError for a shared library, for one
-        return f"{type(error).__name__}: {error}"
-    return None
+    return None if _loads() else _why_not_imported("torch")
 
 
 def cuda_version() -> str | None:

@@ -169,11 +169,8 @@ def _asked(argv: Sequence[str]) -> tuple[TrainConfig, Any, bool]:
     """Read the words; where they say no schedule, the run chooses for itself, unless it was begun with one."""
     if not chooses_for_itself(rename_aliases(argv)):
         config, options = arguments(argv)
-        return (
-            config,
-            options,
-            config.preset == AUTOMATIC and "max_steps" not in (config.given.settings if config.given else {}),
-        )
+        said = {} if config.given is None else config.given.settings
+        return config, options, config.preset == AUTOMATIC and "max_steps" not in said
     config, options = arguments(["--preset", AUTOMATIC, *argv])
     folder = Path(config.result_dir)
     if options.resume and (folder / "cfg.json").exists() and begun(folder) is None:

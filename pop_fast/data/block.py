@@ -26,15 +26,14 @@ from pop_fast.io.read_back import read_arrays, read_json
 
 T = TypeVar("T")
 
-__all__ = ["BLOCK", "find_block", "read_block", "write_block"]
 
 BLOCK: Final = "block"  # what a list of a block says that it is made from
-_LIST, _POINTS = "block.json", "points.npz"
+_BLOCK_LIST, _POINTS = "block.json", "points.npz"
 _FIX: Final = "remove the folder with all blocks, and start 'pop train --blocks' again with --overwrite"
 
 
 def find_block(folder: Path) -> bool:
-    return (folder / _LIST).is_file()
+    return (folder / _BLOCK_LIST).is_file()
 
 
 def write_block(folder: Path, listing: Listing) -> None:
@@ -53,17 +52,17 @@ def write_block(folder: Path, listing: Listing) -> None:
     write_atomically(folder / _POINTS, lambda file: np.savez(file, xyz=cloud.xyz, rgb=cloud.rgb))
     # the list comes last: a folder that has it is whole
     text = json.dumps(content, indent=1) + "\n"
-    write_atomically(folder / _LIST, lambda file: file.write(text.encode()))
+    write_atomically(folder / _BLOCK_LIST, lambda file: file.write(text.encode()))
 
 
 def read_block(folder: Path) -> Listing:
     """Read a block; a CaptureError says that its capture is not where it was, or names a file that is damaged."""
-    path, points = folder / _LIST, folder / _POINTS
+    path, points = folder / _BLOCK_LIST, folder / _POINTS
     content = _refused_as_capture(lambda: read_json(path, _FIX))
     try:
         root = Path(content["capture"])
         transform = _matrix(content["transform"])
-        shots = [_shot(entry) for entry in content["photographs"]]
+        shots = [_block_shot(entry) for entry in content["photographs"]]
     # pycolmap says what it does not know of a camera by errors of many kinds
     except Exception as error:
         raise CaptureError(f"{path}: is not what 'pop train --blocks' writes ({error!r}); {_FIX}") from error
@@ -118,7 +117,7 @@ def _entry(shot: PosedImage) -> dict[str, Any]:
     }
 
 
-def _shot(entry: Any) -> PosedImage:
+def _block_shot(entry: Any) -> PosedImage:
     lens = entry["camera"]
     camera = None
     texts = [entry[name] for name in ("name", "folder", "file")]

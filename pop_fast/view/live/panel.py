@@ -47,9 +47,10 @@ class Panel:
         self._sent: deque[float] = deque(maxlen=_FILES)
         self._client, self._title, self._names = client, title, list(names)
         self._world_transform = world_transform
-        self._changed: Callable[[], None] = lambda: None
-        self._stand: Callable[[int], None] = lambda index: None
-        self._frustums: Callable[[bool], None] = lambda shown: None
+        # called when something else is to be shown, with a place to look from, and to show training cameras or not
+        self.changed: Callable[[], None] = lambda: None
+        self.stand: Callable[[int], None] = lambda index: None
+        self.frustums: Callable[[bool], None] = lambda shown: None
         self._wanted = False
         self._taken = 0
         self._path: list[KeyCamera] = []
@@ -74,18 +75,6 @@ class Panel:
         """Forget the controls, which nobody can set any more."""
         for name in self._controls:
             self._rules.pop(name, None)
-
-    def on_change(self, call: Callable[[], None]) -> None:
-        """Call this when something else is to be shown."""
-        self._changed = call
-
-    def on_stand(self, call: Callable[[int], None]) -> None:
-        """Call this with the number of a place to look from."""
-        self._stand = call
-
-    def on_frustums(self, call: Callable[[bool], None]) -> None:
-        """Call this when training cameras are to be shown, or not."""
-        self._frustums = call
 
     @property
     def mode(self) -> Mode:
@@ -161,7 +150,7 @@ class Panel:
             choice = gui.add_dropdown("look from", tuple(self._names), initial_value=self._names[0])
             step = gui.add_button_group("", ("previous", "next"))
             shown = gui.add_checkbox("show cameras and photographs", False)
-        self._use(choice, one_of(self._names), lambda: self._stand(self._names.index(choice.value)))
+        self._use(choice, one_of(self._names), lambda: self.stand(self._names.index(choice.value)))
 
         def move() -> None:
             by = 1 if step.value == "next" else -1
@@ -169,7 +158,7 @@ class Panel:
             choice.value = self._names[(self._names.index(choice.value) + by) % len(self._names)]
 
         self._use(step, one_of(("previous", "next")), move)
-        self._use(shown, flag, lambda: self._frustums(shown.value))
+        self._use(shown, flag, lambda: self.frustums(shown.value))
 
     def _add_files(self, gui: Any) -> None:
         self._use(gui.add_button("Screenshot"), flag, self._ask)
@@ -182,7 +171,7 @@ class Panel:
 
     def _ask(self) -> None:
         self._wanted = True
-        self._changed()
+        self.changed()
 
     def _forget(self) -> None:
         del self._path[-1:]
@@ -196,4 +185,4 @@ class Panel:
         crop = self.crop
         words = "" if crop is None else f"`--crop {' '.join(f'{value:.4g}' for value in crop)}`"
         self._crop_words.content = words and f"the same in a file: {words} of `pop export`"
-        self._changed()
+        self.changed()

@@ -290,9 +290,7 @@ class _View:
         names = [stand.camera.name for stand in self._stands]
         transform, rules = viewer._scene.world_transform, viewer._guard.rules
         self.panel = Panel(client, names, viewer._title, viewer.box, transform, rules, self._held)
-        self.panel.on_change(self._changed)
-        self.panel.on_stand(self.look_from)
-        self.panel.on_frustums(self._show_frustums)
+        self.panel.changed, self.panel.stand, self.panel.frustums = self._changed, self.look_from, self._show_frustums
         client.camera.on_update(self._held(self._moved))
 
     def look_from(self, index: int) -> None:
