@@ -27,9 +27,8 @@ from pop_fast.blocks.rounds import own_of
 from pop_fast.cli import compare
 from pop_fast.cli.data_check import look_over
 from pop_fast.cli.render import listed_in
-from pop_fast.data.block import read_block
-from pop_fast.data.load import load_capture
-from pop_fast.data.sfm_files import recognise_result
+from pop_fast.data.load import load_capture, read_block
+from pop_fast.data.sfm import recognise_result
 from pop_fast.data.unpack import take_frames, unpack
 from pop_fast.errors import CaptureError
 from pop_fast.io.formats import load_splat_file

@@ -14,9 +14,8 @@ import numpy as np
 from pop_fast.blocks.jobs import Part, block_folder, result_of
 from pop_fast.blocks.merge import merge
 from pop_fast.blocks.plan import FOLDER, Job, Plan, make_plan, write_plan
-from pop_fast.data.capture import Capture, Listing, Progress
+from pop_fast.data.capture import Capture, Listing, Progress, SfmOptions
 from pop_fast.data.load import Photographs, list_capture, load_capture
-from pop_fast.data.sfm_files import SfmOptions
 from pop_fast.io.atomic import write_atomically
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import CaptureRecord

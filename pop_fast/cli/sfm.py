@@ -10,7 +10,7 @@ from typing import Annotated, Final, Literal
 import tyro
 
 from pop_fast.cli import parse
-from pop_fast.data.sfm_files import SfmOptions
+from pop_fast.data.capture import SfmOptions
 from pop_fast.io.heartbeat import bars
 
 _EXAMPLES: Final = """

@@ -38,7 +38,7 @@ from pop_fast.cli.train_options import (
     with_size,
 )
 from pop_fast.cli.view import LiveView, check_viewer
-from pop_fast.data.sfm_files import SfmOptions
+from pop_fast.data.capture import SfmOptions
 from pop_fast.errors import PopError
 from pop_fast.io.heartbeat import bars, duration
 from pop_fast.train.automatic import begun, check_minutes

@@ -95,7 +95,7 @@ def transform_of(splat: Splat) -> np.ndarray | None:
 
 def stands_of_capture(capture: Capture, test_every: int, means: Any) -> list[Any]:
     """Make places to look from of the training views, at most sixty."""
-    from pop_fast.io.pictures import fit
+    from pop_fast.io.images import fit
     from pop_fast.view.html import cameras_of
     from pop_fast.view.live.server import stands_of
 

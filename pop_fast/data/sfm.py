@@ -10,11 +10,15 @@ The search runs in a process of its own. COLMAP computes for minutes inside one 
 process can be ended at any moment, and takes COLMAP's threads, its log and its memory with it. The words of the two
 processes are lines of JSON: one job, and for it any number of reports of progress and one end. Between two reports the
 one that waits counts what COLMAP has written to its database: photographs with features, and pairs that were compared.
+
+It leaves a list of its files, with which replacing a result never removes anything else. The list lies beside the model
+as `sparse/sfm.sha256`, in the format of `sha256sum`, with paths relative to the capture.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import itertools
 import json
 import os
@@ -33,11 +37,10 @@ from typing import IO, Any, Final, Literal
 
 from pop_fast.children import python_command
 from pop_fast.data.cameras import require_colmap
-from pop_fast.data.capture import Progress
+from pop_fast.data.capture import Progress, SfmOptions
 from pop_fast.data.colmap import quiet_colmap
 from pop_fast.data.exports import photographs_of_polycam
 from pop_fast.data.photo_quality import FIX, Shown, about_mixed_sizes, about_use, measure
-from pop_fast.data.sfm_files import UPRIGHT, SfmOptions, recognise_result, write_list
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import check_folder, folder_atomically
 from pop_fast.io.image_header import HEIF_SUFFIXES, read_exif
@@ -477,3 +480,55 @@ def _map(job: Search, tell: Progress) -> Any:
     if best is None or best.num_reg_images() < 2 or best.num_points3D() == 0:
         raise CaptureError(f"no cameras could be found for these {len(job.names)} photographs; {FIX}")
     return best
+
+
+UPRIGHT = "upright.json"
+_LIST = "sfm.sha256"
+
+
+def write_list(sparse: Path, folder: Path, prefix: str = "") -> None:
+    """List every file of a new result `folder` in its folder `sparse`, with `prefix` before their paths."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    lines = [f"{_sha256(path)}  {prefix}{path.relative_to(folder).as_posix()}\n" for path in files]
+    (sparse / _LIST).write_text("".join(lines), encoding="utf-8", errors="surrogateescape")
+
+
+def read_upright(sparse: Path) -> dict[str, int]:
+    """Read by how many quarter turns clockwise photographs are to be turned, by name; others are absent."""
+    path = sparse / UPRIGHT
+    if not path.is_file():
+        return {}
+    fix = "run pop sfm again with --overwrite"
+    try:
+        turns = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise CaptureError(f"{path}: is not JSON ({error}); {fix}") from error
+    if not isinstance(turns, dict) or not all(type(count) is int and 1 <= count <= 3 for count in turns.values()):
+        raise CaptureError(f"{path}: must hold quarter turns, 1 to 3, by the photograph's name; {fix}")
+    return turns
+
+
+def recognise_result(capture: Path, target: Path) -> Callable[[Path], bool]:
+    """Make a test of whether a file, by its path relative to the `target` to be replaced, is as it was written."""
+    written = _read_list(capture / "sparse" / _LIST)
+
+    def recognise(file: Path) -> bool:
+        path = target / file
+        if path.is_symlink():
+            return False
+        name = path.relative_to(capture).as_posix()
+        return name == f"sparse/{_LIST}" or (name in written and written[name] == _sha256(path))
+
+    return recognise
+
+
+def _read_list(path: Path) -> dict[str, str]:
+    if not path.is_file():
+        return {}
+    lines = path.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+    return {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
+
+
+def _sha256(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pop_fast.io.images import write_png
-from pop_fast.io.pictures import error_magnitude, error_picture, id_colors
+from pop_fast.io.images import error_magnitude, error_picture, id_colors, write_png
 from pop_fast.stages.appearance import color_correct
 from pop_fast.stages.losses import ssim
 from pop_fast.stages.ssim import WINDOW_SIZE

@@ -19,7 +19,7 @@ import pytest
 import torch
 
 from pop_fast.cli.view import stands_of_capture
-from pop_fast.io.pictures import id_colors
+from pop_fast.io.images import id_colors
 from pop_fast.train import TrainingRun
 from pop_fast.train.gpu_proxy import renderer
 from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture

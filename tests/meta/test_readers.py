@@ -216,7 +216,7 @@ def test_a_function_that_opens_a_file_is_noticed() -> None:
     for key in (
         ("pop_fast.io.images", "_decode"),
         ("pop_fast.io.image_header", "heif_exif"),
-        ("pop_fast.data.block", "read_block"),  # through read_json
+        ("pop_fast.data.load", "read_block"),  # through read_json
         ("pop_fast.blocks.plan", "read_job"),
         ("pop_fast.train.checkpoint", "load_splats"),  # through read_torch_file
         ("pop_fast.data.unpack", "_open"),

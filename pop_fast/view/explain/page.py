@@ -8,7 +8,7 @@ from html import escape
 
 import numpy as np
 
-from pop_fast.io.pictures import data_uri, fit, id_colors
+from pop_fast.io.images import data_uri, fit, id_colors
 from pop_fast.view.document import asset, document, element
 from pop_fast.view.explain.pixel import PixelExplanation, Row, weighty
 from pop_fast.view.explain.scene import Map, crop

@@ -16,8 +16,7 @@ from pop_fast.api.rasterize import rasterization
 from pop_fast.data.capture import View
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
-from pop_fast.io.images import write_png
-from pop_fast.io.pictures import colormap_table, error_magnitude, error_scale, id_colors, to_uint8
+from pop_fast.io.images import colormap_table, error_magnitude, error_scale, id_colors, to_uint8, write_png
 from pop_fast.stages.covariance import opacities_from_logits, scales_from_log_scales
 from pop_fast.stages.losses import photometric
 from pop_fast.stages.polarization import importance_mask, pop_loss_vjp

@@ -23,9 +23,8 @@ import numpy as np
 
 from pop_fast.errors import PopError
 from pop_fast.view.html import view_distances
-from pop_fast.view.live.draw import SplatScene, ViewState, field_of_view, pose_of_viewmat, viewmat_of_pose
+from pop_fast.view.live.draw import Panel, SplatScene, ViewState, field_of_view, pose_of_viewmat, viewmat_of_pose
 from pop_fast.view.live.guard import Guard, is_any, listen
-from pop_fast.view.live.panel import Panel
 
 if TYPE_CHECKING:
     from pop_fast.view.html import PageCamera

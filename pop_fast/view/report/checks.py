@@ -20,7 +20,7 @@ from pop_fast.data.capture import Capture, View, neighbour_degrees
 from pop_fast.data.photo_quality import GAMMA
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
-from pop_fast.io.pictures import fit, to_uint8
+from pop_fast.io.images import fit, to_uint8
 from pop_fast.io.read_back import read_json
 from pop_fast.stages.appearance import expose
 from pop_fast.train.config import TrainConfig

@@ -10,7 +10,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from pop_fast.io import pictures
+from pop_fast.io import images
 from pop_fast.train.commands import shell_line
 from pop_fast.view.document import Chart, Series, asset, document, draw, draw_histogram
 from pop_fast.view.report.model import Finding, Histogram, ReportData, ReportView, Tile
@@ -129,7 +129,7 @@ def _dominance(data: ReportData) -> str:
     name, ids, render = data.dominant
     n_owners = len(np.unique(ids[ids >= 0]))
     share = 100.0 * float((ids >= 0).mean())
-    ids_uri = pictures.data_uri(pictures.fit(pictures.id_colors(ids), nearest=True), lossless=True)
+    ids_uri = images.data_uri(images.fit(images.id_colors(ids), nearest=True), lossless=True)
     return (
         "<h2>Who owns each pixel</h2>"
         "<p>The dominant Gaussian of a pixel is the one with the largest blending weight there. "
@@ -137,7 +137,7 @@ def _dominance(data: ReportData) -> str:
         '<div class="view"><div class="pair">'
         f'<figure><img class="ids" alt="dominant Gaussians of {escape(name)}" src="{ids_uri}">'
         f'<figcaption class="caption">{n_owners:,} Gaussians own {share:.1f} % of the pixels</figcaption></figure>'
-        f'<figure><img alt="render of {escape(name)}" src="{pictures.data_uri(pictures.fit(render))}">'
+        f'<figure><img alt="render of {escape(name)}" src="{images.data_uri(images.fit(render))}">'
         f'<figcaption class="caption">{escape(name)}</figcaption></figure></div></div>'
     )
 
@@ -303,16 +303,16 @@ def views_section(views: Sequence[ReportView], n_held_out: int | None) -> str:
     """Show held-out views, the worst first, of all that were measured."""
     if not views:
         return ""
-    errors = [pictures.error_magnitude(view.render, view.photo) for view in views]
-    top = pictures.error_scale(errors)
-    near, far = pictures.depth_range([view.depth for view in views if view.depth is not None])
+    errors = [images.error_magnitude(view.render, view.photo) for view in views]
+    top = images.error_scale(errors)
+    near, far = images.depth_range([view.depth for view in views if view.depth is not None])
     rows = [_view(view, error, top, near, far) for view, error in zip(views, errors, strict=True)]
     some = f" Pictures of {len(views)} of {n_held_out}." if n_held_out is not None and n_held_out > len(views) else ""
-    legend = _bar("error", pictures.colorbar_css(), "0", f"{255 * top:.0f} of 255 and more")
+    legend = _bar("error", images.colorbar_css(), "0", f"{255 * top:.0f} of 255 and more")
     if any(view.depth is not None for view in views):
         legend += _bar(
             "depth",
-            pictures.colorbar_css(pictures.DEPTH_COLORS),
+            images.colorbar_css(images.DEPTH_COLORS),
             f"{near:.3g}",
             f"{far:.3g} units of the capture, logarithmic",
         )
@@ -330,13 +330,13 @@ def _view(view: ReportView, error: np.ndarray, top: float, near: float, far: flo
     numbers += [] if view.ssim is None else [f"SSIM {view.ssim:.4f}"]
     head = f"<b>{name}</b>" + "".join(f'<span class="num">{text}</span>' for text in numbers)
     height, width = view.photo.shape[:2]
-    beside = [_figure("error", name, pictures.error_picture(error, top))]
+    beside = [_figure("error", name, images.error_picture(error, top))]
     if view.depth is not None:
-        beside.append(_figure("depth", name, pictures.depth_picture(view.depth, near, far)))
+        beside.append(_figure("depth", name, images.depth_picture(view.depth, near, far)))
     slider = (
         f'<figure class="slider" style="aspect-ratio:{width}/{height}">'
-        f'<img alt="photo of {name}" src="{pictures.data_uri(pictures.fit(view.photo))}">'
-        f'<img class="over" alt="render of {name}" src="{pictures.data_uri(pictures.fit(view.render))}">'
+        f'<img alt="photo of {name}" src="{images.data_uri(images.fit(view.photo))}">'
+        f'<img class="over" alt="render of {name}" src="{images.data_uri(images.fit(view.render))}">'
         '<span class="left">photograph</span><span class="right">render</span><i></i>'
         f'<input type="range" min="0" max="100" step="0.5" value="50" aria-label="photograph against render, {name}">'
         "</figure>"
@@ -346,7 +346,7 @@ def _view(view: ReportView, error: np.ndarray, top: float, near: float, far: flo
 
 
 def _figure(what: str, name: str, picture: np.ndarray) -> str:
-    uri = pictures.data_uri(pictures.fit(picture))
+    uri = images.data_uri(images.fit(picture))
     return (
         f'<figure><img loading="lazy" alt="{what} of {name}" src="{uri}">'
         f'<figcaption class="caption">{what}</figcaption></figure>'
