@@ -1,4 +1,4 @@
-"""Load a capture, whatever made it: a COLMAP model, other programs' cameras, or a bare folder of photographs; or a block.
+"""Load a capture, whatever made it: a COLMAP model, other programs' cameras, a bare folder of photographs; or a block.
 
 Where a capture brings no points to start from, they are drawn: uniform in the cube around the cameras, where two look.
 

@@ -1,4 +1,4 @@
-"""Photographs and masks, found by name, checked and decoded as COLMAP does with OpenCV; and pictures of arrays for pages.
+"""Photographs and masks, found by name, checked and decoded with OpenCV as COLMAP does; pictures of arrays for pages.
 
 EXIF orientation is ignored, because COLMAP ignores it: a model's width and height are those of the stored pixels.
 

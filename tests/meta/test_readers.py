@@ -58,7 +58,10 @@ EXEMPT = {
     "paper_repro.cli:main": "the null device",
     "pop_fast.cli.explain:_explain": "parses what it has made itself",
     "pop_fast.demo.make:_write_model": "makes a model, and reads none",
-    "pop_fast.data.sfm": "reads what the search has written, and what its own child process says",
+    **dict.fromkeys(
+        (f"pop_fast.data.sfm:{name}" for name in ("_extract", "_listen", "_rows", "find_cameras", "main")),
+        "reads what the search has written, and what its own child process says",
+    ),
     "pop_fast.io.images:main": "a child process that decodes what has been read; its end harms nobody",
     "cuda_ext.gpu_check.shared:Command._words": "the end of a log that it has written, with any bytes",
     "cuda_ext.gpu_check.several:_train": "shows what its own training has written",
