@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from pop_fast.data.cameras import require_colmap
-from pop_fast.data.capture import Progress
+from pop_fast.data.capture import Progress, camera_centers
 from pop_fast.data.colmap import quiet_colmap
 from pop_fast.demo.scene import DemoScene, Shape, dot, make_scene
 from pop_fast.errors import CaptureError
@@ -141,15 +141,11 @@ def _survey(
         column, row = at[view][seen[view]].astype(int).T
         total[seen[view]] += photograph[row, column]
     rgb = np.rint(total / seen.sum(axis=0)[:, None]).astype(np.uint8)
-    depth = np.median(np.linalg.norm(points[None] - _centers(viewmats)[:, None], axis=-1), axis=0)
+    depth = np.median(np.linalg.norm(points[None] - camera_centers(viewmats)[:, None], axis=-1), axis=0)
     # triangulated from m observations, a point is off by about a pixel's footprint over sqrt(m)
     footprint = _PIXEL_NOISE * depth / K[0, 0] / np.sqrt(seen.sum(axis=0))
     noisy = points + footprint[:, None] * generator.standard_normal(points.shape)
     return _Survey(noisy, rgb, seen, at + _PIXEL_NOISE * generator.standard_normal(at.shape))
-
-
-def _centers(viewmats: np.ndarray) -> np.ndarray:
-    return -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
 
 
 def _project(viewmat: np.ndarray, K: np.ndarray, points: np.ndarray) -> np.ndarray:

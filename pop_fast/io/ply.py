@@ -238,14 +238,18 @@ class Header:
 
 def read_header(path: Path) -> Header:
     """Read the header alone; a PopError says that it is absent or cut off, or names the line that breaks a rule."""
+    return header_of(file_bytes(path, "PLY file", _LONGEST), path)
+
+
+def file_bytes(path: Path, what: str = "file", most: int = -1) -> bytes:
+    """Return a file's bytes, or so many from its beginning; a PopError says that it is absent or cannot be read."""
     try:
         with open(path, "rb") as file:
-            head = file.read(_LONGEST)
+            return file.read(most)
     except FileNotFoundError:
-        raise PopError(f"{path}: the PLY file is absent; check the path") from None
+        raise PopError(f"{path}: the {what} is absent; check the path") from None
     except OSError as error:
         raise PopError(f"{path}: could not be read: {error.strerror}; check the path and its permissions") from error
-    return header_of(head, path)
 
 
 def header_of(data: bytes, path: Path) -> Header:
@@ -265,9 +269,7 @@ def read_vertices(path: Path) -> np.ndarray:
     # a file that is no splat is recognised by its beginning
     _vertex_elements(read_header(path), path)
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise PopError(f"{path}: could not be read: {error.strerror}; check the path and its permissions") from error
+        data = file_bytes(path)
     except MemoryError as error:
         raise PopError(f"{path}: does not fit into memory; crop or thin it out first") from error
     return vertices_of(data, path)

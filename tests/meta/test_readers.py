@@ -39,7 +39,6 @@ EXEMPT = {
     "pop_ref.learn.grading:read_grade": "one line of a child process; its test hands it what a student may print",
     "pop_fast.cli.learn:_graded_apart": "hands read_grade what its own child process says",
     "pop_fast.view.document": OWN,
-    "pop_fast.view.html": OWN,
     "pop_fast.compiled.build": OWN,
     "pop_fast.compiled.library": SYSTEM,
     "pop_fast.compiled.native_step": "opens a handle of the compiled library, no file",

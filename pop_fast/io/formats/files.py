@@ -15,7 +15,7 @@ from pop_fast.io.formats import FORMATS, PLY, format_names, sog
 from pop_fast.io.formats.cloud import Cloud
 from pop_fast.io.formats.compressed_ply import is_compressed
 from pop_fast.io.formats.table import READ_ONLY
-from pop_fast.io.ply import Frame, asks_for_antialiasing, header_of, params_of_ply, ply_bytes
+from pop_fast.io.ply import Frame, asks_for_antialiasing, file_bytes, header_of, params_of_ply, ply_bytes
 
 
 class Stored(NamedTuple):
@@ -145,20 +145,11 @@ def load_splat_file(path: str | os.PathLike[str]) -> Stored:
     if path.name.lower() == sog.META:
         return _stored(sog.decode_folder(path))
     if suffix in READ_ONLY:
-        return _stored(READ_ONLY[suffix](_bytes(path), path))
+        return _stored(READ_ONLY[suffix](file_bytes(path), path))
     if not is_splat_file(path):
         raise PopError(f"{path}: the name must end in one of {', '.join(readable_names())}")
     name = named_format(path)
     if name in (PLY, "compressed-ply"):
         # either may stand under the name of the other
         name = "compressed-ply" if is_compressed(path) else PLY
-    return decoded(name, _bytes(path), path)
-
-
-def _bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise PopError(f"{path}: the file is absent; check the path") from None
-    except OSError as error:
-        raise PopError(f"{path}: could not be read: {error.strerror}; check the path and its permissions") from error
+    return decoded(name, file_bytes(path), path)
