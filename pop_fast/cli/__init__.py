@@ -136,7 +136,9 @@ def _run(words: list[str]) -> int:
         print(_overview())
         return 0
     if words[0] in ("-V", "--version"):
-        print(f"pop {_version()}")
+        from importlib.metadata import version
+
+        print(f"pop {version('pop-splatting')}")
         return 0
     name, rest = _split(words)
     if name is None:
@@ -187,12 +189,6 @@ def _overview() -> str:
     )
 
 
-def _version() -> str:
-    from importlib.metadata import version
-
-    return version("pop-splatting")
-
-
 # C0 without tab and line feed, DEL, C1, and what turns the direction of a line
 _CONTROL: Final = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 # of a message; both of its ends say more than the middle
@@ -232,7 +228,9 @@ def describe(error: BaseException) -> str | None:
         return "out of memory; use smaller images (--factor 2 or more) or fewer Gaussians"
     if isinstance(error, RuntimeError) and "can't start new thread" in str(error):
         return "the system allows no further thread; raise the limit (ulimit -u), or use fewer: --threads 1"
-    if isinstance(error, ValueError | NotImplementedError) and _raised_here(error):
+    frames = traceback.extract_tb(error.__traceback__)
+    here = bool(frames) and any(package in frames[-1].filename.replace("\\", "/") for package in _PACKAGES)
+    if isinstance(error, ValueError | NotImplementedError) and here:
         return re.sub(r"\s*\n\s*", " ", str(error))
     return None
 
@@ -254,11 +252,6 @@ def _describe_os_error(error: OSError) -> str | None:
             return None
         case _:
             return f"{where}{error.strerror}"
-
-
-def _raised_here(error: BaseException) -> bool:
-    frames = traceback.extract_tb(error.__traceback__)
-    return bool(frames) and any(package in frames[-1].filename.replace("\\", "/") for package in _PACKAGES)
 
 
 T = TypeVar("T")

@@ -66,6 +66,7 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
     from pop_fast.data import check_dataset
     from pop_fast.data.photo_quality import CaptureFinding, about_quality, bad, measure_file, number, warn
     from pop_fast.data.sfm import photo_folder, photographs
+    from pop_fast.io.images import find_image
 
     listing = check_dataset.read_listing(root, images)
     if listing is None:
@@ -85,7 +86,7 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
     findings += [warn("poses", note) for note in listing.notes]
     findings += check_dataset.about_cameras(shots)
     findings += check_dataset.about_spacing(shots)
-    paths = {id(shot): check_dataset.file_of(root, shot) for shot in shots}
+    paths = {id(shot): find_image(root / shot.folder, shot.file) for shot in shots}
     photos, damage = _each(
         shots, lambda shot: check_dataset.read_photo(shot, paths[id(shot)], cloud), lambda shot: paths[id(shot)]
     )

@@ -55,8 +55,12 @@ def run(argv: Sequence[str]) -> int:
     args = parse(Args, argv, "eval", examples=_EXAMPLES)
     if args.json is not None:
         check_file(args.json)
+    from pop_fast.train.lpips import LPIPS
+
     splat = load_splat(args.splat)
-    _, stats = measured(splat, args, _nets(args, splat.config))
+    chosen = {"vgg": args.lpips_vgg or splat.config.lpips_vgg, "alex": args.lpips_alex or splat.config.lpips_alex}
+    nets = [LPIPS(net, files) for net, files in chosen.items() if files]  # type: ignore[arg-type]
+    _, stats = measured(splat, args, nets)
     if args.per_view:
         for name, numbers in stats["per_view"].items():
             print(f"{name}: " + ", ".join(f"{key} {value:.4f}" for key, value in numbers.items()))
@@ -98,13 +102,6 @@ def measure_splat(splat: Splat, config: TrainConfig, views: list[ViewTensors], n
         beat.say(f"measuring {len(views)} views")
         measured = evaluate(backend, splat.params, views, config, splat.sh_degree, nets)
         return {**population(splat.params["opacities"].sigmoid()), **measured}
-
-
-def _nets(args: Args, config: TrainConfig) -> list[LPIPS]:
-    from pop_fast.train.lpips import LPIPS
-
-    chosen = {"vgg": args.lpips_vgg or config.lpips_vgg, "alex": args.lpips_alex or config.lpips_alex}
-    return [LPIPS(net, files) for net, files in chosen.items() if files]  # type: ignore[arg-type]
 
 
 def _record(folder: Path, step: int, stats: dict[str, Any]) -> None:

@@ -30,16 +30,11 @@ class Args(CaptureArguments):
 def run(argv: Sequence[str]) -> int:
     args = parse(Args, argv, "report")
     if args.check:
-        _check(args)
+        from pop_fast.cli.export import checked
+
+        splat = load_splat(args.result)
+        checked(args.result, splat, *open_with_bars(splat, args))
     from pop_fast.view.report import write_report
 
     print(write_report(args.result))
     return 0
-
-
-def _check(args: Args) -> None:
-    from pop_fast.cli.export import checked
-
-    splat = load_splat(args.result)
-    capture, config = open_with_bars(splat, args)
-    checked(args.result, splat, capture, config)

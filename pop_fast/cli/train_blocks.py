@@ -113,11 +113,10 @@ def train_in_blocks(config: TrainConfig, options: Any, chosen: str, argv: Sequen
         _take_threads(folder, config)
     if begun is None or read_plan(folder) is None:
         division = _divided(config, options, job)
-        print(
-            printable(
-                f"{config.method} in blocks {job.blocks}, {config.max_steps:,} steps each{_rounds_of(job)} -> {folder}"
-            )
+        rounds = (
+            f", then {job.rounds} round{'s' if job.rounds > 1 else ''} of {job.round_steps:,}" if job.rounds else ""
         )
+        print(printable(f"{config.method} in blocks {job.blocks}, {config.max_steps:,} steps each{rounds} -> {folder}"))
         print(chosen)
         if begun is None:
             _begin(folder, config, options, job, division, argv)
@@ -196,12 +195,6 @@ def _take_threads(folder: Path, config: TrainConfig) -> None:
     begun = read_config(folder)
     if begun.threads != config.threads:
         ResultFolder(folder).write_settings(replace(config, near_plane=begun.near_plane), {})
-
-
-def _rounds_of(job: Job) -> str:
-    if job.rounds == 0:
-        return ""
-    return f", then {job.rounds} round{'s' if job.rounds > 1 else ''} of {job.round_steps:,}"
 
 
 def _dividing(job: Job) -> dict[str, Any]:

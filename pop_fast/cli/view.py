@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
+import numpy as np
 import tyro
 
 from pop_fast.cli import parse
@@ -16,8 +17,6 @@ from pop_fast.errors import PopError
 from pop_fast.train.load_result import Splat, load_splat
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from pop_fast.data import Capture
     from pop_fast.train.training_run import TrainingRun
     from pop_fast.view.live.server import LiveViewer
@@ -87,10 +86,10 @@ def make_viewer(args: Args, splat: Splat) -> LiveViewer:
 
 def transform_of(splat: Splat) -> np.ndarray | None:
     """Return how a lone file's world came from its capture's, as its header says; None where it does not."""
-    import numpy as np
-
-    known = splat.frame is not None and splat.frame.name == "training" and splat.frame.transform is not None
-    return np.array(splat.frame.transform) if known and splat.frame is not None else None
+    frame = splat.frame
+    if frame is None or frame.name != "training" or frame.transform is None:
+        return None
+    return np.array(frame.transform)
 
 
 def stands_of_capture(capture: Capture, test_every: int, means: Any) -> list[Any]:

@@ -62,10 +62,6 @@ def read_listing(root: Path, images: str | None = None) -> Listing | None:
     return replace(listing, shots=[replace(shot, folder=images) for shot in listing.shots])
 
 
-def file_of(root: Path, shot: PosedImage) -> Path | None:
-    return find_image(root / shot.folder, shot.file)
-
-
 def read_photo(shot: PosedImage, path: Path | None, cloud: SparsePoints | None = None) -> Photo:
     """Decode and measure the photograph of a shot, found at `path`, and its brightness at the points that it sees."""
     if path is None:

@@ -43,15 +43,13 @@ def find_models(folder: Path) -> list[tuple[Path, int]]:
         inside = [path for path in place.iterdir() if path.is_dir()] if place != folder and place.is_dir() else []
         # COLMAP numbers its models, and begins with the one that it thinks best
         inside.sort(key=lambda path: (not path.name.isdigit(), len(path.name), path.name))
-        models = [(path, _count_images(path)) for path in (*inside, place) if _holds_model(path)]
+        # one of its files makes a model, so that another that is absent is named instead of the model being passed over
+        kinds = [f"{name}{suffix}" for name in _FILES for suffix in (".bin", ".txt")]
+        found = [path for path in (*inside, place) if any((path / kind).is_file() for kind in kinds)]
+        models = [(path, _count_images(path)) for path in found]
         if models:
             return sorted(models, key=lambda model: -model[1])
     return []
-
-
-def _holds_model(folder: Path) -> bool:
-    # one of its files makes a model, so that another that is absent is named instead of the model being passed over
-    return any((folder / f"{name}{suffix}").is_file() for name in _FILES for suffix in (".bin", ".txt"))
 
 
 def _suffix(model: Path) -> str:

@@ -155,9 +155,13 @@ def load_capture(
         raise CaptureError(f"missing is {missing!r}; it must be 'error' or 'skip'")
     if resize not in ("area", "bicubic"):
         raise CaptureError(f"resize is {resize!r}; it must be 'area' or 'bicubic'")
-    shown = _background(background)
+    if len(background) != 3 or not all(0.0 <= c <= 1.0 for c in background):
+        raise CaptureError(f"background is {tuple(background)}; it must be three numbers in [0, 1]")
+    red, green, blue = map(float, background)
     listing = list_capture(path, source, images, sfm, progress) if listing is None else listing
-    options = PhotoOptions(int(factor), masks, missing, shown, images, resize, part=listing.made_from == BLOCK)
+    options = PhotoOptions(
+        int(factor), masks, missing, (red, green, blue), images, resize, part=listing.made_from == BLOCK
+    )
 
     def wanted(shots: Sequence[PosedImage]) -> list[bool]:
         if photographs == "none":
@@ -253,12 +257,6 @@ def _of_model(root: Path, models: Sequence[tuple[Path, int]], images: str | None
     shots = turned_upright(root, beside_the_model(root, listed, images), model)
     notes = about_other_models(root, models) + about_unplaced(root / (images or shots[0].folder), shots)
     return Listing(root, model, shots, cloud, "COLMAP model", notes)
-
-
-def _background(color: tuple[float, float, float]) -> tuple[float, float, float]:
-    if len(color) != 3 or not all(0.0 <= c <= 1.0 for c in color):
-        raise CaptureError(f"background is {tuple(color)}; it must be three numbers in [0, 1]")
-    return (float(color[0]), float(color[1]), float(color[2]))
 
 
 def beside_the_model(root: Path, shots: list[PosedImage], images: str | None) -> list[PosedImage]:

@@ -510,7 +510,9 @@ def read_upright(sparse: Path) -> dict[str, int]:
 
 def recognise_result(capture: Path, target: Path) -> Callable[[Path], bool]:
     """Make a test of whether a file, by its path relative to the `target` to be replaced, is as it was written."""
-    written = _read_list(capture / "sparse" / _LIST)
+    listing = capture / "sparse" / _LIST
+    text = listing.read_text(encoding="utf-8", errors="surrogateescape") if listing.is_file() else ""
+    written = {name: digest for digest, _, name in (line.partition("  ") for line in text.splitlines())}
 
     def recognise(file: Path) -> bool:
         path = target / file
@@ -520,13 +522,6 @@ def recognise_result(capture: Path, target: Path) -> Callable[[Path], bool]:
         return name == f"sparse/{_LIST}" or (name in written and written[name] == _sha256(path))
 
     return recognise
-
-
-def _read_list(path: Path) -> dict[str, str]:
-    if not path.is_file():
-        return {}
-    lines = path.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
-    return {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
 
 
 def _sha256(path: Path) -> str:

@@ -190,21 +190,18 @@ def draw(chart: Chart) -> str:
     """Draw one chart as a `<figure>` with title, legend and SVG."""
     axes = _Axes(chart)
     body = [_shading(chart, axes), _grid(axes), *(_line(series, axes) for series in chart.series)]
+    rounded = [[float(f"{v:.6g}") if math.isfinite(v) else None for v in s.y] for s in chart.series]
     data = {
         "stop": axes.x_stop,
         "unit": chart.unit,
         "box": [_LEFT, _RIGHT, _TOP, _BOTTOM, WIDTH, HEIGHT],
         "series": [
-            {"n": s.name, "c": s.color, "x": list(s.x), "y": [_json_number(v) for v in s.y]} for s in chart.series
+            {"n": s.name, "c": s.color, "x": list(s.x), "y": y} for s, y in zip(chart.series, rounded, strict=True)
         ],
     }
     legend = "".join(f'<span><i style="background:{s.color}"></i>{escape(s.name)}</span>' for s in chart.series)
     packed = json.dumps(data, separators=(",", ":"))
     return card(chart.title, legend, WIDTH, HEIGHT, "".join(body), data=packed)
-
-
-def _json_number(value: float) -> float | None:
-    return float(f"{value:.6g}") if math.isfinite(value) else None
 
 
 def _shading(chart: Chart, axes: _Axes) -> str:

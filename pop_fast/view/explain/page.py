@@ -104,10 +104,12 @@ def page(e: PixelExplanation, maps: Sequence[Map], differences: Sequence[str] = 
     """Lay out the page, with maps of the same view, and lines that tell where two renderers part, if that was asked."""
     pictures = {entry.name: entry.picture for entry in maps}
     drawn = sorted(e.blended, key=lambda row: -row.weight)[:_DRAWN]
+    about = f"{e.width} x {e.height} px, profile {e.profile}, {e.n_gaussians:,} Gaussians; loss {e.objective}"
+    about += f" + {e.lambda_pop:g} L_POP" if e.lambda_pop else ""
     body = "".join(
         [
             f"<header><h1>Why pixel ({e.x}, {e.y}) of {escape(e.view)} looks like that</h1>",
-            f"<p>{_subtitle(e)}</p></header>",
+            f"<p>{escape(about)}</p></header>",
             _tiles(e),
             _stages(e, drawn, pictures),
             _light(e),
@@ -119,13 +121,6 @@ def page(e: PixelExplanation, maps: Sequence[Map], differences: Sequence[str] = 
     )
     style = asset("report", "page.css") + asset("explain", "page.css")
     return document(f"{e.view} ({e.x}, {e.y})", style, body, asset("explain", "page.js"))
-
-
-def _subtitle(e: PixelExplanation) -> str:
-    term = f" + {e.lambda_pop:g} L_POP" if e.lambda_pop else ""
-    return escape(
-        f"{e.width} x {e.height} px, profile {e.profile}, {e.n_gaussians:,} Gaussians; loss {e.objective}{term}"
-    )
 
 
 def _tiles(e: PixelExplanation) -> str:

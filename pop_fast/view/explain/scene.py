@@ -24,6 +24,9 @@ from pop_fast.train.config import TrainConfig
 from pop_fast.train.presets import LOSSES
 
 TILE_SIZE = 16
+# of rasterization's meta
+_KEPT = ("means2d", "depths", "conics", "opacities", "radii", "dominant_ids", "dominant_weights", "n_contrib")
+_KEPT += ("n_traversed", "final_T", "flatten_ids", "isect_offsets")
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +136,7 @@ def explain_view(
         step=step,
         gaussians=gaussians,
         image=image.detach(),
-        info={name: v.detach() if isinstance(v, Tensor) else v for name, v in _wanted(info).items()},
+        info={name: v.detach() if isinstance(v, Tensor) else v for name, v in info.items() if name in _KEPT},
         loss=float(loss.detach()),
         v_image=v_image,
         v_opacities=v_opacities,
@@ -151,11 +154,6 @@ def with_objective(config: TrainConfig, objective: str) -> TrainConfig:
     other = TrainConfig.of(method=objective, **plan)
     names = ("photometric", "photometric_divisor", "lambda_ssim", "l2_stop_iter", "strategy")
     return replace(config, given=None, **{name: getattr(other, name) for name in names})
-
-
-def _wanted(info: Mapping[str, Any]) -> dict[str, Any]:
-    names = ("means2d", "depths", "conics", "opacities", "radii", "dominant_ids", "dominant_weights", "n_contrib")
-    return {name: info[name] for name in (*names, "n_traversed", "final_T", "flatten_ids", "isect_offsets")}
 
 
 def _photometric(image: Tensor, view: View, config: TrainConfig, step: int) -> Tensor:

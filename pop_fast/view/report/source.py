@@ -23,7 +23,7 @@ from pop_fast.train.load_result import read_record
 from pop_fast.train.presets import ALIASES, METHODS, Given, words_of
 from pop_fast.train.results import read_config
 from pop_fast.view.document import Window
-from pop_fast.view.report.checks import Checks, read_checks
+from pop_fast.view.report.checks import read_checks
 from pop_fast.view.report.model import Finding, Histogram, ReportData, ReportView, Tile, verdict
 from pop_fast.view.report.page import page
 
@@ -54,7 +54,12 @@ def read_result(folder: Path) -> ReportData:
     views = _views(folder)
     dominant = _dominant(folder)
     changes = [record for record in records if "cloned" in record or "reset" in record]
-    curves, checks = _curves(records, folder), _checks(folder)
+    curves, checks = _curves(records, folder), None
+    if measured := _numbered(folder / "report_data", r"checks_step(\d+)\.json"):
+        checks = read_checks(measured[-1][1])
+    viewer = folder / "viewer.html"
+    fix = "train again with --resume, which measures them"
+    entries = checked_encodings(stats.get("encodings") or [], str(folder), fix)
     held_out = f"{stats['views']} held-out views" if "views" in stats else ""
     return ReportData(
         title=f"{Path(config.data).resolve().name} · {method.split(' (')[0]}",
@@ -70,8 +75,8 @@ def read_result(folder: Path) -> ReportData:
         n_held_out=stats.get("views"),
         config=_settings(config, folder),
         changes=[{key: change.get(key) for key in _CHANGE_COLUMNS} for change in changes],
-        files=_files(stats, str(folder)),
-        viewer=_viewer(folder),
+        files=[encoding_heads(entries), *encoding_rows(entries)] if entries else [],
+        viewer=_read(viewer).decode("utf-8", "replace") if viewer.is_file() else None,
         verdict=[typed(found, config, folder) for found in verdict(stats, checks, curves.get("psnr_val"))],
         checked=checks is not None,
         orbit=_orbit(folder),
@@ -114,21 +119,6 @@ _STEP_COUNTS: Final = frozenset({"max_steps", "eval_steps", "save_steps", "check
 
 
 _CHANGE_COLUMNS: Final = ("step", "cloned", "split", "pruned", "reset", "num_gaussians")
-
-
-def _files(stats: Mapping[str, Any], where: str) -> list[tuple[str, ...]]:
-    entries = checked_encodings(stats.get("encodings") or [], where, "train again with --resume, which measures them")
-    return [encoding_heads(entries), *encoding_rows(entries)] if entries else []
-
-
-def _viewer(folder: Path) -> str | None:
-    path = folder / "viewer.html"
-    return _read(path).decode("utf-8", "replace") if path.is_file() else None
-
-
-def _checks(folder: Path) -> Checks | None:
-    numbered = _numbered(folder / "report_data", r"checks_step(\d+)\.json")
-    return read_checks(numbered[-1][1]) if numbered else None
 
 
 def _orbit(folder: Path) -> tuple[str, bytes] | None:
