@@ -55,9 +55,9 @@ def run(argv: Sequence[str]) -> int:
     args = parse(Args, argv, "eval", examples=_EXAMPLES)
     if args.json is not None:
         check_file(args.json)
+    splat = load_splat(args.splat)
     from pop_fast.train.lpips import LPIPS
 
-    splat = load_splat(args.splat)
     chosen = {"vgg": args.lpips_vgg or splat.config.lpips_vgg, "alex": args.lpips_alex or splat.config.lpips_alex}
     nets = [LPIPS(net, files) for net, files in chosen.items() if files]  # type: ignore[arg-type]
     _, stats = measured(splat, args, nets)
