@@ -33,12 +33,12 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Final, Literal, TypeAlias, cast
+from typing import Any, BinaryIO, Final, Literal, cast
 
 import numpy as np
 
 from pop_fast.data.cameras import WIDEST, Numbers, brown_lens, check_size, make_camera, shortened, viewmat_from_pose
-from pop_fast.data.capture import PosedImage, SparsePoints, Split
+from pop_fast.data.capture import Listing, PosedImage, SparsePoints, Split
 from pop_fast.errors import CaptureError
 from pop_fast.io.image_header import read_size
 from pop_fast.io.images import find_image, read_image
@@ -63,11 +63,13 @@ def photographs_of_polycam(root: Path) -> Path | None:
     return None if cameras is None else cameras.parent / dict(_FOLDERS)[cameras.name]
 
 
-def read_polycam(folder: Path, root: Path) -> list[PosedImage]:
-    """Read every camera of an export, sorted by name, from the folder that `find_polycam` returns."""
+def read_polycam(folder: Path, root: Path, images: str) -> tuple[list[PosedImage], list[str]]:
+    """Read every camera of an export, sorted by name; its photographs are in a folder of its own, not in `images`."""
+    del images
     photos = folder.parent / dict(_FOLDERS)[folder.name]
     relative = photos.relative_to(root).as_posix()
-    return [_shot(path, photos, relative, number) for number, path in enumerate(sorted(folder.glob("*.json")), start=1)]
+    files = enumerate(sorted(folder.glob("*.json")), start=1)
+    return [_shot(path, photos, relative, number) for number, path in files], []
 
 
 def _shot(path: Path, photos: Path, folder: str, number: int) -> PosedImage:
@@ -264,7 +266,7 @@ def find_realitycapture(root: Path) -> Path | None:
     return _first(root, "*.csv", is_one)
 
 
-def read_realitycapture(path: Path, root: Path, images: str) -> list[PosedImage]:
+def read_realitycapture(path: Path, root: Path, images: str) -> tuple[list[PosedImage], list[str]]:
     """Read all cameras, sorted by name; the photographs say their size, which the file does not."""
     rows = _rows(path)
     sizes = {name: _size(root / images, name) for name, _ in rows}
@@ -283,7 +285,7 @@ def read_realitycapture(path: Path, root: Path, images: str) -> list[PosedImage]
         shots.append(
             PosedImage(name, images, name, _realitycapture_camera(where, read, width, height, number), viewmat)
         )
-    return sorted(shots, key=lambda shot: shot.name)
+    return sorted(shots, key=lambda shot: shot.name), []
 
 
 def _rows(path: Path) -> list[tuple[str, dict[str, Any]]]:
@@ -347,50 +349,28 @@ def _realitycapture_camera(where: str, read: Numbers, width: int, height: int, n
     return make_camera(number, model, width, height, pinhole + lens)
 
 
-Program: TypeAlias = Literal["polycam", "metashape", "realitycapture"]
+_POLYCAM: Final = "keyframes/corrected_cameras or keyframes/cameras"
+_CSV: Final = 'CSV file of "Internal/External camera parameters"'
+# what it is called, what it is, and how it is found and read
 EXPORTS: Final = {
-    "polycam": ("Polycam export", find_polycam, "keyframes/corrected_cameras or keyframes/cameras"),
-    "metashape": ("Metashape cameras", find_metashape, "cameras as Agisoft XML"),
-    "realitycapture": (
-        "RealityCapture cameras",
-        find_realitycapture,
-        'CSV file of "Internal/External camera parameters"',
-    ),
+    "polycam": ("Polycam export", _POLYCAM, find_polycam, read_polycam),
+    "metashape": ("Metashape cameras", "cameras as Agisoft XML", find_metashape, read_metashape),
+    "realitycapture": ("RealityCapture cameras", _CSV, find_realitycapture, read_realitycapture),
 }
 
 
-def find_export(root: Path, program: str = "auto") -> tuple[str, Path] | None:
-    """Find what a program has exported, the program and its file or folder; "auto" takes the first that is there."""
-    for name, (_, find, _) in EXPORTS.items():
-        found = find(root) if program in ("auto", name) else None
-        if found is not None:
-            return name, found
-    return None
+def read_export(root: Path, program: str = "auto", images: str | None = None) -> Listing | None:
+    """Read what a program has exported; "auto" takes the first that is there, and None is returned where none is.
 
-
-def read_export(
-    program: str, path: Path, root: Path, images: str | None = None
-) -> tuple[list[PosedImage], SparsePoints | None, list[str]]:
-    """Read an export that `find_export` found.
-
-    Args:
-        program: one of `EXPORTS`.
-        path: its file or folder.
-        root: the capture.
-        images: the folder in it with the photographs; by default `images`, or the capture itself where there is none.
-
-    Returns:
-        The shots; the points of `sparse_pc.ply` or `points3D.ply` in the capture, or None; notes.
+    The photographs are in the folder `images` of the capture; by default that of this name, or the capture itself.
     """
     folder = images or ("images" if (root / "images").is_dir() else "")
-    notes: list[str] = []
-    if program == "polycam":
-        shots = read_polycam(path, root)
-    elif program == "metashape":
-        shots, notes = read_metashape(path, root, folder)
-    else:
-        shots = read_realitycapture(path, root, folder)
-    return shots, points_beside(root), notes
+    for name, (title, _, find, read) in EXPORTS.items():
+        path = find(root) if program in ("auto", name) else None
+        if path is not None:
+            shots, notes = read(path, root, folder)
+            return Listing(root, path, shots, points_beside(root), title, notes)
+    return None
 
 
 _POINTS = ("sparse_pc.ply", "points3D.ply", "points3d.ply")

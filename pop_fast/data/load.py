@@ -40,7 +40,7 @@ from pop_fast.data.capture import (
     transform_viewmats,
 )
 from pop_fast.data.colmap import find_models, read_model
-from pop_fast.data.exports import EXPORTS, find_export, find_transforms, read_export, read_transforms
+from pop_fast.data.exports import EXPORTS, find_transforms, read_export, read_transforms
 from pop_fast.data.read_images import PhotoOptions, read_views
 from pop_fast.data.sfm import photo_folder, photographs, read_upright, run_sfm
 from pop_fast.errors import CaptureError, PopError
@@ -218,10 +218,9 @@ def find_listing(root: Path, source: Source = "auto", images: str | None = None)
     found = find_transforms(root) if source in ("auto", "transforms") else []
     if found:
         return Listing(root, found[0], *read_transforms(found), found[0].name, [])
-    export = find_export(root, source)
+    export = read_export(root, source, images)
     if export is not None:
-        shots, cloud, notes = read_export(*export, root, images)
-        return Listing(root, export[1], shots, cloud, EXPORTS[export[0]][0], notes)
+        return export
     if source == "colmap":
         raise CaptureError(
             f"{root}: has no COLMAP model in sparse, sparse/0 or colmap/sparse/0; run pop sfm, or COLMAP"
@@ -229,7 +228,7 @@ def find_listing(root: Path, source: Source = "auto", images: str | None = None)
     if source == "transforms":
         raise CaptureError(f"{root}: has no transforms.json and no transforms_train.json; choose another --source")
     if source in EXPORTS:
-        raise CaptureError(f"{root}: has no {EXPORTS[source][2]}; export it there, or choose another --source")
+        raise CaptureError(f"{root}: has no {EXPORTS[source][1]}; export it there, or choose another --source")
     folder = photo_folder(root)
     if not photographs(folder):
         hint = unreadable_photographs(folder) or "give the folder of a capture"
