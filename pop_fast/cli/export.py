@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
@@ -260,20 +260,27 @@ class FinishOptions(LimitOptions):
 
 
 def finish(folder: Path, capture: Capture, options: Any) -> int:
-    """Write what surrounds a run whose results are complete, which they stay whatever becomes of it.
+    """Write what surrounds a run whose results are complete; see `after_results`."""
+    own = FinishOptions(**{f.name: getattr(options, f.name) for f in fields(FinishOptions)})
+    left = f"the results in {folder} are complete, and pop export {folder} writes files of them"
+    return after_results(lambda: _finish(folder, capture, own), "writing exports", "", left)
+
+
+def after_results(write: Callable[[], object], doing: str, failed: str, left: str) -> int:
+    """Write something beside results that are complete, which they stay whatever becomes of it.
 
     Returns:
-        The exit status: 0, or 1 where something could not be written, or 130 after Ctrl-C.
+        The exit status: 0, or 1 where it could not be written, or 130 after Ctrl-C.
     """
-    left = f"the results in {folder} are complete, and pop export {folder} writes files of them"
     try:
-        _finish(folder, capture, FinishOptions(**{f.name: getattr(options, f.name) for f in fields(FinishOptions)}))
+        write()
     except KeyboardInterrupt:
-        print(f"pop: stopped while writing exports; {left}", file=sys.stderr)
+        print(f"pop: stopped while {doing}; {left}", file=sys.stderr)
         return EXIT_INTERRUPTED
     except Exception as error:
+        # a fault of the program too: the command that writes it by itself shows where it is
         reason = describe(error) or f"{type(error).__name__}: {error}"
-        print(f"pop: error: {reason}; {left}", file=sys.stderr)
+        print(f"pop: error: {failed}{reason}; {left}", file=sys.stderr)
         return EXIT_INCOMPLETE
     return 0
 

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import tyro
 
 from pop_fast.api.registry import BACKENDS, require_backend
-from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED, describe, parse, printable
-from pop_fast.cli.export import FinishOptions, finish
+from pop_fast.cli import EXIT_INTERRUPTED, parse, printable
+from pop_fast.cli.export import FinishOptions, after_results, finish
 from pop_fast.cli.options import LimitOptions
 from pop_fast.cli.train_blocks import check_blocks, train_in_blocks
 from pop_fast.cli.train_options import (
@@ -281,21 +281,15 @@ def _trained(training: TrainingRun, folder: Path, capture: Capture, options: Any
 
 
 def report(folder: Path) -> int:
-    """Write the report of a run whose results are complete, which they stay; return the exit status: 0, 1 or 130."""
-    left = f"the results in {folder} are complete, and pop report {folder} writes it"
-    try:
+    """Write the report of a run whose results are complete; see `after_results`."""
+
+    def write() -> None:
         from pop_fast.view.report import write_report
 
         print(f"report: {write_report(folder)}")
-    except KeyboardInterrupt:
-        print(f"pop: stopped while writing the report; {left}", file=sys.stderr)
-        return EXIT_INTERRUPTED
-    except Exception as error:
-        # a fault of the program too: 'pop report' shows where it is
-        reason = describe(error) or f"{type(error).__name__}: {error}"
-        print(f"pop: error: the report could not be written: {reason}; {left}", file=sys.stderr)
-        return EXIT_INCOMPLETE
-    return 0
+
+    left = f"the results in {folder} are complete, and pop report {folder} writes it"
+    return after_results(write, "writing the report", "the report could not be written: ", left)
 
 
 def arguments(argv: Sequence[str]) -> tuple[TrainConfig, Any]:

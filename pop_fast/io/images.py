@@ -431,10 +431,6 @@ def main() -> None:
             continue  # whoever reads the photograph itself says so
 
 
-if __name__ == "__main__":
-    main()
-
-
 COLORMAP: Final = "magma"
 _MAX_SIDE: Final = 640
 
@@ -535,3 +531,7 @@ def depth_picture(depth: np.ndarray, near: float, far: float) -> np.ndarray:
     picture = colormap_table(DEPTH_COLORS)[np.round(255.0 * level).astype(np.uint8)]
     picture[~known] = _NOTHING
     return picture
+
+
+if __name__ == "__main__":
+    main()

@@ -244,14 +244,8 @@ class Guard:
 
         ours = {"process_request": process_request, "create_connection": self._connections(websockets)}
         limits = {"max_size": _LONGEST_MESSAGE, "max_queue": 4, "open_timeout": _PATIENCE, "close_timeout": 1.0}
-        return {
-            **given,
-            **ours,
-            **limits,
-            "ping_interval": _PATIENCE,
-            "ping_timeout": _PATIENCE,
-            "sock": self._listening,
-        }
+        limits |= {"ping_interval": _PATIENCE, "ping_timeout": _PATIENCE}
+        return {**given, **ours, **limits, "sock": self._listening}
 
     def refusal(self, request: Any, arrived_at: str) -> tuple[HTTPStatus, str] | None:
         """Return why a request, that came to an address of this machine, is refused, or None."""
