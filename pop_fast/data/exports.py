@@ -88,13 +88,21 @@ def _shot(path: Path, photos: Path, folder: str, number: int) -> PosedImage:
     return PosedImage(name, folder, name, camera, viewmat)
 
 
+def _json(path: Path, fix: str) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise CaptureError(f"{path}: could not be read: {error.strerror}") from error
+    # besides what JSON and UTF-8 do not allow, whole numbers of thousands of digits
+    except ValueError as error:
+        raise CaptureError(f"{path}: is not valid JSON ({error}); {fix}") from error
+
+
 def _load(path: Path) -> dict[str, Any]:
     fix = "export the capture again"
     try:
-        given = json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise CaptureError(f"{path}: could not be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
+        given = _json(path, fix)
+    except RecursionError as error:
         raise CaptureError(f"{path}: is not valid JSON ({error}); {fix}") from error
     if not isinstance(given, dict):
         raise CaptureError(f"{path}: is no object of a camera's fields (fx, t_00, ...); {fix}")
@@ -422,14 +430,9 @@ def points_beside(folder: Path, named: Path | None = None) -> SparsePoints | Non
 
 def _load_transforms(path: Path) -> dict[str, Any]:
     try:
-        listing = json.loads(path.read_text(encoding="utf-8-sig"))
+        listing = _json(path, "write it again or repair it there")
     except RecursionError:
         raise CaptureError(f"{path}: is nested too deeply to be a list of frames; write it again") from None
-    # besides what JSON and UTF-8 do not allow, whole numbers of thousands of digits
-    except ValueError as error:
-        raise CaptureError(f"{path}: is not valid JSON ({error}); write it again or repair it there") from error
-    except OSError as error:
-        raise CaptureError(f"{path}: could not be read: {error.strerror}") from error
     if not isinstance(listing, dict) or not isinstance(listing.get("frames"), list):
         raise CaptureError(f"{path}: has no list 'frames'; it must be an object as nerfstudio or instant-ngp writes it")
     return listing

@@ -65,33 +65,20 @@ FEW: Final = 20
 
 @dataclass(frozen=True)
 class Shown:
-    """What was measured of one photograph.
+    """What was measured of one photograph, with sides shrunk to up to 512 px but for size and brightness."""
 
-    Attributes:
-        name: relative file name.
-        size: width and height, px; (0, 0) where it cannot be read.
-        problem: why it cannot be read, or "".
-        exif: what its camera noted.
-        digest: of the file's bytes.
-        sharpness: variance of the Laplacian, of a gray picture with sides up to 512 px.
-        brightness: mean gray, 0 to 255.
-        dark: share of pixels under 4.
-        bright: share of pixels over 251.
-        thumb: gray. float32 [24, 24]
-        features: places and descriptors of up to 500 SIFT features of the gray picture, sides up to 512 px; places are
-            px of that picture. float32 [P, 2], uint8 [P, 128]
-    """
-
-    name: str
-    size: tuple[int, int] = (0, 0)
-    problem: str = ""
-    exif: Exif = field(default_factory=Exif)
-    digest: str = ""
-    sharpness: float = 0.0
-    brightness: float = 0.0
-    dark: float = 0.0
-    bright: float = 0.0
+    name: str  # relative file name
+    size: tuple[int, int] = (0, 0)  # width and height, px; (0, 0) where it cannot be read
+    problem: str = ""  # why it cannot be read
+    exif: Exif = field(default_factory=Exif)  # what its camera noted
+    digest: str = ""  # of the file's bytes
+    sharpness: float = 0.0  # variance of the Laplacian, gray
+    brightness: float = 0.0  # mean gray, 0 to 255
+    dark: float = 0.0  # share of pixels under 4
+    bright: float = 0.0  # share of pixels over 251
+    # gray. float32 [24, 24]
     thumb: np.ndarray = field(default_factory=lambda: np.zeros((_THUMB, _THUMB), np.float32))
+    # places, px, and descriptors of up to 500 SIFT features, gray. float32 [P, 2], uint8 [P, 128]
     features: tuple[np.ndarray, np.ndarray] = field(
         default_factory=lambda: (np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8))
     )
