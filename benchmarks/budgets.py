@@ -28,7 +28,7 @@ import torch
 
 from benchmarks.record import machine, read_json, write_json
 from benchmarks.sizes import PLY_BYTES, measured, pop, resolved
-from pop_fast.cli.limits import LimitOptions
+from pop_fast.cli.options import LimitOptions
 from pop_fast.data import to_capture_frame
 from pop_fast.density import shrink
 from pop_fast.density.passes import Passes

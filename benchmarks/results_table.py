@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from paper_repro.paper import paper
-from pop_fast.view.report.compare import COLUMNS, markdown, row
+from pop_fast.view.report.source import COLUMNS, markdown, row
 
 RESULTS = Path(__file__).resolve().parent / "results"
 RUNS = RESULTS / "training.jsonl"

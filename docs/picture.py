@@ -17,9 +17,9 @@ import torch
 from PIL import Image
 
 from pop_fast.api.backend import get_backend
-from pop_fast.data.initialize import initialize_params
+from pop_fast.data.gaussians import initialize_params
 from pop_fast.data.load import load_capture
-from pop_fast.io.pictures import id_colors
+from pop_fast.io.images import id_colors
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.views import ViewTensors, render_view
 

@@ -137,7 +137,7 @@ def _counts(item: Found) -> str:
 def _listing(folder: Path) -> tuple[list[str], bool, list[tuple[int, int]]]:
     """Read the names that a camera model lists, whether it has a split of its own, and its images' sizes."""
     from pop_fast.data.colmap import find_model, read_model
-    from pop_fast.data.transforms import find_transforms, read_transforms
+    from pop_fast.data.exports import find_transforms, read_transforms
 
     model = find_model(folder)
     if model is not None:

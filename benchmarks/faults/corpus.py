@@ -29,13 +29,13 @@ from pop_fast.blocks.plan import Job, job_text, make_plan, write_plan
 from pop_fast.data.capture import Listing
 from pop_fast.data.colmap import read_model
 from pop_fast.data.load import load_capture
-from pop_fast.data.sfm_files import UPRIGHT, write_list
+from pop_fast.data.sfm import UPRIGHT, write_list
 from pop_fast.io.formats import FORMATS, encoded
 from pop_fast.io.image_header import can_read_heif
 from pop_fast.io.ply import save_ply
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.load_result import RECORD, CaptureRecord, record_text
-from pop_fast.view.live.state import KeyCamera, path_of
+from pop_fast.view.live.draw import KeyCamera, path_of
 from pop_fast.view.report.checks import Checks
 from pop_ref.conformance.scenes import save_scene
 from pop_ref.conformance.vectors import export

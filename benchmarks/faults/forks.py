@@ -46,7 +46,7 @@ def start(work: Callable[[], int | None], said: Path, memory: int | None = None)
             resource.setrlimit(resource.RLIMIT_AS, (have + memory, have + memory))
         status = work() or 0
     except BaseException as error:
-        from pop_fast.cli.errors import describe
+        from pop_fast.cli import describe
 
         line = describe(error)
         if line is not None and "\n" not in line and len(line) < 1000:

@@ -22,7 +22,7 @@ from typing import Any
 
 import torch
 
-from pop_fast.cli.errors import describe, message
+from pop_fast.cli import describe, message
 from pop_fast.errors import PopError
 
 from .corpus import HERE, pack

@@ -27,16 +27,14 @@ from pop_fast.blocks.run import read_round
 from pop_fast.cli import compare
 from pop_fast.cli.data_check import look_over
 from pop_fast.cli.render import listed_in
-from pop_fast.data.block import read_block
-from pop_fast.data.load import load_capture
-from pop_fast.data.sfm_files import recognise_result
-from pop_fast.data.unpack import unpack
-from pop_fast.data.video import take_frames
+from pop_fast.data.load import load_capture, read_block
+from pop_fast.data.sfm import recognise_result
+from pop_fast.data.unpack import take_frames, unpack
 from pop_fast.errors import CaptureError
 from pop_fast.io.formats import load_splat_file
 from pop_fast.io.image_header import can_read_heif, read_exif, read_size
 from pop_fast.io.images import read_image, read_mask
-from pop_fast.io.ply_rows import read_points
+from pop_fast.io.ply import read_points
 from pop_fast.train import TrainConfig
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.automatic import begun
@@ -45,7 +43,7 @@ from pop_fast.train.load_result import load_splat, read_record
 from pop_fast.train.lpips import LPIPS
 from pop_fast.train.results import read_config
 from pop_fast.view.frames import exported_to
-from pop_fast.view.live.state import read_path
+from pop_fast.view.live.draw import read_path
 from pop_fast.view.paths import frames_in
 from pop_fast.view.report.source import read_result
 from pop_ref.conformance import vector_check

@@ -76,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except Exception as error:
-        from pop_fast.cli.errors import describe
+        from pop_fast.cli import describe
 
         line = str(error) if isinstance(error, PopError) else describe(error)
         if debug or line is None:

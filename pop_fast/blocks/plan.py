@@ -23,7 +23,7 @@ The folder of a run in blocks has a result's own files, which describe the merge
     blocks/job.json         what was asked for
     blocks/plan.json        borders, and the numbers of every block
     blocks/map.png          the same seen from above
-    blocks/i_j/             one block: the list of its photographs and its points (see `pop_fast.data.block`)
+    blocks/i_j/             one block: the list of its photographs and its points (see `pop_fast.data.load`)
     blocks/i_j/result/      its training, an ordinary result folder
     blocks/i_j/trained      is there when its training is finished
     blocks/merged           is there when the blocks are merged for the last time
@@ -53,9 +53,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from pop_fast.data.block import write_block
+from pop_fast.blocks.plan import Partition, divide, grid_of
 from pop_fast.data.capture import Capture, Listing, SparsePoints
-from pop_fast.data.random_points import in_picture
+from pop_fast.data.load import in_picture, write_block
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.read_back import read_json

@@ -30,10 +30,8 @@ from torch.optim import Adam
 
 from pop_fast.blocks.jobs import block_folder, core_of, marker_of
 from pop_fast.blocks.plan import read_plan
-from pop_fast.data.block import find_block, read_block, write_block
 from pop_fast.data.capture import Capture, View
-from pop_fast.data.load import load_capture
-from pop_fast.data.random_points import in_picture
+from pop_fast.data.load import find_block, in_picture, load_capture, read_block, write_block
 from pop_fast.density.protocol import State
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically

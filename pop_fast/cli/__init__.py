@@ -1,7 +1,8 @@
 """The command line, `pop`: one small module a subcommand, loaded only when it is called.
 
-`main` owns what every subcommand shares: the list of them, one-line errors, exit statuses. A subcommand module has one
-public function, `run(argv) -> int`, and prints nothing but its result; all errors travel as exceptions.
+`main` owns what every subcommand shares: the list of them, how words are read, one-line errors, exit statuses. A
+subcommand module has one public function, `run(argv) -> int`, and prints nothing but its result; all errors travel as
+exceptions.
 """
 
 from __future__ import annotations
@@ -9,18 +10,19 @@ from __future__ import annotations
 import atexit
 import contextlib
 import difflib
+import errno
 import importlib
+import inspect
 import io
 import os
 import re
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+import traceback
+from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
-from typing import Final, NoReturn
-
-from pop_fast.cli.errors import describe, message
+from typing import Final, NoReturn, TypeVar
 
 COMMANDS: Final = {
     "train": "fit a splat to a capture or a folder of photographs",
@@ -134,12 +136,20 @@ def _run(words: list[str]) -> int:
         print(_overview())
         return 0
     if words[0] in ("-V", "--version"):
-        print(f"pop {_version()}")
+        from importlib.metadata import version
+
+        print(f"pop {version('pop-splatting')}")
         return 0
     name, rest = _split(words)
     if name is None:
         return _unknown(words)
-    return importlib.import_module(f"pop_fast.cli.{re.sub('[ -]', '_', name)}").run(rest)
+    return command(name)(rest)
+
+
+def command(name: str) -> Callable[[Sequence[str]], int]:
+    """Import what runs a subcommand: `run` of the module of its name, or as of `build-cpu` `run_cpu` of `build`."""
+    module, _, part = name.replace(" ", "_").partition("-")
+    return getattr(importlib.import_module(f"pop_fast.cli.{module}"), f"run_{part}" if part else "run")
 
 
 def _split(words: list[str]) -> tuple[str | None, list[str]]:
@@ -179,7 +189,86 @@ def _overview() -> str:
     )
 
 
-def _version() -> str:
-    from importlib.metadata import version
+# C0 without tab and line feed, DEL, C1, and what turns the direction of a line
+_CONTROL: Final = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+# of a message; both of its ends say more than the middle
+_LONGEST: Final = 1_200
+_END: Final = 300
 
-    return version("pop-splatting")
+
+def printable(text: str) -> str:
+    """Write control characters, and what no text may hold, as escapes: a terminal shows them and obeys none."""
+    shown = _CONTROL.sub(_escaped, text)
+    return shown.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+def _escaped(found: re.Match[str]) -> str:
+    code = ord(found[0])
+    return f"\\x{code:02x}" if code < 256 else f"\\u{code:04x}"
+
+
+def message(text: str) -> str:
+    """Make an error's text `printable`, and shorten it in its middle."""
+    shown = printable(text)
+    return shown if len(shown) <= _LONGEST else f"{shown[: _LONGEST - _END]} ... {shown[-_END:]}"
+
+
+_PACKAGES: Final = ("/pop_fast/", "/pop_ref/", "/cuda_ext/")
+
+
+def describe(error: BaseException) -> str | None:
+    """Say in one line what the user can do about an error, or None when it is a fault of the program.
+
+    A `ValueError` or `NotImplementedError` counts as the user's when the package itself raised it, because then its
+    message names field and fix; one that escapes from a library below is a fault, and keeps its traceback.
+    """
+    if isinstance(error, OSError):
+        return _describe_os_error(error)
+    if isinstance(error, MemoryError) or "not enough memory" in str(error) or "can't allocate memory" in str(error):
+        return "out of memory; use smaller images (--factor 2 or more) or fewer Gaussians"
+    if isinstance(error, RuntimeError) and "can't start new thread" in str(error):
+        return "the system allows no further thread; raise the limit (ulimit -u), or use fewer: --threads 1"
+    frames = traceback.extract_tb(error.__traceback__)
+    here = bool(frames) and any(package in frames[-1].filename.replace("\\", "/") for package in _PACKAGES)
+    if isinstance(error, ValueError | NotImplementedError) and here:
+        return re.sub(r"\s*\n\s*", " ", str(error))
+    return None
+
+
+def _describe_os_error(error: OSError) -> str | None:
+    where = f"{error.filename}: " if error.filename else ""
+    match error.errno:
+        case errno.ENOSPC | errno.EDQUOT:
+            return f"{where}the disk is full; free some space or write elsewhere with --out"
+        case errno.EACCES | errno.EPERM | errno.EROFS:
+            return f"{where}permission denied; change its owner or mode, or write elsewhere with --out"
+        case errno.ENOENT:
+            return f"{where}no such file or folder"
+        case errno.EISDIR:
+            return f"{where}is a folder where a file is needed"
+        case errno.ENOTDIR | errno.EEXIST:
+            return f"{where}a file is in the way where a folder is needed"
+        case None:
+            return None
+        case _:
+            return f"{where}{error.strerror}"
+
+
+T = TypeVar("T")
+
+
+def parse(kind: type[T], argv: Sequence[str], command: str, default: T | None = None, examples: str = "") -> T:
+    """Read the words after `pop COMMAND` into a dataclass, whose docstring is the description.
+
+    `default` are values that words override, for dataclasses without defaults of their own. SystemExit ends it: 0 after
+    --help, 2 after bad usage, when tyro has said what is wrong.
+    """
+    import tyro
+
+    about = inspect.cleandoc(kind.__doc__ or "").partition("\nAttributes:")[0].strip()
+    if examples:
+        about += "\n\nexamples:\n" + "\n".join(f"  {line.strip()}" for line in examples.strip().splitlines())
+    start = tyro.MISSING_NONPROP if default is None else default
+    # a switch is shown with its opposite, so that one sentence is right for both
+    style = (tyro.conf.HelptextFromCommentsOff,)
+    return tyro.cli(kind, args=list(argv), prog=f"pop {command}", description=about, default=start, config=style)

@@ -11,17 +11,19 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import tyro
 
-from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED
-from pop_fast.cli.arguments import parse
+from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED, parse
 from pop_fast.cli.train_blocks import merged_lines, plan_lines, round_lines
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
+from pop_fast.io.heartbeat import bars
+from pop_fast.train.choose import choose_backend
+from pop_fast.train.config import TrainConfig
+from pop_fast.train.load_result import RECORD, CaptureRecord, read_record, record_text
+from pop_fast.train.results import read_config
 
 if TYPE_CHECKING:
     from pop_fast.blocks.jobs import Part
     from pop_fast.blocks.plan import Job
-    from pop_fast.train.config import TrainConfig
-    from pop_fast.train.load_result import CaptureRecord
 
 _EXAMPLES: Final = """
     pop blocks train out/city 0_1            train one block, or resume it
@@ -52,11 +54,8 @@ class Args:
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "blocks", examples=_EXAMPLES)
     from pop_fast.blocks.plan import read_job
-    from pop_fast.train.load_result import CaptureRecord, read_record
-    from pop_fast.train.results import read_config
 
     folder = args.result.absolute()
     job = read_job(folder)
@@ -81,11 +80,7 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _part(args: Args, job: Job) -> Part:
-    """Find which part of the run is asked for.
-
-    Raises:
-        PopError: it has no such block or round.
-    """
+    """Find which part of the run is asked for; a PopError says that it has no such block or round."""
     from pop_fast.blocks.jobs import parts_of
 
     if args.part == "train" and args.block not in job.names:
@@ -102,7 +97,6 @@ def _part(args: Args, job: Job) -> Part:
 
 def _partition(folder: Path, config: TrainConfig, record: CaptureRecord, job: Job) -> int:
     from pop_fast.blocks.run import divide_capture
-    from pop_fast.cli.progress import bars
 
     with bars(config.progress) as progress:
         division = divide_capture(config, record, job, progress=progress)
@@ -117,7 +111,6 @@ def _train(folder: Path, config: TrainConfig, block: str, argv: Sequence[str]) -
     from pop_fast.blocks.plan import read_plan
     from pop_fast.blocks.run import config_of
     from pop_fast.cli.train import check_backend, train_capture
-    from pop_fast.train.choose import choose_backend
 
     if read_plan(folder) is None:
         raise PopError(f"{folder}: its capture is not divided yet; run pop blocks partition {folder}")
@@ -137,14 +130,9 @@ def _options(folder: Path, own: TrainConfig) -> Any:
     """Return the options of `pop train` that a block's training is done with.
 
     They are those of a user's own training of the block's folder, without what the merged result has instead.
-
-    Args:
-        folder: the run's.
-        own: the settings of the training.
     """
     from pop_fast.cli.train import arguments
-    from pop_fast.cli.train_checks import as_begun, check_output
-    from pop_fast.train.load_result import read_record
+    from pop_fast.cli.train_options import as_begun, check_output
 
     record, place = read_record(folder), Path(own.result_dir)
     again = ["--resume"] if (place / "cfg.json").is_file() else []
@@ -160,11 +148,9 @@ def _train_round(folder: Path, config: TrainConfig, record: CaptureRecord, job: 
     from pop_fast.blocks.jobs import marker_of
     from pop_fast.blocks.rounds import check_merged, read_core, read_start, write_counts, write_round_block
     from pop_fast.blocks.run import round_config
-    from pop_fast.cli.errors import printable
+    from pop_fast.cli import printable
     from pop_fast.cli.train import check_backend, open_capture, summary
-    from pop_fast.cli.train_checks import record_of, resumption, stopped
-    from pop_fast.train.choose import choose_backend
-    from pop_fast.train.load_result import RECORD, record_text
+    from pop_fast.cli.train_options import record_of, resumption, stopped
 
     assert part.block is not None
     begun, names = time.perf_counter(), check_merged(folder, part.round)
@@ -202,8 +188,7 @@ def _train_round(folder: Path, config: TrainConfig, record: CaptureRecord, job: 
 
 def _merge(folder: Path, config: TrainConfig, record: CaptureRecord, job: Job, part: Part) -> int:
     from pop_fast.blocks.run import merge_capture
-    from pop_fast.cli.finish import FinishOptions, finish
-    from pop_fast.cli.progress import bars
+    from pop_fast.cli.export import FinishOptions, finish
     from pop_fast.cli.train import report, summary
 
     try:

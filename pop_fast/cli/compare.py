@@ -10,9 +10,11 @@ from typing import Annotated, Any, Final
 
 import tyro
 
-from pop_fast.cli.arguments import parse
-from pop_fast.cli.capture_options import CaptureArguments
+from pop_fast.cli import parse
+from pop_fast.cli.options import CaptureArguments
 from pop_fast.errors import PopError
+from pop_fast.train.load_result import load_splat
+from pop_fast.train.results import read_config
 
 _EXAMPLES: Final = """
     pop compare out/scene_pop out/scene_adc
@@ -35,11 +37,10 @@ class Args(CaptureArguments):
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "compare", examples=_EXAMPLES)
     if not args.results:
         raise PopError("nothing to compare; name one or more result folders")
-    from pop_fast.view.report.compare import markdown, plain, row
+    from pop_fast.view.report.source import markdown, plain, row
 
     found = [_stats(path, args) for path in args.results]
     unfinished = [path for path, stats in zip(args.results, found, strict=True) if "psnr" not in stats]
@@ -55,7 +56,6 @@ def run(argv: Sequence[str]) -> int:
 
 def _stats(path: Path, args: Args) -> dict[str, Any]:
     """Return what a result's training left of numbers, or measure the file of a splat."""
-    from pop_fast.train.results import read_config
     from pop_fast.view.report.source import read_last_stats
 
     if path.is_file():
@@ -67,7 +67,6 @@ def _stats(path: Path, args: Args) -> dict[str, Any]:
 
 def _measured(path: Path, args: Args) -> dict[str, Any]:
     from pop_fast.cli.eval import measured
-    from pop_fast.train.load_result import load_splat
 
     capture, stats = measured(load_splat(path), args, [])
     return {**stats, "capture": capture, "method": path.name}

@@ -6,7 +6,6 @@ The script holds all words, so that pressing Tab starts no Python; it is written
 from __future__ import annotations
 
 import contextlib
-import importlib
 import io
 import re
 from collections.abc import Sequence
@@ -15,8 +14,7 @@ from typing import Annotated, Final, Literal
 
 import tyro
 
-from pop_fast.cli import COMMANDS
-from pop_fast.cli.arguments import parse
+from pop_fast.cli import COMMANDS, command, parse
 
 _EXAMPLES: Final = """
     eval "$(pop completion bash)"                                  in ~/.bashrc
@@ -52,19 +50,17 @@ class Args:
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "completion", examples=_EXAMPLES)
     words = {name: options_of(name) for name in COMMANDS}
     print(fish(words) if args.shell == "fish" else bash(words, args.shell == "zsh"), end="")
     return 0
 
 
-def options_of(command: str) -> list[str]:
+def options_of(name: str) -> list[str]:
     """List the options of a subcommand, as its help shows them."""
-    module = importlib.import_module(f"pop_fast.cli.{re.sub('[ -]', '_', command)}")
     text = io.StringIO()
     with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
-        module.run(["--help-all" if command == "train" else "--help"])
+        command(name)(["--help-all" if name == "train" else "--help"])
     shown = text.getvalue()
     found = {word for line in _OPTION.findall(shown) for word in _WORD.findall(line.split("  ")[0])}
     return sorted(found)

@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Final
 import numpy as np
 import tyro
 
-from pop_fast.cli.arguments import parse
+from pop_fast.cli import parse
 from pop_fast.cli.export import HTML, check_file, file_format, note_lost_frame, say_written
-from pop_fast.cli.limits import FormatName, LimitOptions, Output, Shown, limited
+from pop_fast.cli.options import FormatName, LimitOptions, Output, Shown, limited
 from pop_fast.errors import PopError
+from pop_fast.io.atomic import write_atomically
+from pop_fast.train.config import TrainConfig
 
 if TYPE_CHECKING:
     from pop_fast.io.formats import Stored
-    from pop_fast.train.config import TrainConfig
 
 _EXAMPLES: Final = """
     pop convert scene.ply scene.sog
@@ -45,14 +46,11 @@ class Args(LimitOptions):
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "convert", examples=_EXAMPLES)
     args.check()
     if args.score not in ("auto", "visibility"):
         raise PopError(f"--score {args.score} needs the training views; 'pop export RESULT' knows them")
-    from pop_fast.io.atomic import write_atomically
     from pop_fast.io.formats import load_splat_file
-    from pop_fast.train.config import TrainConfig
 
     name = file_format(args.out, args.to)
     check_file(args.out, args.source, args.overwrite)
@@ -72,7 +70,6 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _output(args: Args, name: str, stored: Stored, config: TrainConfig) -> Output:
-    """Return what is made of raw parameters."""
     if name == HTML:
         from pop_fast.view.html import page_of
 
@@ -83,11 +80,7 @@ def _output(args: Args, name: str, stored: Stored, config: TrainConfig) -> Outpu
 
 
 def _training_frame(source: Path, stored: Stored) -> np.ndarray | None:
-    """Return the training frame from the capture's; None where the splat is in the capture's own frame.
-
-    Raises:
-        PopError: it is in the training frame, and nothing says how that came from the capture's.
-    """
+    """Return the training frame from the capture's; None where the splat is in the capture's own frame."""
     if stored.frame is None or stored.frame.name == "capture":
         return None
     if stored.frame.transform is None:

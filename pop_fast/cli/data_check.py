@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import tyro
 
-from pop_fast.cli.arguments import parse
-from pop_fast.cli.errors import printable
+from pop_fast.cli import parse, printable
+from pop_fast.io.heartbeat import bars
+from pop_fast.machine import memory_bytes
 
 if TYPE_CHECKING:
     from pop_fast.data.photo_quality import CaptureFinding
@@ -37,7 +37,6 @@ class Args:
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "data check")
     from pop_fast.data.unpack import capture_folder
 
@@ -65,9 +64,9 @@ def run(argv: Sequence[str]) -> int:
 def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
     """Examine a capture, or photographs alone; all findings in reading order."""
     from pop_fast.data import check_dataset
-    from pop_fast.data.photo_quality import CaptureFinding, about_quality, measure_file, number
+    from pop_fast.data.photo_quality import CaptureFinding, about_quality, bad, measure_file, number, warn
     from pop_fast.data.sfm import photo_folder, photographs
-    from pop_fast.machine import memory_bytes
+    from pop_fast.io.images import find_image
 
     listing = check_dataset.read_listing(root, images)
     if listing is None:
@@ -76,7 +75,7 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
         shown, damage = _each(files, lambda path: measure_file(path, path.relative_to(folder).as_posix()), lambda p: p)
         findings = [
             *check_dataset.about_bare(root, shown),
-            *(CaptureFinding("bad", "photographs", problem) for problem in damage),
+            *(bad("photographs", problem) for problem in damage),
         ]
         return [*findings, *about_quality(shown)]
     shots, cloud = listing.shots, listing.cloud
@@ -84,15 +83,15 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
     inside = "" if listing.made_from == where else f" in {where}"
     what = f"{len(shots)} {number(len(shots), 'view', 'views')} from the {listing.made_from}{inside}"
     findings = [CaptureFinding("ok" if len(shots) > 1 else "bad", "poses", what)]
-    findings += [CaptureFinding("warn", "poses", note) for note in listing.notes]
+    findings += [warn("poses", note) for note in listing.notes]
     findings += check_dataset.about_cameras(shots)
     findings += check_dataset.about_spacing(shots)
-    paths = {id(shot): check_dataset.file_of(root, shot) for shot in shots}
+    paths = {id(shot): find_image(root / shot.folder, shot.file) for shot in shots}
     photos, damage = _each(
         shots, lambda shot: check_dataset.read_photo(shot, paths[id(shot)], cloud), lambda shot: paths[id(shot)]
     )
     findings += check_dataset.about_photos(photos, root)
-    findings += [CaptureFinding("bad", "photographs", problem) for problem in damage]
+    findings += [bad("photographs", problem) for problem in damage]
     findings += about_quality([photo.shown for photo in photos if photo.shown is not None])
     findings += check_dataset.about_drift(photos)
     findings += check_dataset.about_masks(photos, root)
@@ -104,18 +103,9 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
 
 def _each(items: Sequence[T], read: Callable[[T], R], file_of: Callable[[T], Path | None]) -> tuple[list[R], list[str]]:
     """Read photographs, several at a time, with progress; what was read, and a line for each JPEG with damage."""
-    from pop_fast.cli.progress import bars
-    from pop_fast.io.jpeg import jpeg_damage
+    from pop_fast.io.images import in_threads, jpeg_damage
 
     files = [path for path in map(file_of, items) if path is not None]
-    found: list[R] = []
-    with bars() as progress, jpeg_damage(files) as damage, ThreadPoolExecutor(max_workers=4) as pool:
-        jobs = [pool.submit(read, item) for item in items]
-        try:
-            for job in jobs:
-                found.append(job.result())
-                progress("looking at photographs", len(found), len(jobs))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    with bars() as progress, jpeg_damage(files) as damage:
+        found = in_threads(read, items, "looking at photographs", progress, most=4)
     return found, list(damage.values())

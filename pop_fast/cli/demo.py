@@ -9,7 +9,8 @@ from typing import Annotated, Final
 
 import tyro
 
-from pop_fast.cli.arguments import parse
+from pop_fast.cli import parse
+from pop_fast.io.heartbeat import bars
 
 _EXAMPLES: Final = """
     pop demo scene && pop train scene --minutes 2
@@ -35,9 +36,7 @@ class Args:
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "demo", examples=_EXAMPLES)
-    from pop_fast.cli.progress import bars
     from pop_fast.demo import make_demo
 
     with bars() as progress:

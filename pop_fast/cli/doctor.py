@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from pop_fast.api.backend import backend_names, get_backend
-from pop_fast.cli.arguments import parse
+from pop_fast.cli import parse
 from pop_fast.machine import machine_name, memory_bytes
 
 # holds all of torch that Python calls, and needs the rest of it
@@ -23,27 +23,15 @@ _LIBRARIES: Final = ("libtorch_python.so", "libtorch_python.dylib", "torch_pytho
 
 
 def why_torch_fails() -> str | None:
-    """Tell whether torch can be imported, from whether its library loads; None where it does.
+    """Tell whether torch can be imported, from whether its library loads: the error, or None where it does.
 
     Where the library does not load by itself, torch is imported: it knows more places to look for what it needs.
-
-    Returns:
-        The error, with its type's name, or None.
     """
-    try:
-        if not _loads():
-            importlib.import_module("torch")
-    except Exception as error:  # a broken install raises anything: OSError for a shared library, for one
-        return f"{type(error).__name__}: {error}"
-    return None
+    return None if _loads() else _why_not_imported("torch")
 
 
 def cuda_version() -> str | None:
-    """Return the version of CUDA that torch was built with, None for a CPU build.
-
-    Raises:
-        ImportError: torch does not say.
-    """
+    """Return the version of CUDA that torch was built with, None for a CPU build."""
     spec = importlib.util.spec_from_file_location("torch_version", _folder() / "version.py")
     if spec is None or spec.loader is None:
         raise ImportError("torch has no version.py")
@@ -112,7 +100,6 @@ class Args:
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "doctor")
     findings = [*packages(), *machine()]
     if not any(finding.name == "torch" and finding.state == "missing" for finding in findings):
@@ -143,7 +130,6 @@ def packages() -> Iterator[DoctorLine]:
 
 
 def machine() -> Iterator[DoctorLine]:
-    """Tell processor, cores and memory."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     yield DoctorLine("processor", "ok", f"{machine_name()}, {cores} usable core{'s' if cores != 1 else ''}")
     total, free = memory_bytes()

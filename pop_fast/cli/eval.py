@@ -11,14 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import tyro
 
-from pop_fast.cli.arguments import parse
-from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
+from pop_fast.cli import parse
+from pop_fast.cli.options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import check_file, write_atomically
+from pop_fast.io.heartbeat import Heartbeat
+from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import CaptureOptions, Splat, load_splat
+from pop_fast.train.results import ResultFolder
 
 if TYPE_CHECKING:
-    from pop_fast.train.config import TrainConfig
     from pop_fast.train.lpips import LPIPS
     from pop_fast.train.views import ViewTensors
 
@@ -50,12 +52,15 @@ class Args(CaptureArguments):
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "eval", examples=_EXAMPLES)
     if args.json is not None:
         check_file(args.json)
     splat = load_splat(args.splat)
-    _, stats = measured(splat, args, _nets(args, splat.config))
+    from pop_fast.train.lpips import LPIPS
+
+    chosen = {"vgg": args.lpips_vgg or splat.config.lpips_vgg, "alex": args.lpips_alex or splat.config.lpips_alex}
+    nets = [LPIPS(net, files) for net, files in chosen.items() if files]  # type: ignore[arg-type]
+    _, stats = measured(splat, args, nets)
     if args.per_view:
         for name, numbers in stats["per_view"].items():
             print(f"{name}: " + ", ".join(f"{key} {value:.4f}" for key, value in numbers.items()))
@@ -70,11 +75,7 @@ def run(argv: Sequence[str]) -> int:
 
 
 def measured(splat: Splat, options: CaptureOptions, nets: Sequence[LPIPS]) -> tuple[str, dict[str, Any]]:
-    """Measure a splat on the held-out views of its capture, and return the capture's name and the numbers.
-
-    Raises:
-        PopError: no capture is known, it cannot be read, holds no view out, or its images are too small.
-    """
+    """Measure a splat on the held-out views of its capture, and return the capture's name and the numbers."""
     from pop_fast.train.evaluate import too_small
     from pop_fast.train.views import ViewTensors
 
@@ -90,7 +91,6 @@ def measured(splat: Splat, options: CaptureOptions, nets: Sequence[LPIPS]) -> tu
 
 def measure_splat(splat: Splat, config: TrainConfig, views: list[ViewTensors], nets: Sequence[LPIPS]) -> dict[str, Any]:
     """Measure a splat on views; the numbers are those that training itself would write."""
-    from pop_fast.io.heartbeat import Heartbeat
     from pop_fast.train.engines import renderer
     from pop_fast.train.environment import reproducible
     from pop_fast.train.evaluate import evaluate, population
@@ -104,15 +104,7 @@ def measure_splat(splat: Splat, config: TrainConfig, views: list[ViewTensors], n
         return {**population(splat.params["opacities"].sigmoid()), **measured}
 
 
-def _nets(args: Args, config: TrainConfig) -> list[LPIPS]:
-    from pop_fast.train.lpips import LPIPS
-
-    chosen = {"vgg": args.lpips_vgg or config.lpips_vgg, "alex": args.lpips_alex or config.lpips_alex}
-    return [LPIPS(net, files) for net, files in chosen.items() if files]  # type: ignore[arg-type]
-
-
 def _record(folder: Path, step: int, stats: dict[str, Any]) -> None:
-    from pop_fast.train.results import ResultFolder
     from pop_fast.view.report import write_report
     from pop_fast.view.report.source import read_stats
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import tyro
 
-from pop_fast.cli.arguments import parse
-from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
+from pop_fast.cli import parse
+from pop_fast.cli.options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import check_file, check_folder, folder_atomically, write_atomically
 from pop_fast.train.load_result import load_splat
@@ -58,7 +58,6 @@ class Args(CaptureArguments):
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "explain", examples=_EXAMPLES)
     at = None if args.pixel is None else parse_pixel(args.pixel)
     if at is None and (args.maps is None or args.html or args.json or args.diff):
@@ -75,11 +74,9 @@ def _explain(args: Args, at: tuple[int, int] | None) -> int:
     from pop_fast.train.environment import reproducible
     from pop_fast.view.explain import explain_pixel, explain_view
     from pop_fast.view.explain.diff import difference
-    from pop_fast.view.explain.maps import view_maps, write_maps
-    from pop_fast.view.explain.model import WIDTH, table
     from pop_fast.view.explain.page import page
-    from pop_fast.view.explain.pixel import check_inside
-    from pop_fast.view.explain.scene import with_objective
+    from pop_fast.view.explain.pixel import WIDTH, check_inside, table
+    from pop_fast.view.explain.scene import view_maps, with_objective, write_maps
 
     splat = load_splat(args.splat)
     capture, config = open_with_bars(splat, args)
@@ -114,11 +111,6 @@ def _explain(args: Args, at: tuple[int, int] | None) -> int:
 
 
 def parse_pixel(text: str) -> tuple[int, int]:
-    """Read "X,Y".
-
-    Raises:
-        PopError: it is something else.
-    """
     try:
         x, y = (int(word) for word in text.split(","))
     except ValueError:
@@ -127,11 +119,6 @@ def parse_pixel(text: str) -> tuple[int, int]:
 
 
 def chosen_view(capture: Capture, which: str) -> View:
-    """Find a view by its place or by its name.
-
-    Raises:
-        PopError: there is none such.
-    """
     named = [view for view in capture.views if which in (view.name, Path(view.name).name, Path(view.name).stem)]
     if len(named) == 1:
         return named[0]

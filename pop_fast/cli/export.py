@@ -1,27 +1,32 @@
-"""`pop export`: a result as one file, in the format that is asked for, or as a folder as Inria's trainer leaves it."""
+"""`pop export`: a result as one file, or a folder in Inria's layout; and what `pop train` writes when it ends."""
 
 from __future__ import annotations
 
+import dataclasses
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import numpy as np
 import tyro
 
-from pop_fast.cli.arguments import parse
-from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
-from pop_fast.cli.limits import FormatName, LimitOptions, Output, Shown, limited
+from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED, describe, parse
+from pop_fast.cli.options import CaptureArguments, FormatName, LimitOptions, Output, Shown, limited, open_with_bars
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import check_folder, check_place
+from pop_fast.io.atomic import check_folder, check_place, write_atomically
+from pop_fast.io.heartbeat import Heartbeat
+from pop_fast.io.ply import Frame
+from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import Splat, frame_of_splat, load_splat, read_record
+from pop_fast.train.results import ResultFolder
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from pop_fast.data import Capture
-    from pop_fast.io.frame import Frame
-    from pop_fast.train.config import TrainConfig
+
 
 HTML: Final = "html"
 _EXAMPLES: Final = """
@@ -57,7 +62,6 @@ class Args(LimitOptions, CaptureArguments):
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "export", examples=_EXAMPLES)
     args.check()
     if args.layout == "inria":
@@ -79,7 +83,9 @@ def run(argv: Sequence[str]) -> int:
     left = limited(shown, args, output)
     for line in left.said:
         print(line)
-    say_written(out, len(left.params["means"]), _write(out, output.write(left.params, left.level)))
+    data = output.write(left.params, left.level)
+    write_atomically(out, lambda file: file.write(data))
+    say_written(out, len(left.params["means"]), len(data))
     return 0
 
 
@@ -106,7 +112,6 @@ class _Opened:
 
     @property
     def known(self) -> bool:
-        """Tell whether there is one to load."""
         return self._options.capture is not None or bool(self.config.data and Path(self.config.data).is_dir())
 
     def capture(self) -> tuple[Capture, TrainConfig]:
@@ -117,11 +122,7 @@ class _Opened:
 
 
 def planned_file(args: Args) -> tuple[Path, str]:
-    """Return the file to write and its format, which must agree.
-
-    Raises:
-        PopError: nothing says the format, the name is another's, or the place may not be written to.
-    """
+    """Return the file to write and its format, which must agree."""
     if args.out is None and args.to is None:
         raise PopError("nothing says what to write; give --out FILE or --to FORMAT")
     if args.out is None:
@@ -144,11 +145,7 @@ def file_name(stem: str, to: str) -> str:
 
 
 def file_format(out: Path, to: str | None) -> str:
-    """Return the format that a file is to be written in, by its name or as `--to` says.
-
-    Raises:
-        PopError: they do not agree, or neither says it.
-    """
+    """Return the format that a file is to be written in, by its name or as `--to` says; they must agree."""
     from pop_fast.io.formats import named_format
 
     is_page = out.suffix.lower() in (".html", ".htm")
@@ -158,7 +155,6 @@ def file_format(out: Path, to: str | None) -> str:
 
 
 def say_written(out: Path, count: int, size: int) -> None:
-    """Print what was written: so many Gaussians and bytes."""
     print(f"{count:,} Gaussians, {size / 1e6:.2f} MB -> {out}")
 
 
@@ -172,11 +168,7 @@ def note_lost_frame(out: Path, name: str, frame: Frame | None) -> None:
 
 
 def check_file(out: Path, source: Path, overwrite: bool) -> None:
-    """Check that one file may be written where it is asked for.
-
-    Raises:
-        PopError: something is in the way that is not to be replaced, or it is the splat itself.
-    """
+    """Refuse a file that is not to be replaced, or is the splat itself."""
     if out.is_dir():
         raise PopError(f"{out}: a folder of this name is in the way; choose another --out")
     if out.exists() and source.exists() and out.samefile(source):
@@ -187,7 +179,6 @@ def check_file(out: Path, source: Path, overwrite: bool) -> None:
 
 
 def _output(args: Args, out: Path, name: str, splat: Splat, opened: _Opened) -> Output:
-    """Return what is made of raw parameters in the splat's frame."""
     if name == HTML:
         from pop_fast.view.html import cameras_of, page_of
 
@@ -199,21 +190,8 @@ def _output(args: Args, out: Path, name: str, splat: Splat, opened: _Opened) -> 
     return Output(name, splat.config.antialiased, frame, transform)
 
 
-def _write(out: Path, data: bytes) -> int:
-    from pop_fast.io.atomic import write_atomically
-
-    write_atomically(out, lambda file: file.write(data))
-    return len(data)
-
-
 def _output_frame(splat: Splat, args: Args) -> tuple[np.ndarray | None, Frame | None]:
-    """Return what `to_capture_frame` is given to move the splat into the file's frame, and that frame.
-
-    Returns:
-        The similarity [4, 4], or None where nothing moves; the frame, or None where nothing says which it is.
-    """
-    from pop_fast.io.frame import Frame
-
+    """Return the similarity [4, 4] into the file's frame, or None where nothing moves; and that frame, where known."""
     now, transform = frame_of_splat(splat, args), known_transform(splat, args)
     wanted = args.frame or ("capture" if splat.folder is not None else now)
     if wanted is None or wanted == (now or "capture"):
@@ -232,8 +210,6 @@ def _training_frame(splat: Splat, args: Args) -> np.ndarray | None:
 
 
 def _loaded_transform(splat: Splat, args: Args) -> np.ndarray:
-    from pop_fast.io.frame import Frame
-
     as_trained = replace(splat, frame=Frame("training"))
     return open_with_bars(as_trained, replace(args, own_frame=False, training_frame=False))[0].world_transform
 
@@ -260,3 +236,131 @@ def without_invisible(splat: Splat) -> Splat:
     before, after = len(kept), int(kept.sum())
     print(f"opacity >= 1/255: {after:,} of {before:,} Gaussians kept, {before - after:,} left out")
     return replace(splat, params={name: value[kept] for name, value in splat.params.items()})
+
+
+VIEWER: Final = "viewer.html"
+EXPORTS: Final = "export"
+
+
+@dataclass(frozen=True, kw_only=True)
+class FinishOptions(LimitOptions):
+    """What is written beside the results.
+
+    Attributes:
+        export: also write the splat in these formats into the result's folder export, in the capture's own frame. The
+            limits below hold for these files, for the table of sizes and for the page; the checkpoint and the PLY stay
+            whole.
+        skip_sizes: do not measure what the splat weighs in every format.
+        skip_checks: do not render what only the report shows: depth, the orbit, floaters, exposure, overfitting.
+    """
+
+    export: tuple[FormatName, ...] = ()
+    skip_sizes: bool = False
+    skip_checks: bool = False
+
+
+def finish(folder: Path, capture: Capture, options: Any) -> int:
+    """Write what surrounds a run whose results are complete; see `after_results`."""
+    own = FinishOptions(**{f.name: getattr(options, f.name) for f in fields(FinishOptions)})
+    left = f"the results in {folder} are complete, and pop export {folder} writes files of them"
+    return after_results(lambda: _finish(folder, capture, own), "writing exports", "", left)
+
+
+def after_results(write: Callable[[], object], doing: str, failed: str, left: str) -> int:
+    """Write something beside results that are complete, which they stay whatever becomes of it.
+
+    Returns:
+        The exit status: 0, or 1 where it could not be written, or 130 after Ctrl-C.
+    """
+    try:
+        write()
+    except KeyboardInterrupt:
+        print(f"pop: stopped while {doing}; {left}", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except Exception as error:
+        # a fault of the program too: the command that writes it by itself shows where it is
+        reason = describe(error) or f"{type(error).__name__}: {error}"
+        print(f"pop: error: {failed}{reason}; {left}", file=sys.stderr)
+        return EXIT_INCOMPLETE
+    return 0
+
+
+def _finish(folder: Path, capture: Capture, options: FinishOptions) -> None:
+    from pop_fast.view.html import cameras_of, page_of
+
+    splat = load_splat(folder)
+    title = folder.resolve().name
+
+    rest = (cameras_of(capture.train_views(splat.config.test_every)), splat.config, splat.sh_degree, title)
+    shown = Shown(
+        params=splat.params,
+        sh_degree=splat.sh_degree,
+        config=splat.config,
+        world_transform=capture.world_transform,
+        photographed=lambda: (capture, splat.config),
+        checkpoint=splat.path,
+    )
+    page = Output(HTML, splat.config.antialiased, page=lambda params, level: page_of(params, *rest, level))
+    # what the page and the table of sizes show, and every file whose size is not limited
+    kept = limited(shown, dataclasses.replace(options, target_mb=None), page)
+    names = options.export or (("ply",) if options.any else ())
+    for line in kept.said if names and options.target_mb is None else ():
+        print(line)
+    frame = Frame("capture", tuple(map(tuple, capture.world_transform.tolist())))
+    for name in names:
+        output, left = page if name == HTML else Output(name, page.antialiased, frame, capture.world_transform), kept
+        if options.target_mb is not None:
+            left = limited(shown, options, output)
+            for line in left.said:
+                print(line)
+        path = folder / EXPORTS / file_name(title, name)
+        data = output.write(left.params, left.level)
+        write_atomically(path, lambda file, data=data: file.write(data))
+        say_written(path, len(left.params["means"]), len(data))
+    shown_page = page.write(kept.params)
+    write_atomically(folder / VIEWER, lambda file: file.write(shown_page))
+    if not options.skip_sizes:
+        _sizes(folder, splat, capture, kept.params)
+    if not options.skip_checks:
+        checked(folder, splat, capture, splat.config)
+
+
+def checked(folder: Path, splat: Splat, capture: Capture, config: TrainConfig) -> None:
+    """Render and measure what the report shows besides the results; see `pop_fast.view.report.checks`."""
+    from pop_fast.train.engines import renderer
+    from pop_fast.train.environment import reproducible
+    from pop_fast.view.report.checks import write_checks
+
+    backend, _ = renderer(config.backend)
+    with reproducible(config.threads), Heartbeat() as beat:
+        beat.say("rendering depth and the orbit for the report")
+        step = config.max_steps - 1 if splat.step is None else splat.step
+        write_checks(folder, capture, splat.params, config, splat.sh_degree, backend, step)
+
+
+def _sizes(folder: Path, splat: Splat, capture: Capture, params: dict[str, Tensor]) -> None:
+    """Measure the encodings, print them and add them to the statistics."""
+    from pop_fast.train.engines import renderer
+    from pop_fast.train.environment import reproducible
+    from pop_fast.train.evaluate import measure_encodings
+    from pop_fast.train.views import ViewTensors
+    from pop_fast.view.report.source import encoding_heads, encoding_rows
+
+    config = splat.config
+    views = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
+    backend, _ = renderer(config.backend)
+    with reproducible(config.threads):
+        found = measure_encodings(backend, params, views, config, splat.sh_degree, capture.world_transform)
+        entries = [encoding.entry() for encoding in found]
+    for line in table_lines([encoding_heads(entries), *encoding_rows(entries)]):
+        print(line)
+    results = ResultFolder(folder)
+    before = results.read_stats("val", splat.step) if splat.step is not None else None
+    if before is not None and splat.step is not None:
+        results.write_stats("val", splat.step, {**before, "encodings": entries})
+
+
+def table_lines(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lay out a table: the first column to the left, the others to the right."""
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    return ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]

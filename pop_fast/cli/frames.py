@@ -9,7 +9,8 @@ from typing import Annotated, Final
 
 import tyro
 
-from pop_fast.cli.arguments import parse
+from pop_fast.cli import parse
+from pop_fast.io.heartbeat import bars
 
 _EXAMPLES: Final = """
     pop frames walk.mp4                          writes walk_frames, up to 150 photographs
@@ -34,10 +35,8 @@ class Args:
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "frames", examples=_EXAMPLES)
-    from pop_fast.cli.progress import bars
-    from pop_fast.data.video import take_frames
+    from pop_fast.data.unpack import take_frames
 
     out = args.out or args.video.with_name(f"{args.video.stem}_frames")
     with bars() as progress:

@@ -10,7 +10,8 @@ from typing import Annotated, Any, Final
 
 import tyro
 
-from pop_fast.cli.arguments import parse
+from pop_fast.cli import parse
+from pop_fast.io.atomic import file_atomically
 
 _EXAMPLES: Final = """
     pop learn start mine           write thirteen files to fill in
@@ -101,7 +102,6 @@ class Args:
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     action = parse(Args, argv, "learn", examples=_EXAMPLES).action
     if isinstance(action, Class):
         return _class(action)
@@ -125,7 +125,6 @@ def _class(args: Class) -> int:
     from pop_ref.learn import needs_of_judging
 
     needs_of_judging()
-    from pop_fast.io.atomic import file_atomically
     from pop_ref.learn.grading import class_report, submissions
 
     grades = []

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import tyro
 
-from pop_fast.cli.arguments import parse
-from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
+from pop_fast.cli import parse
+from pop_fast.cli.options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import check_file, check_folder, folder_atomically, write_atomically
 from pop_fast.train.load_result import load_splat, paths_read
@@ -54,7 +54,6 @@ class Args(CaptureArguments):
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "render", examples=_EXAMPLES)
     if args.out is None and args.video is None:
         raise PopError("nothing to write; give --out DIR for pictures, --video FILE for a video, or both")
@@ -94,11 +93,6 @@ def _render(args: Args, video: VideoFile | None) -> int:
 
 
 def check_path(path: str) -> None:
-    """Check the path that was asked for before the long work begins.
-
-    Raises:
-        PopError: it is neither a name that is known nor a file that was recorded.
-    """
     from pop_fast.view.paths import PATHS
 
     if path in ("views", *PATHS):
@@ -114,11 +108,7 @@ def check_path(path: str) -> None:
 
 
 def planned_video(args: Args) -> VideoFile | None:
-    """Check the video that was asked for before the long work begins.
-
-    Raises:
-        PopError: its name, its rate or its place will not do, or it is there and may not be replaced.
-    """
+    """Check the video that was asked for before the long work begins."""
     if args.video is None:
         return None
     from pop_fast.view.paths import VideoFile

@@ -9,8 +9,9 @@ from typing import Annotated
 
 import tyro
 
-from pop_fast.cli.arguments import parse
-from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
+from pop_fast.cli import parse
+from pop_fast.cli.options import CaptureArguments, open_with_bars
+from pop_fast.train.load_result import load_splat
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,20 +28,13 @@ class Args(CaptureArguments):
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "report")
     if args.check:
-        _check(args)
+        from pop_fast.cli.export import checked
+
+        splat = load_splat(args.result)
+        checked(args.result, splat, *open_with_bars(splat, args))
     from pop_fast.view.report import write_report
 
     print(write_report(args.result))
     return 0
-
-
-def _check(args: Args) -> None:
-    from pop_fast.cli.finish import checked
-    from pop_fast.train.load_result import load_splat
-
-    splat = load_splat(args.result)
-    capture, config = open_with_bars(splat, args)
-    checked(args.result, splat, capture, config)

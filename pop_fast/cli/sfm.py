@@ -9,8 +9,9 @@ from typing import Annotated, Final, Literal
 
 import tyro
 
-from pop_fast.cli.arguments import parse
-from pop_fast.data.sfm_files import SfmOptions
+from pop_fast.cli import parse
+from pop_fast.data.capture import SfmOptions
+from pop_fast.io.heartbeat import bars
 
 _EXAMPLES: Final = """
     pop sfm photos                 writes photos/sparse/0
@@ -41,9 +42,7 @@ class Args:
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "sfm", examples=_EXAMPLES)
-    from pop_fast.cli.progress import bars
     from pop_fast.data import run_sfm
     from pop_fast.data.sfm import photo_folder
     from pop_fast.io.images import unreadable_photographs

@@ -7,7 +7,7 @@ import os
 import sys
 import time
 import typing
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
@@ -16,32 +16,37 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import tyro
 
 from pop_fast.api.backend import BACKENDS, require_backend
-from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED
-from pop_fast.cli.arguments import parse
-from pop_fast.cli.errors import describe, printable
-from pop_fast.cli.finish import FinishOptions, finish
-from pop_fast.cli.limits import LimitOptions
+from pop_fast.cli import EXIT_INTERRUPTED, parse, printable
+from pop_fast.cli.export import FinishOptions, after_results, finish
+from pop_fast.cli.options import LimitOptions
 from pop_fast.cli.train_blocks import check_blocks, train_in_blocks
-from pop_fast.cli.train_checks import (
+from pop_fast.cli.train_options import (
+    PLAN,
+    BlocksOptions,
     as_begun,
     check_early,
     check_output,
     chooses_for_itself,
     notes_before,
+    overrides,
+    plan_of,
     record_of,
+    rename_aliases,
     resumption,
     stopped,
     with_length,
     with_size,
 )
-from pop_fast.cli.train_options import PLAN, BlocksOptions, overrides, plan_of, rename_aliases
 from pop_fast.cli.view import LiveView, check_viewer
-from pop_fast.data.sfm_files import SfmOptions
+from pop_fast.data.capture import SfmOptions
 from pop_fast.errors import PopError
+from pop_fast.io.heartbeat import bars, duration
 from pop_fast.train.automatic import begun, check_minutes
 from pop_fast.train.choose import check_gpus, choose_backend
 from pop_fast.train.config import TrainConfig
+from pop_fast.train.load_result import RECORD, read_record, record_text
 from pop_fast.train.presets import ALIASES, AUTOMATIC, LOSSES, METHODS, Given
+from pop_fast.train.results import COMMANDS_FILE, commands_text
 from pop_fast.train.steps import why_not_trained
 from pop_ref.constants import PROFILES
 
@@ -132,7 +137,6 @@ class _Run(BlocksOptions, FinishOptions):
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     config, options, chooses = _asked(argv)
     folder = Path(config.result_dir)
     options.check()
@@ -165,7 +169,8 @@ def _asked(argv: Sequence[str]) -> tuple[TrainConfig, Any, bool]:
     """Read the words; where they say no schedule, the run chooses for itself, unless it was begun with one."""
     if not chooses_for_itself(rename_aliases(argv)):
         config, options = arguments(argv)
-        return config, options, config.preset == AUTOMATIC and "max_steps" not in _said(config)
+        said = {} if config.given is None else config.given.settings
+        return config, options, config.preset == AUTOMATIC and "max_steps" not in said
     config, options = arguments(["--preset", AUTOMATIC, *argv])
     folder = Path(config.result_dir)
     if options.resume and (folder / "cfg.json").exists() and begun(folder) is None:
@@ -173,15 +178,10 @@ def _asked(argv: Sequence[str]) -> tuple[TrainConfig, Any, bool]:
     return config, options, True
 
 
-def _said(config: TrainConfig) -> Mapping[str, Any]:
-    return {} if config.given is None else config.given.settings
-
-
 def _in_a_folder(config: TrainConfig) -> TrainConfig:
     """Take photographs out of a video, or out of an archive, where the capture is one."""
     if not Path(config.data).is_file():
         return config
-    from pop_fast.cli.progress import bars
     from pop_fast.data.unpack import capture_folder
 
     with bars(config.progress) as progress:
@@ -218,7 +218,7 @@ def train_capture(
     ranks: Ranks | None = None,
     chooses: bool = False,
 ) -> int:
-    """Train on a capture, finish the result and report on it.
+    """Train on a capture, finish the result and report on it; return the exit status.
 
     Args:
         config: the settings.
@@ -227,18 +227,12 @@ def train_capture(
         argv: the words after `pop train`, for commands.json.
         ranks: the processes that train together.
         chooses: choose the schedule by the speed of this machine.
-
-    Returns:
-        The exit status.
     """
-    from pop_fast.train.load_result import RECORD, read_record, record_text
-    from pop_fast.train.results import COMMANDS_FILE, commands_text
 
     folder, start = Path(config.result_dir), time.perf_counter()
     capture = _open_in_turn(config, options, ranks)
     searching = capture.sfm_seconds or 0.0
     loading = time.perf_counter() - start - searching
-    from pop_fast.io.heartbeat import duration
     from pop_fast.train.environment import keep_freed_memory
     from pop_fast.train.ranks import ALONE
     from pop_fast.train.training_run import TrainingRun
@@ -249,7 +243,8 @@ def train_capture(
     for note in capture.notes:
         print(f"note: {printable(note)}")
     config, told = with_length(config, capture, options) if chooses else (config, ())
-    print(printable(f"{capture.name}: {capture.source}; {_plan(config)}"))
+    plan = f"{config.method}, {config.max_steps:,} steps, seed {config.seed} -> {config.result_dir}"
+    print(printable(f"{capture.name}: {capture.source}; {plan}"))
     print(chosen)
     for line in told:
         print(line, flush=True)
@@ -287,33 +282,19 @@ def _trained(training: TrainingRun, folder: Path, capture: Capture, options: Any
 
 
 def report(folder: Path) -> int:
-    """Write the report of a run whose results are complete, which they stay whatever becomes of it.
+    """Write the report of a run whose results are complete; see `after_results`."""
 
-    Returns:
-        The exit status: 0, or 1 where it could not be written, or 130 after Ctrl-C.
-    """
-    left = f"the results in {folder} are complete, and pop report {folder} writes it"
-    try:
+    def write() -> None:
         from pop_fast.view.report import write_report
 
         print(f"report: {write_report(folder)}")
-    except KeyboardInterrupt:
-        print(f"pop: stopped while writing the report; {left}", file=sys.stderr)
-        return EXIT_INTERRUPTED
-    except Exception as error:
-        # a fault of the program too: 'pop report' shows where it is
-        reason = describe(error) or f"{type(error).__name__}: {error}"
-        print(f"pop: error: the report could not be written: {reason}; {left}", file=sys.stderr)
-        return EXIT_INCOMPLETE
-    return 0
+
+    left = f"the results in {folder} are complete, and pop report {folder} writes it"
+    return after_results(write, "writing the report", "the report could not be written: ", left)
 
 
 def arguments(argv: Sequence[str]) -> tuple[TrainConfig, Any]:
-    """Read the words after `pop train` into settings of the run and of what surrounds it.
-
-    Raises:
-        PopError: a setting is out of range.
-    """
+    """Read the words after `pop train` into settings of the run and of what surrounds it."""
     words = rename_aliases(argv)
     short_help = "--help" in words or "-h" in words
     words = ["--help" if word == "--help-all" else word for word in words]
@@ -331,13 +312,7 @@ def arguments(argv: Sequence[str]) -> tuple[TrainConfig, Any]:
 
 
 def _arguments_type(base: TrainConfig, plan: dict[str, Any], short: bool) -> type:
-    """Make the class that tyro reads: every setting of `TrainConfig`, or only those that the short help shows.
-
-    Args:
-        base: the defaults.
-        plan: what they come from, as far as it was said.
-        short: hide what `_SHOWN` does not name.
-    """
+    """Make the class that tyro reads: every setting of `TrainConfig`, or only those that the short help shows."""
     kinds = typing.get_type_hints(Given)
     kinds["method"] = Literal[(*METHODS, *ALIASES)]
     columns: list[Any] = [(name, kinds[name], plan.get(name, getattr(Given, name))) for name in PLAN]
@@ -372,11 +347,7 @@ def _arguments_type(base: TrainConfig, plan: dict[str, Any], short: bool) -> typ
 
 
 def check_backend(config: TrainConfig) -> None:
-    """Refuse a backend that cannot run here, or not with these settings, before the minutes of loading, not after.
-
-    Raises:
-        PopError: says why and what to do.
-    """
+    """Refuse a backend that cannot run here, or not with these settings, before the minutes of loading."""
     reason = why_not_trained(require_backend(config.backend), config)
     if reason is not None:
         raise PopError(reason)
@@ -399,7 +370,6 @@ def open_capture(config: TrainConfig, options: Any) -> Capture:
 
     The cameras of bare photographs are found first.
     """
-    from pop_fast.cli.progress import bars
     from pop_fast.data.load import load_capture
     from pop_fast.lazy import background_import
 
@@ -420,10 +390,6 @@ def open_capture(config: TrainConfig, options: Any) -> Capture:
             sfm=options.sfm,
             seed=config.seed,
         )
-
-
-def _plan(config: TrainConfig) -> str:
-    return f"{config.method}, {config.max_steps:,} steps, seed {config.seed} -> {config.result_dir}"
 
 
 def summary(stats: dict[str, Any]) -> str:

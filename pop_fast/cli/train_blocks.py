@@ -9,31 +9,26 @@ from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pop_fast.cli import EXIT_INTERRUPTED
-from pop_fast.cli.errors import printable
-from pop_fast.cli.finish import FinishOptions, table_lines
+from pop_fast.cli import EXIT_INTERRUPTED, printable
+from pop_fast.cli.export import FinishOptions, table_lines
 from pop_fast.cli.train_options import BlocksOptions
 from pop_fast.errors import PopError
+from pop_fast.io.atomic import FolderLock, write_atomically
+from pop_fast.io.heartbeat import bars
+from pop_fast.train.config import TrainConfig, first_difference
+from pop_fast.train.load_result import RECORD, CaptureRecord, record_text
+from pop_fast.train.results import COMMANDS_FILE, ResultFolder, commands_text, read_config
 
 if TYPE_CHECKING:
     from pop_fast.blocks.plan import Job
     from pop_fast.blocks.run import Division
-    from pop_fast.train.config import TrainConfig
 
 # of what is written at the end, what looks at all training photographs, which the merge does not hold
 _NEED_ALL = ("without_floaters", "final_prune", "max_gaussians", "target_mb")
 
 
 def check_blocks(config: TrainConfig, options: Any) -> None:
-    """Refuse what cannot be trained in blocks, before anything is loaded.
-
-    Args:
-        config: the settings.
-        options: those of `pop train`.
-
-    Raises:
-        PopError: names the option, the reason and what to do.
-    """
+    """Refuse what cannot be trained in blocks, by the option, the reason and what to do, before anything is loaded."""
     if options.blocks is None:
         _check_without(config, options)
         return
@@ -84,11 +79,7 @@ def _check_without(config: TrainConfig, options: Any) -> None:
 
 
 def _job(config: TrainConfig, options: Any) -> Job:
-    """Gather what is asked for; what is not said of rounds is as a run that is resumed was begun.
-
-    Raises:
-        PopError: an option is out of range, or job.json is damaged.
-    """
+    """Gather what is asked for; what is not said of rounds is as a run that is resumed was begun."""
     from pop_fast.blocks.plan import DEFAULT_ROUNDS, ROUND_SHARE, Job, read_job
 
     begun = read_job(Path(config.result_dir)) if options.resume else None
@@ -107,20 +98,9 @@ def _job(config: TrainConfig, options: Any) -> Job:
 
 
 def train_in_blocks(config: TrainConfig, options: Any, chosen: str, argv: Sequence[str]) -> int:
-    """Divide the capture where that is not done yet, and do the parts of the run that are not done yet.
-
-    Args:
-        config: the settings; every block is trained with them.
-        options: those of `pop train`.
-        chosen: a line on the backend.
-        argv: the words after `pop train`, for commands.json.
-
-    Returns:
-        The exit status.
-    """
+    """Divide the capture where that is not done yet, do the parts of the run that are left, return the exit status."""
     from pop_fast.blocks.jobs import gpus_for, has_snakemake, marker_of, profile_folder, run_in_turn, run_workflow
     from pop_fast.blocks.plan import FOLDER, read_plan
-    from pop_fast.io.atomic import FolderLock
 
     folder, job = Path(config.result_dir), _job(config, options)
     config = replace(config, data=str(Path(config.data).absolute()))
@@ -132,11 +112,10 @@ def train_in_blocks(config: TrainConfig, options: Any, chosen: str, argv: Sequen
         _take_threads(folder, config)
     if begun is None or read_plan(folder) is None:
         division = _divided(config, options, job)
-        print(
-            printable(
-                f"{config.method} in blocks {job.blocks}, {config.max_steps:,} steps each{_rounds_of(job)} -> {folder}"
-            )
+        rounds = (
+            f", then {job.rounds} round{'s' if job.rounds > 1 else ''} of {job.round_steps:,}" if job.rounds else ""
         )
+        print(printable(f"{config.method} in blocks {job.blocks}, {config.max_steps:,} steps each{rounds} -> {folder}"))
         print(chosen)
         if begun is None:
             _begin(folder, config, options, job, division, argv)
@@ -165,15 +144,9 @@ def train_in_blocks(config: TrainConfig, options: Any, chosen: str, argv: Sequen
 
 
 def _begun(folder: Path, config: TrainConfig, job: Job) -> Job | None:
-    """Read what a run that is resumed was begun with, or None where nothing is there.
-
-    Raises:
-        PopError: it is another run: names what differs.
-    """
+    """Read what a run that is resumed was begun with, or None where nothing is there; it must not differ."""
     from pop_fast.blocks.plan import read_job
-    from pop_fast.train.config import first_difference
     from pop_fast.train.engines import engine_of
-    from pop_fast.train.results import read_config
 
     before = read_job(folder)
     if before is None:
@@ -209,7 +182,6 @@ def _extend(folder: Path, before: Job, job: Job) -> None:
     """Let a run have more rounds than it was begun with; its merge is then the last one no more."""
     from pop_fast.blocks.jobs import marker_of
     from pop_fast.blocks.plan import JOB, job_text
-    from pop_fast.io.atomic import write_atomically
 
     if job.rounds > before.rounds:
         marker_of(folder, None, None).unlink(missing_ok=True)
@@ -219,17 +191,9 @@ def _extend(folder: Path, before: Job, job: Job) -> None:
 
 def _take_threads(folder: Path, config: TrainConfig) -> None:
     """Let the parts of a run that are not done yet have as many threads as are asked for now."""
-    from pop_fast.train.results import ResultFolder, read_config
-
     begun = read_config(folder)
     if begun.threads != config.threads:
         ResultFolder(folder).write_settings(replace(config, near_plane=begun.near_plane), {})
-
-
-def _rounds_of(job: Job) -> str:
-    if job.rounds == 0:
-        return ""
-    return f", then {job.rounds} round{'s' if job.rounds > 1 else ''} of {job.round_steps:,}"
 
 
 def _dividing(job: Job) -> dict[str, Any]:
@@ -238,8 +202,6 @@ def _dividing(job: Job) -> dict[str, Any]:
 
 def _divided(config: TrainConfig, options: Any, job: Job) -> Division:
     from pop_fast.blocks.run import divide_capture
-    from pop_fast.cli.progress import bars
-    from pop_fast.train.load_result import CaptureRecord
 
     how = {"images": options.images, "missing": options.missing, "source": options.source}
     record = CaptureRecord(**how, masks=not options.ignore_masks)
@@ -256,9 +218,8 @@ def _begin(folder: Path, config: TrainConfig, options: Any, job: Job, division: 
     import numpy as np
 
     from pop_fast.blocks.plan import JOB, job_text
-    from pop_fast.cli.train_checks import record_of
-    from pop_fast.train.load_result import RECORD, record_text
-    from pop_fast.train.results import COMMANDS_FILE, ResultFolder, commands_text
+    from pop_fast.cli.train_options import record_of
+    from pop_fast.train.results import ResultFolder
 
     record = record_text(record_of(division.capture, options))
     beside = {RECORD: record, COMMANDS_FILE: commands_text(None, ["pop", "train", *argv]), JOB: job_text(job)}

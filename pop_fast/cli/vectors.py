@@ -9,7 +9,7 @@ from typing import Annotated, Final, Literal
 
 import tyro
 
-from pop_fast.cli.arguments import parse
+from pop_fast.cli import parse
 from pop_fast.io.atomic import folder_atomically
 
 _EXAMPLES: Final = """
@@ -56,7 +56,6 @@ _NAMED: Final = 8  # names that a line gives
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     action = parse(Args, argv, "vectors", examples=_EXAMPLES).action
     if isinstance(action, Check):
         return _check(action)

@@ -8,16 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
+import numpy as np
 import tyro
 
-from pop_fast.cli.arguments import parse
-from pop_fast.cli.capture_options import CaptureArguments, open_with_bars
+from pop_fast.cli import parse
+from pop_fast.cli.options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
 from pop_fast.train.load_result import Splat, load_splat
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from pop_fast.data import Capture
     from pop_fast.train.training_run import TrainingRun
     from pop_fast.view.live.server import LiveViewer
@@ -46,7 +45,6 @@ class Args(CaptureArguments):
 
 
 def run(argv: Sequence[str]) -> int:
-    """Run the subcommand."""
     args = parse(Args, argv, "view", examples=_EXAMPLES)
     from pop_fast.train.environment import reproducible
 
@@ -88,15 +86,15 @@ def make_viewer(args: Args, splat: Splat) -> LiveViewer:
 
 def transform_of(splat: Splat) -> np.ndarray | None:
     """Return how a lone file's world came from its capture's, as its header says; None where it does not."""
-    import numpy as np
-
-    known = splat.frame is not None and splat.frame.name == "training" and splat.frame.transform is not None
-    return np.array(splat.frame.transform) if known and splat.frame is not None else None
+    frame = splat.frame
+    if frame is None or frame.name != "training" or frame.transform is None:
+        return None
+    return np.array(frame.transform)
 
 
 def stands_of_capture(capture: Capture, test_every: int, means: Any) -> list[Any]:
     """Make places to look from of the training views, at most sixty."""
-    from pop_fast.io.pictures import fit
+    from pop_fast.io.images import fit
     from pop_fast.view.html import cameras_of
     from pop_fast.view.live.server import stands_of
 
@@ -107,7 +105,6 @@ def stands_of_capture(capture: Capture, test_every: int, means: Any) -> list[Any
 
 
 def announce(viewer: LiveViewer) -> None:
-    """Print where the viewer is."""
     from pop_fast.view.live.server import LOOPBACK
 
     print(f"viewer: {viewer.url}", flush=True)
@@ -116,11 +113,7 @@ def announce(viewer: LiveViewer) -> None:
 
 
 def check_address(host: str, port: int) -> None:
-    """Refuse an address that the viewer cannot listen on, within a second or so.
-
-    Raises:
-        PopError: the port is none, viser is absent, or the address is not this machine's.
-    """
+    """Refuse an address that the viewer cannot listen on, within a second or so."""
     if not 0 < port < 65536:
         raise PopError(f"port is {port}; give --port a number from 1 to 65535")
     from pop_fast.view.live.guard import listen
@@ -138,7 +131,6 @@ class LiveView:
         self._viewer: LiveViewer | None = None
 
     def start(self, run: TrainingRun) -> None:
-        """Start the server, and print where it is."""
         from pop_fast.view.live.draw import scene_of
         from pop_fast.view.live.server import LiveViewer
 
@@ -157,10 +149,6 @@ class LiveView:
 
 
 def check_viewer(options: Any) -> None:
-    """Refuse a viewer that cannot be before the minutes of loading, not after.
-
-    Raises:
-        PopError: viser is absent, or the address cannot be listened on.
-    """
+    """Refuse a viewer that cannot be before the minutes of loading, not after."""
     if options.view:
         check_address(options.view_host, options.view_port)

@@ -9,10 +9,9 @@ from pop_fast.lazy import given_by
 
 if TYPE_CHECKING:
     from pop_fast.data.capture import Capture, View
-    from pop_fast.data.initialize import initialize_params
+    from pop_fast.data.gaussians import apply_similarity, initialize_params, to_capture_frame
     from pop_fast.data.load import load_capture
     from pop_fast.data.sfm import run_sfm
-    from pop_fast.data.similarity import apply_similarity, to_capture_frame
 
 __all__ = [
     "Capture",
@@ -30,9 +29,8 @@ __getattr__ = given_by(
     __name__,
     {
         "capture": ("Capture", "View"),
-        "initialize": ("initialize_params",),
+        "gaussians": ("apply_similarity", "initialize_params", "to_capture_frame"),
         "load": ("load_capture",),
         "sfm": ("run_sfm",),
-        "similarity": ("apply_similarity", "to_capture_frame"),
     },
 )

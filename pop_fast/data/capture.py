@@ -1,8 +1,17 @@
-"""What a capture is to the rest of the program: pinhole views with their photographs, and a sparse cloud of points.
+"""What a capture is to the rest of the program: pinhole views with their photographs, sparse points, and their frame.
 
 Conventions: OpenCV cameras (+x right, +y down, +z forward); pixel centres at +0.5, so that the point (0, 0) of an
 image is its outer corner, `K` of an image resized by s is exactly diag(s, s, 1) K, and COLMAP's intrinsics are used as
 they are stored.
+
+The world of a capture is put into the frame that gsplat trains in by three similarities: (1) turn the mean up direction
+of the cameras to -y, put the origin at the median of the points of the optical axes that are nearest to the capture's
+origin, and scale the median camera distance to 1; (2) turn the principal axes of the sparse points to x, y, z in order
+of falling variance, origin at their median; (3) turn half round about x where the points lie above their middle,
+because a scene has more points near its floor.
+
+Source: gsplat v1.5.3, examples/datasets/normalize.py and colmap.py. Departs: the signs of the principal axes, which
+gsplat leaves to LAPACK, are fixed so that the largest entry of the x and y axes is positive.
 """
 
 from __future__ import annotations
@@ -11,7 +20,7 @@ import html
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -52,12 +61,10 @@ class View:
 
     @property
     def width(self) -> int:
-        """Width of the image, px."""
         return int(self.image.shape[1])
 
     @property
     def height(self) -> int:
-        """Height of the image, px."""
         return int(self.image.shape[0])
 
     @property
@@ -134,11 +141,7 @@ class Capture:
         return float(1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
 
     def train_views(self, test_every: int = 8) -> tuple[View, ...]:
-        """Select the views to train on: all that `test_views` leaves, validation views apart.
-
-        Args:
-            test_every: as `test_views`.
-        """
+        """Select the views to train on: all that `test_views` leaves, validation views apart."""
         if self._has_split:
             return tuple(view for view in self.views if view.split == "train")
         return tuple(view for i, view in enumerate(self.views) if test_every <= 0 or i % test_every != 0)
@@ -161,12 +164,7 @@ class Capture:
 
 
 def held_out(splits: Sequence[Split | None], test_every: int) -> list[bool]:
-    """Tell which views are held out; see `Capture.test_views`.
-
-    Args:
-        splits: the capture's own assignment of each view, in the order of their names.
-        test_every: as `Capture.test_views`.
-    """
+    """Tell which views are held out, by the capture's own assignment in the order of their names; see `test_views`."""
     if any(split is not None for split in splits):
         chosen = "test" if "test" in splits else "val"
         return [split == chosen for split in splits]
@@ -175,42 +173,26 @@ def held_out(splits: Sequence[Split | None], test_every: int) -> list[bool]:
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """One listed photograph.
+    """One listed photograph."""
 
-    Attributes:
-        name: as listed; unique, and what views are sorted by.
-        folder: the image folder, relative to the capture; "" for the capture itself.
-        file: relative name in that folder; the extension may differ from the file's.
-        camera: a `PinholeCamera` or `pycolmap.Camera`, or None where only the field of view is known.
-        viewmat: world -> camera, rigid. float64 [4, 4]
-        angle_x: horizontal field of view in radians, where `camera` is None.
-        mask: the mask file that the list names, if any.
-        split: the list's own assignment, if any.
-        turns: quarter turns clockwise that make the photograph upright; `camera` and `viewmat` are those of its pixels
-            as they are stored.
-        seen: rows of the sparse points that it sees; None where that is not known. int32 [M]
-    """
-
-    name: str
-    folder: str
-    file: str
-    camera: Any
-    viewmat: np.ndarray
-    angle_x: float | None = None
-    mask: Path | None = None
-    split: Split | None = None
+    name: str  # as listed; unique, and what views are sorted by
+    folder: str  # the image folder, relative to the capture; "" for the capture itself
+    file: str  # relative name in that folder; the extension may differ from the file's
+    camera: Any  # a `PinholeCamera` or `pycolmap.Camera`, or None where only the field of view is known
+    viewmat: np.ndarray  # world -> camera, rigid. float64 [4, 4]
+    angle_x: float | None = None  # horizontal field of view in radians, where `camera` is None
+    mask: Path | None = None  # the mask file that the list names, if any
+    split: Split | None = None  # the list's own assignment, if any
+    # quarter turns clockwise that make the photograph upright; `camera` and `viewmat` are those of its pixels
+    # as they are stored
     turns: int = 0
+    # rows of the sparse points that it sees; None where that is not known. int32 [M]
     seen: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class SparsePoints:
-    """Sparse points.
-
-    Attributes:
-        xyz: float64 [P, 3]
-        rgb: uint8 [P, 3]
-    """
+    """Sparse points: places float64 [P, 3], colours uint8 [P, 3]."""
 
     xyz: np.ndarray
     rgb: np.ndarray
@@ -221,24 +203,198 @@ class SparsePoints:
 
 @dataclass(frozen=True, eq=False)
 class Listing:
-    """What a capture lists, its photographs not read.
+    """What a capture lists, its photographs not read."""
+
+    root: Path  # the folder that the photographs' folders are in
+    path: Path  # the file or model that lists them, for messages
+    shots: list[PosedImage]  # where each was taken
+    cloud: SparsePoints | None  # sparse points; None where there are none
+    made_from: str  # what kind of list it is
+    notes: list[str] = field(default_factory=list)  # one line each
+    # the training frame, where that is decided already; None normalizes. float64 [4, 4]
+    transform: np.ndarray | None = None
+    sfm_seconds: float | None = None  # how long the cameras were searched for, where that was done now
+
+
+# of a point from the middle of all, times the median camera distance
+_FARTHEST: Final = 1e100
+
+
+def transform_points(transform: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Move points by a similarity: p' = s R p + t. float64 [P, 3]"""
+    return points @ transform[:3, :3].T + transform[:3, 3]
+
+
+def transform_viewmats(transform: np.ndarray, viewmats: np.ndarray) -> np.ndarray:
+    """Move cameras [V, 4, 4] by a similarity of the world [4, 4], and keep their view matrices rigid.
+
+    With R, s, t of the similarity and c' = s R c + t the new centre: rotation' = rotation R^T, viewmat' = [rotation',
+    -rotation' c'].
+    """
+    linear = transform[:3, :3]
+    scale = np.cbrt(np.linalg.det(linear))
+    rotations = viewmats[:, :3, :3] @ (linear / scale).T
+    centers = transform_points(transform, camera_centers(viewmats))
+    moved = viewmats.copy()
+    moved[:, :3, :3] = rotations
+    moved[:, :3, 3] = -np.einsum("vij,vj->vi", rotations, centers)
+    return moved
+
+
+def normalizing_transform(viewmats: np.ndarray, points: np.ndarray | None) -> np.ndarray:
+    """Find the similarity, normalised world from the capture's own, by viewmats [V, 4, 4] and sparse points [P, 3].
+
+    Without points, or with fewer than four, only step (1) is taken.
+
+    Raises:
+        CaptureError: the cameras have no extent or no common up direction, or points are too far away.
+    """
+    transform = _from_cameras(viewmats)
+    if points is None or len(points) < 4:
+        return transform
+    transform = _principal_axes(transform_points(transform, points)) @ transform
+    heights = transform_points(transform, points)[:, 2]
+    if np.median(heights) > np.mean(heights):
+        transform = np.diag([1.0, -1.0, -1.0, 1.0]) @ transform
+    return transform
+
+
+def camera_centers(viewmats: np.ndarray) -> np.ndarray:
+    """Give the cameras' centres in the world: c = -R^T t. [V, 3]"""
+    return -np.einsum("vji,vj->vi", viewmats[:, :3, :3], viewmats[:, :3, 3])
+
+
+def focus_point(viewmats: np.ndarray) -> np.ndarray:
+    """Give the point nearest to all optical axes: sum_i (I - d_i d_i^T)(x - c_i) = 0.
+
+    Parallel axes meet nowhere, and those that spread meet behind the cameras; then it is the point one mean camera
+    distance ahead of the cameras' mean.
+    """
+    centers, forward = camera_centers(viewmats), viewmats[:, 2, :3]
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    total = across.sum(axis=0)
+    if np.linalg.cond(total) < 1e6:
+        focus = np.linalg.solve(total, np.einsum("mij,mj->i", across, centers))
+        if np.median(np.einsum("mj,mj->m", focus - centers, forward)) > 0.0:
+            return focus
+    spread = float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).mean())
+    return centers.mean(axis=0) + (spread or 1.0) * forward.mean(axis=0)
+
+
+# four of five cameras of ten captures look past the point by up to 13 degrees where people went round a subject; by 49
+# to 155 on a walk, in rooms photographed from their middle, and from the air
+_LOOKS_AT: Final = np.radians(25.0)
+_MOST_CAMERAS: Final = 0.8
+
+
+def look_at_one_point(viewmats: np.ndarray) -> bool:
+    """Tell whether four of five cameras look at `focus_point`, as those do that went round a subject. [V, 4, 4]"""
+    rays = focus_point(viewmats) - camera_centers(viewmats)
+    along = np.einsum("mj,mj->m", rays, viewmats[:, 2, :3])
+    cosines = along / np.maximum(np.linalg.norm(rays, axis=1), 1e-12)
+    return bool(np.mean(cosines >= np.cos(_LOOKS_AT)) >= _MOST_CAMERAS)
+
+
+# degrees between neighbouring cameras from which what lies between them is guessed
+FAR_APART: Final = 15.0
+
+
+def nearest_cameras(viewmats: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Find the nearest other camera of each, as the point that they look at sees them, and the angle to it in degrees.
+
+    [V] each; None of a single camera, and where they look at no one point.
+    """
+    if len(viewmats) < 2 or not look_at_one_point(viewmats):
+        return None
+    offsets = camera_centers(viewmats) - focus_point(viewmats)
+    rays = offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12)
+    cosines = rays @ rays.T
+    np.fill_diagonal(cosines, -1.0)
+    return cosines.argmax(axis=1), np.degrees(np.arccos(np.clip(cosines.max(axis=1), -1.0, 1.0)))
+
+
+def neighbour_degrees(viewmats: np.ndarray) -> float | None:
+    """Give the median of the angles of `nearest_cameras`, degrees; None where there are none."""
+    found = nearest_cameras(viewmats)
+    return None if found is None else float(np.median(found[1]))
+
+
+def _from_cameras(viewmats: np.ndarray) -> np.ndarray:
+    # the rows of a view matrix are the camera's axes in the world: x right, y down, z forward
+    up = -viewmats[:, 1, :3].mean(axis=0)
+    length = np.linalg.norm(up)
+    turn = _rotation_between(up / length, np.array([0.0, -1.0, 0.0])) if length > 1e-6 else np.eye(3)
+    centers = camera_centers(viewmats) @ turn.T
+    forwards = viewmats[:, 2, :3] @ turn.T
+    nearest = centers - np.sum(forwards * centers, axis=1, keepdims=True) * forwards
+    origin = np.median(nearest, axis=0)
+    distance = float(np.median(np.linalg.norm(centers - origin, axis=1)))
+    spread = float(np.ptp(centers, axis=0).max())
+    if spread <= 1e-9 * max(1.0, float(np.abs(centers).max())) or distance == 0.0:
+        raise CaptureError("all cameras stand at one place; a scene can only be made from photographs that moved")
+    transform = np.eye(4)
+    transform[:3, :3] = turn / distance
+    transform[:3, 3] = -origin / distance
+    return transform
+
+
+def _rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Rotate unit vector a onto unit vector b by the shortest way: I + [v] + [v]^2 / (1 + a.b), v = a x b."""
+    cosine = float(a @ b)
+    if cosine <= -1.0 + 1e-12:
+        return np.diag([-1.0, -1.0, 1.0])
+    x, y, z = np.cross(a, b)
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + skew + skew @ skew / (1.0 + cosine)
+
+
+def _principal_axes(points: np.ndarray) -> np.ndarray:
+    middle = np.median(points, axis=0)
+    # the square of what is too far is no float
+    farthest = float(np.abs(points - middle).max())
+    if not farthest < _FARTHEST:
+        raise CaptureError(
+            f"in units of the cameras' distance, points lie up to {farthest:.3g} from their middle, which cannot be "
+            "normalized; correct the positions of cameras and points, or use --no-normalize"
+        )
+    _, axes = np.linalg.eigh(np.cov(points - middle, rowvar=False))
+    rotation = axes.T[::-1].copy()
+    for row in rotation[:2]:
+        if row[np.argmax(np.abs(row))] < 0.0:
+            row *= -1.0
+    rotation[2] = np.cross(rotation[0], rotation[1])
+    transform = np.eye(4)
+    transform[:3, :3] = rotation
+    transform[:3, 3] = -rotation @ middle
+    return transform
+
+
+MATCHERS: Final = ("auto", "exhaustive", "sequential")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SfmOptions:
+    """How cameras are found.
 
     Attributes:
-        root: the folder that the photographs' folders are in.
-        path: the file or model that lists them, for messages.
-        shots: where each was taken.
-        cloud: sparse points; None where there are none.
-        made_from: what kind of list it is.
-        notes: one line each.
-        transform: the training frame, where that is decided already; None normalizes. float64 [4, 4]
-        sfm_seconds: how long the cameras were searched for, where that was done now.
+        max_size: longest side at which features are looked for, px; cameras are always in full size.
+        camera_model: COLMAP's name of the lens model.
+        single_camera: all photographs share one camera; by default when they are all of one size.
+        matcher: "exhaustive" matches all photographs with all, "sequential" each with its neighbours by name; "auto"
+            matches up to 60 exhaustively.
+        seed: of every random choice.
     """
 
-    root: Path
-    path: Path
-    shots: list[PosedImage]
-    cloud: SparsePoints | None
-    made_from: str
-    notes: list[str] = field(default_factory=list)
-    transform: np.ndarray | None = None
-    sfm_seconds: float | None = None
+    max_size: int = 1600
+    camera_model: str = "SIMPLE_RADIAL"
+    single_camera: bool | None = None
+    matcher: Literal["auto", "exhaustive", "sequential"] = "auto"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.max_size < 64:
+            raise CaptureError(f"max_size is {self.max_size}; it must be at least 64 px, or there are no features")
+        if self.matcher not in MATCHERS:
+            raise CaptureError(f"matcher is {self.matcher!r}; use one of {', '.join(MATCHERS)}")
+        if not 0 <= self.seed < 2**31:
+            raise CaptureError(f"seed is {self.seed}; it must be a whole number from 0 to {2**31 - 1}")

@@ -10,20 +10,24 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pop_fast.data.capture import Listing, PosedImage, SparsePoints
+from pop_fast.data.capture import FAR_APART, Listing, PosedImage, SparsePoints, nearest_cameras
 from pop_fast.data.colmap import find_model
-from pop_fast.data.exposure_drift import UNEVEN, exposures, levels_at
 from pop_fast.data.load import find_listing
-from pop_fast.data.normalize import FAR_APART, nearest_cameras
 from pop_fast.data.photo_quality import (
+    UNEVEN,
     CaptureFinding,
     Shown,
     State,
     about_mixed_sizes,
     about_number,
     about_use,
+    bad,
+    exposures,
+    levels_at,
     measure,
     number,
+    ok,
+    warn,
 )
 from pop_fast.data.sfm import photo_folder
 from pop_fast.errors import CaptureError
@@ -51,21 +55,11 @@ class Photo:
 
 
 def read_listing(root: Path, images: str | None = None) -> Listing | None:
-    """Read where photographs were taken, as training does; see `pop_fast.data.load.find_listing`.
-
-    Args:
-        root: the capture's folder.
-        images: the folder in it with the photographs, in place of the listed one.
-    """
+    """Read where photographs were taken, as training does; `images` is their folder in place of the listed one."""
     listing = find_listing(root, images=images)
     if listing is None or images is None:
         return listing
     return replace(listing, shots=[replace(shot, folder=images) for shot in listing.shots])
-
-
-def file_of(root: Path, shot: PosedImage) -> Path | None:
-    """Find the photograph of a shot."""
-    return find_image(root / shot.folder, shot.file)
 
 
 def read_photo(shot: PosedImage, path: Path | None, cloud: SparsePoints | None = None) -> Photo:
@@ -97,7 +91,6 @@ def _is_rotated(path: Path) -> bool:
 
 
 def about_cameras(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:
-    """Tell the lens models and sizes."""
     kinds: Counter[str] = Counter()
     for shot in shots:
         camera = shot.camera
@@ -106,9 +99,9 @@ def about_cameras(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:
         else:
             kinds[f"{camera.model_name} {camera.width}x{camera.height}, f = {camera.mean_focal_length():.1f} px"] += 1
     for kind, count in kinds.most_common(8):
-        yield CaptureFinding("ok", "cameras", f"{count} x {kind}")
+        yield ok("cameras", f"{count} x {kind}")
     if len(kinds) > 8:
-        yield CaptureFinding("ok", "cameras", f"and {len(kinds) - 8} more kinds")
+        yield ok("cameras", f"and {len(kinds) - 8} more kinds")
 
 
 def about_spacing(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:
@@ -128,10 +121,10 @@ def about_spacing(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:
         gaps.setdefault((first, second), gap)
     apart = f"neighbours {median:.1f} degrees apart as the subject sees them (median)"
     if median <= FAR_APART:
-        yield CaptureFinding("ok", "spacing", f"{apart}; at most {next(iter(gaps.values()))}")
+        yield ok("spacing", f"{apart}; at most {next(iter(gaps.values()))}")
         return
     wide = ", ".join(list(gaps.values())[:_GAPS])
-    yield CaptureFinding("warn", "spacing", f"{apart}: far; photographs between these would help most: {wide}")
+    yield warn("spacing", f"{apart}: far; photographs between these would help most: {wide}")
 
 
 def about_photos(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding]:
@@ -143,26 +136,22 @@ def about_photos(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding
     if absent:
         names = ", ".join(photo.shot.name for photo in absent[:3])
         fix = "restore them or train with --missing skip"
-        yield CaptureFinding(
-            "bad", "photographs", f"{len(absent)} of {len(photos)} listed are absent, first {names}; {fix}"
-        )
+        yield bad("photographs", f"{len(absent)} of {len(photos)} listed are absent, first {names}; {fix}")
     for photo in photos:
         if photo.path is not None and photo.problem:
-            yield CaptureFinding("bad", "photographs", photo.problem)
+            yield bad("photographs", photo.problem)
         elif photo.shot.camera is not None and photo.path is not None:
             yield from _about_size(photo)
     turned = sum(photo.shot.turns > 0 for photo in photos)
     if turned:
-        yield CaptureFinding("ok", "EXIF", f"{turned} are stored turned and shown upright, as pop sfm noted")
+        yield ok("EXIF", f"{turned} are stored turned and shown upright, as pop sfm noted")
     rotated = [photo.shot.name for photo in photos if photo.rotated and not photo.shot.turns]
     if rotated:
         note = "the pixels are used as stored, as COLMAP does; poses must have been made so too"
-        yield CaptureFinding("warn", "EXIF", f"{len(rotated)} ask to be rotated, first {rotated[0]}: {note}")
+        yield warn("EXIF", f"{len(rotated)} ask to be rotated, first {rotated[0]}: {note}")
     with_alpha = sum(photo.alpha for photo in photos)
     if with_alpha:
-        yield CaptureFinding(
-            "ok", "alpha", f"{with_alpha} photographs have it: composited over the background, no mask"
-        )
+        yield ok("alpha", f"{with_alpha} photographs have it: composited over the background, no mask")
     yield from _about_unlisted(photos, root)
 
 
@@ -182,9 +171,7 @@ def _about_unlisted(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFind
         if folder and (root / folder).is_dir():
             spare = [path.name for path in list_images(root / folder) if path.resolve() not in used]
             if spare:
-                yield CaptureFinding(
-                    "warn", "pairing", f"{len(spare)} files in {folder}/ are not listed, first {spare[0]}"
-                )
+                yield warn("pairing", f"{len(spare)} files in {folder}/ are not listed, first {spare[0]}")
 
 
 def about_masks(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding]:
@@ -200,12 +187,10 @@ def about_masks(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding]
         try:
             kept.append(float(read_mask(path).mean()))
         except CaptureError as error:
-            yield CaptureFinding("bad", "masks", str(error))
+            yield bad("masks", str(error))
     if not kept:
         if folder.is_dir():
-            yield CaptureFinding(
-                "bad", "masks", f"{folder} holds none named as a photograph (<name>.png or <name>.jpg.png)"
-            )
+            yield bad("masks", f"{folder} holds none named as a photograph (<name>.png or <name>.jpg.png)")
         return
     mean = float(np.mean(kept))
     text = f"{len(kept)} masks keep {100 * mean:.0f} % of the pixels (white = keep)"
@@ -213,9 +198,7 @@ def about_masks(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding]
         "warn" if mean < 0.35 else "ok", "masks", text + ("; are they inverted?" if mean < 0.35 else "")
     )
     if lone:
-        yield CaptureFinding(
-            "warn", "masks", f"{len(lone)} photographs have none, first {lone[0]}: all of their pixels count"
-        )
+        yield warn("masks", f"{len(lone)} photographs have none, first {lone[0]}: all of their pixels count")
 
 
 def about_points(
@@ -223,7 +206,7 @@ def about_points(
 ) -> Iterator[CaptureFinding]:
     """Project a sample of the points into every view: poses and points that do not belong together show here."""
     if cloud is None or len(cloud) == 0:
-        yield CaptureFinding("warn", "points", "none: training starts from random points in the cameras' view")
+        yield warn("points", "none: training starts from random points in the cameras' view")
         return
     chosen = cloud.xyz[np.random.default_rng(0).permutation(len(cloud))[:sample]]
     shares: dict[str, float] = {}
@@ -237,15 +220,15 @@ def about_points(
         shares[shot.name] = float(inside.sum()) / len(chosen)
     blind = [name for name, share in shares.items() if share == 0.0]
     mean = 100.0 * float(np.mean(list(shares.values()) or [0.0]))
-    yield CaptureFinding("ok", "points", f"{len(cloud):,}; a view sees {mean:.0f} % of them on average")
+    yield ok("points", f"{len(cloud):,}; a view sees {mean:.0f} % of them on average")
     if blind:
-        yield CaptureFinding("warn", "points", f"{len(blind)} views see none, first {blind[0]}: are these poses right?")
+        yield warn("points", f"{len(blind)} views see none, first {blind[0]}: are these poses right?")
 
 
 def about_reprojection(root: Path) -> Iterator[CaptureFinding]:
     """Tell the mean reprojection error of the model's tracks, where it has any."""
+    from pop_fast.data.cameras import require_colmap
     from pop_fast.data.colmap import quiet_colmap
-    from pop_fast.data.pinhole import require_colmap
 
     model = find_model(root)
     if model is None:
@@ -261,10 +244,10 @@ def about_reprojection(root: Path) -> Iterator[CaptureFinding]:
     except Exception as problem:
         words = " ".join(str(problem).split())
         fix = "training does without its tracks; write the model again to have them"
-        yield CaptureFinding("warn", "reprojection", f"{model}: COLMAP cannot read its tracks ({words}); {fix}")
+        yield warn("reprojection", f"{model}: COLMAP cannot read its tracks ({words}); {fix}")
         return
     if observations == 0:
-        yield CaptureFinding("ok", "reprojection", "the model has no tracks, so its error is unknown")
+        yield ok("reprojection", "the model has no tracks, so its error is unknown")
         return
     state: State = "ok" if error < 2.0 else "warn"
     yield CaptureFinding(state, "reprojection", f"mean error {error:.2f} px over {observations:,} observations")
@@ -294,7 +277,7 @@ def about_memory(photos: Sequence[Photo], cloud: SparsePoints | None, free: int)
     too_much = free > 0 and 3 * pixels > 0.7 * free
     yield CaptureFinding("warn" if too_much else "ok", "memory", f"photographs take {by_factor}")
     start = f"; training starts with {len(cloud):,}" if cloud is not None else ""
-    yield CaptureFinding("ok", "memory", f"Gaussians take {BYTES_IN_TRAINING:,.0f} MB a million{start}")
+    yield ok("memory", f"Gaussians take {BYTES_IN_TRAINING:,.0f} MB a million{start}")
 
 
 def about_bare(root: Path, shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
@@ -311,7 +294,7 @@ def about_bare(root: Path, shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     yield CaptureFinding("ok" if sizes else "bad", "photographs", listed or "none could be read")
     for one in shown:
         if one.problem:
-            yield CaptureFinding("bad", "photographs", one.problem)
+            yield bad("photographs", one.problem)
     yield from about_number(len(sound))
     yield from about_use(sound)
     mixed = about_mixed_sizes(sound)
@@ -319,7 +302,7 @@ def about_bare(root: Path, shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
         yield mixed
     left = unreadable_photographs(photo_folder(root))
     if left:
-        yield CaptureFinding("warn", "photographs", left)
+        yield warn("photographs", left)
     turned = sum(one.exif.orientation in (3, 6, 8) for one in sound)
     if turned:
-        yield CaptureFinding("ok", "EXIF", f"{turned} are stored turned; what is trained on is upright")
+        yield ok("EXIF", f"{turned} are stored turned; what is trained on is upright")

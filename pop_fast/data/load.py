@@ -1,30 +1,53 @@
-"""Load a capture, whatever made it: a COLMAP model, transforms.json, or a bare folder of photographs."""
+"""Load a capture, whatever made it: a COLMAP model, other programs' cameras, a bare folder of photographs; or a block.
+
+Where a capture brings no points to start from, they are drawn: uniform in the cube around the cameras, where two look.
+
+A block is of a capture that is too large for one training: a list of some of its photographs, and points of its own.
+
+    block.json    the capture's folder, its training frame, and the photographs with their cameras and splits
+    points.npz    xyz (float64 [P, 3], the capture's own frame) and rgb (uint8 [P, 3])
+
+No photograph is copied, and the capture's own list is not read again, so that what a block's training needs grows with
+the block alone.
+"""
 
 from __future__ import annotations
 
+import json
+import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from os.path import splitext
 from pathlib import Path
-from typing import Literal
+from typing import Any, Final, Literal, TypeVar
 from zipfile import is_zipfile
 
 import numpy as np
 
-from pop_fast.data.block import BLOCK, find_block, read_block
-from pop_fast.data.capture import Capture, Listing, PosedImage, Progress, SparsePoints, View, held_out
+from pop_fast.data.cameras import PINHOLES, Numbers, check_size, make_camera
+from pop_fast.data.capture import (
+    Capture,
+    Listing,
+    PosedImage,
+    Progress,
+    SfmOptions,
+    SparsePoints,
+    View,
+    held_out,
+    normalizing_transform,
+    transform_points,
+    transform_viewmats,
+)
 from pop_fast.data.colmap import find_models, read_model
-from pop_fast.data.exports import EXPORTS, find_export, read_export
-from pop_fast.data.normalize import normalizing_transform, transform_points, transform_viewmats
-from pop_fast.data.random_points import random_points
+from pop_fast.data.exports import EXPORTS, find_transforms, read_export, read_transforms
 from pop_fast.data.read_images import PhotoOptions, read_views
-from pop_fast.data.sfm import photo_folder, photographs, run_sfm
-from pop_fast.data.sfm_files import SfmOptions, read_upright
-from pop_fast.data.transforms import find_transforms, read_transforms
-from pop_fast.errors import CaptureError
+from pop_fast.data.sfm import photo_folder, photographs, read_upright, run_sfm
+from pop_fast.errors import CaptureError, PopError
+from pop_fast.io.atomic import write_atomically
 from pop_fast.io.image_header import read_size
 from pop_fast.io.images import VIDEO_SUFFIXES, find_image, unreadable_photographs
+from pop_fast.io.read_back import read_arrays, read_json
 
 # the mean of the cameras' viewing directions, as unit vectors, is this long where they all look about the same way
 _SAME_WAY = 0.9
@@ -33,12 +56,7 @@ _NAMED = 12
 
 
 def about_other_models(root: Path, models: Sequence[tuple[Path, int]]) -> list[str]:
-    """Tell which models of a capture were passed over for the largest.
-
-    Args:
-        root: the capture's folder.
-        models: folders and their numbers of images (-1: unreadable), the one that is used first.
-    """
+    """Tell which models were passed over for the first, with their numbers of images (-1: unreadable)."""
     if len(models) < 2:
         return []
     listed = [f"{path.relative_to(root)} ({count if count >= 0 else 'unreadable'})" for path, count in models]
@@ -48,12 +66,7 @@ def about_other_models(root: Path, models: Sequence[tuple[Path, int]]) -> list[s
 
 
 def about_unplaced(folder: Path, shots: Sequence[PosedImage]) -> list[str]:
-    """Tell which photographs of a folder have no camera.
-
-    Args:
-        folder: where the photographs are.
-        shots: what the model lists.
-    """
+    """Tell which photographs of a folder have no camera among the shots that the model lists."""
     # by stem too, because a photograph may have been converted since the model was made
     placed = {name for shot in shots for name in (shot.file, splitext(shot.file)[0])}
     names = [path.relative_to(folder).as_posix() for path in photographs(folder)]
@@ -68,13 +81,7 @@ def about_unplaced(folder: Path, shots: Sequence[PosedImage]) -> list[str]:
 
 
 def about_random_points(views: Sequence[View], made: int, wanted: int) -> list[str]:
-    """Tell where random points can be expected to be poor: too few, or between cameras that all look away from there.
-
-    Args:
-        views: with their cameras.
-        made: points that were made.
-        wanted: points that should have been.
-    """
+    """Tell where random points can be expected to be poor: too few, or between cameras that all look away."""
     fix = "bring points: run pop sfm on the photographs, or name a PLY file as ply_file_path"
     length = float(np.linalg.norm(np.mean([view.viewmat[2, :3] for view in views], axis=0)))
     if length > _SAME_WAY:
@@ -148,9 +155,13 @@ def load_capture(
         raise CaptureError(f"missing is {missing!r}; it must be 'error' or 'skip'")
     if resize not in ("area", "bicubic"):
         raise CaptureError(f"resize is {resize!r}; it must be 'area' or 'bicubic'")
-    shown = _background(background)
+    if len(background) != 3 or not all(0.0 <= c <= 1.0 for c in background):
+        raise CaptureError(f"background is {tuple(background)}; it must be three numbers in [0, 1]")
+    red, green, blue = map(float, background)
     listing = list_capture(path, source, images, sfm, progress) if listing is None else listing
-    options = PhotoOptions(int(factor), masks, missing, shown, images, resize, part=listing.made_from == BLOCK)
+    options = PhotoOptions(
+        int(factor), masks, missing, (red, green, blue), images, resize, part=listing.made_from == BLOCK
+    )
 
     def wanted(shots: Sequence[PosedImage]) -> list[bool]:
         if photographs == "none":
@@ -180,11 +191,7 @@ def list_capture(
     sfm: bool | SfmOptions = False,
     progress: Progress | None = None,
 ) -> Listing:
-    """Read what a capture lists, and none of its photographs; see `load_capture`.
-
-    Raises:
-        CaptureError: one line that names the file, the field and the fix.
-    """
+    """Read what a capture lists, and none of its photographs; see `load_capture`."""
     root = Path(path)
     listing = find_listing(root, source, images)
     if listing is None:
@@ -201,9 +208,6 @@ def find_listing(root: Path, source: Source = "auto", images: str | None = None)
 
     Returns:
         None where nothing says so, but there are photographs that cameras can be found for.
-
-    Raises:
-        CaptureError: the folder is absent or none, it holds no photographs, or what says so is damaged.
     """
     _check_root(root)
     if source == "auto" and find_block(root):
@@ -214,10 +218,9 @@ def find_listing(root: Path, source: Source = "auto", images: str | None = None)
     found = find_transforms(root) if source in ("auto", "transforms") else []
     if found:
         return Listing(root, found[0], *read_transforms(found), found[0].name, [])
-    export = find_export(root, source)
+    export = read_export(root, source, images)
     if export is not None:
-        shots, cloud, notes = read_export(*export, root, images)
-        return Listing(root, export[1], shots, cloud, EXPORTS[export[0]][0], notes)
+        return export
     if source == "colmap":
         raise CaptureError(
             f"{root}: has no COLMAP model in sparse, sparse/0 or colmap/sparse/0; run pop sfm, or COLMAP"
@@ -225,7 +228,7 @@ def find_listing(root: Path, source: Source = "auto", images: str | None = None)
     if source == "transforms":
         raise CaptureError(f"{root}: has no transforms.json and no transforms_train.json; choose another --source")
     if source in EXPORTS:
-        raise CaptureError(f"{root}: has no {EXPORTS[source][2]}; export it there, or choose another --source")
+        raise CaptureError(f"{root}: has no {EXPORTS[source][1]}; export it there, or choose another --source")
     folder = photo_folder(root)
     if not photographs(folder):
         hint = unreadable_photographs(folder) or "give the folder of a capture"
@@ -253,12 +256,6 @@ def _of_model(root: Path, models: Sequence[tuple[Path, int]], images: str | None
     shots = turned_upright(root, beside_the_model(root, listed, images), model)
     notes = about_other_models(root, models) + about_unplaced(root / (images or shots[0].folder), shots)
     return Listing(root, model, shots, cloud, "COLMAP model", notes)
-
-
-def _background(color: tuple[float, float, float]) -> tuple[float, float, float]:
-    if len(color) != 3 or not all(0.0 <= c <= 1.0 for c in color):
-        raise CaptureError(f"background is {tuple(color)}; it must be three numbers in [0, 1]")
-    return (float(color[0]), float(color[1]), float(color[2]))
 
 
 def beside_the_model(root: Path, shots: list[PosedImage], images: str | None) -> list[PosedImage]:
@@ -304,13 +301,7 @@ def _from_photos(root: Path, images: str | None, sfm: bool | SfmOptions, progres
 def check_factor(root: Path, factor: int, smallest: int = 1) -> None:
     """Refuse a factor that leaves nothing of bare photographs, by their headers, before their cameras are searched for.
 
-    Args:
-        root: the capture's folder.
-        factor: by which photographs are shrunk.
-        smallest: side of the smallest photograph that can be used, px.
-
-    Raises:
-        CaptureError: names the first photograph that would be smaller.
+    `smallest` is the side of the smallest photograph that can be used, px.
     """
     folder = photo_folder(root)
     if factor == 1 or (root / f"{folder.name}_{factor}").is_dir():
@@ -349,3 +340,169 @@ def _assemble(root: Path, listing: Listing, views: list[View], normalize: bool, 
     name = root.resolve().name
     points_of = (cloud.xyz, cloud.rgb)
     return Capture(name, tuple(views), *points_of, source, transform, tuple(notes), listing.sfm_seconds)
+
+
+_ROUNDS = 20
+
+
+def random_points(views: Sequence[View], count: int = 30_000, seed: int = 0) -> SparsePoints:
+    """Draw points uniformly from the cameras' bounding cube, and keep those in the pictures of two views or more.
+
+    The cube stands around the bounding box of the camera centres, with that box's longest side. Every point gets the
+    mean colour of the photographs.
+
+    Raises:
+        CaptureError: no two views look at a common part of the cube.
+    """
+    centers = np.stack([view.camera_center for view in views])
+    middle = 0.5 * (centers.min(axis=0) + centers.max(axis=0))
+    half = 0.5 * float(np.ptp(centers, axis=0).max())
+    generator = np.random.default_rng(seed)
+    kept: list[np.ndarray] = []
+    for _ in range(_ROUNDS):
+        points = middle + half * generator.uniform(-1.0, 1.0, (count, 3))
+        kept.append(points[sum(in_picture(points, view).astype(np.int64) for view in views) >= 2])
+        if sum(map(len, kept)) >= count:
+            break
+    xyz = np.concatenate(kept)[:count]
+    if len(xyz) == 0:
+        raise CaptureError(
+            "there are no points, and no two views look at the same part of the space around the cameras"
+        )
+    color = np.mean([view.image.mean(axis=(0, 1)) for view in views], axis=0)
+    return SparsePoints(xyz, np.tile(np.rint(color).astype(np.uint8), (len(xyz), 1)))
+
+
+def in_picture(points: np.ndarray, view: View) -> np.ndarray:
+    """Tell which points a view has in front of it and inside its image, whatever may stand before them. bool [P]"""
+    x, y, z = (points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]).T
+    # the image's edges as planes through the camera: no division, so points at z = 0 are harmless
+    u = view.K[0, 0] * x + view.K[0, 2] * z
+    v = view.K[1, 1] * y + view.K[1, 2] * z
+    return (z > 0.0) & (u >= 0.0) & (u < view.width * z) & (v >= 0.0) & (v < view.height * z)
+
+
+T = TypeVar("T")
+
+
+BLOCK: Final = "block"  # what a list of a block says that it is made from
+_BLOCK_LIST, _POINTS = "block.json", "points.npz"
+_FIX: Final = "remove the folder with all blocks, and start 'pop train --blocks' again with --overwrite"
+
+
+def find_block(folder: Path) -> bool:
+    return (folder / _BLOCK_LIST).is_file()
+
+
+def write_block(folder: Path, listing: Listing) -> None:
+    """Write a block: its photographs are those of `listing.shots`, its points those of `listing.cloud`.
+
+    All is in the capture's own frame, with the training frame of the whole capture as `listing.transform`.
+    """
+    cloud, transform = listing.cloud, listing.transform
+    if cloud is None or transform is None:
+        raise ValueError("a block has points and the training frame of its capture")
+    content = {
+        "capture": str(listing.root.absolute()),
+        "transform": transform.tolist(),
+        "photographs": [_entry(shot) for shot in listing.shots],
+    }
+    write_atomically(folder / _POINTS, lambda file: np.savez(file, xyz=cloud.xyz, rgb=cloud.rgb))
+    # the list comes last: a folder that has it is whole
+    text = json.dumps(content, indent=1) + "\n"
+    write_atomically(folder / _BLOCK_LIST, lambda file: file.write(text.encode()))
+
+
+def read_block(folder: Path) -> Listing:
+    """Read a block; a CaptureError says that its capture is not where it was, or names a file that is damaged."""
+    path, points = folder / _BLOCK_LIST, folder / _POINTS
+    content = _refused_as_capture(lambda: read_json(path, _FIX))
+    try:
+        root = Path(content["capture"])
+        transform = _matrix(content["transform"])
+        shots = [_block_shot(entry) for entry in content["photographs"]]
+    # pycolmap says what it does not know of a camera by errors of many kinds
+    except Exception as error:
+        raise CaptureError(f"{path}: is not what 'pop train --blocks' writes ({error!r}); {_FIX}") from error
+    cloud = _points(points)
+    # a name may be longer than the system takes, which Path's own question raises
+    if not os.path.isdir(root):
+        raise CaptureError(
+            f"{path}: is a block of {str(root)[:200]}, which is not there; put the capture back, or {_FIX}"
+        )
+    return Listing(root, path, shots, cloud, BLOCK, transform=transform)
+
+
+def _refused_as_capture(read: Callable[[], T]) -> T:
+    try:
+        return read()
+    except PopError as error:
+        raise CaptureError(str(error)) from error
+
+
+def _points(path: Path) -> SparsePoints:
+    arrays = _refused_as_capture(lambda: read_arrays(path, {"xyz": ("f", 2), "rgb": ("u", 2)}, _FIX))
+    cloud = SparsePoints(arrays["xyz"].astype(np.float64), arrays["rgb"].astype(np.uint8))
+    if cloud.xyz.shape[1] != 3 or cloud.rgb.shape != cloud.xyz.shape:
+        shapes = f"xyz has shape {list(cloud.xyz.shape)}, rgb {list(cloud.rgb.shape)}"
+        raise CaptureError(f"{path}: is not what 'pop train --blocks' writes ({shapes}); {_FIX}")
+    if not np.isfinite(cloud.xyz).all():
+        raise CaptureError(f"{path}: xyz has an entry that is not finite; {_FIX}")
+    return cloud
+
+
+def _entry(shot: PosedImage) -> dict[str, Any]:
+    camera = shot.camera
+    lens = None
+    if camera is not None:
+        size = {"width": int(camera.width), "height": int(camera.height)}
+        lens = {
+            "id": int(camera.camera_id),
+            "model": camera.model_name,
+            **size,
+            "params": list(map(float, camera.params)),
+        }
+    return {
+        "name": shot.name,
+        "folder": shot.folder,
+        "file": shot.file,
+        "camera": lens,
+        "viewmat": shot.viewmat.tolist(),
+        "angle_x": shot.angle_x,
+        "mask": None if shot.mask is None else str(shot.mask.absolute()),
+        "split": shot.split,
+        "turns": shot.turns,
+    }
+
+
+def _block_shot(entry: Any) -> PosedImage:
+    lens = entry["camera"]
+    camera = None
+    texts = [entry[name] for name in ("name", "folder", "file")]
+    if not all(isinstance(text, str) and "\0" not in text for text in texts):
+        raise ValueError(f"name, folder and file are {texts}")
+    if type(entry["turns"]) is not int or not 0 <= entry["turns"] <= 3:
+        raise ValueError(f"turns is {entry['turns']!r}")
+    if lens is not None:
+        where = f"camera of {entry['name']}"
+        read = Numbers(where, lens)
+        width, height = check_size(where, read("width"), read("height"))
+        params = [float(p) for p in lens["params"]]
+        if not np.isfinite(params).all():
+            raise ValueError(f"{where} has parameters that are not finite")
+        if lens["model"] in PINHOLES and len(params) != max(PINHOLES[lens["model"]][1]) + 1:
+            raise ValueError(f"{where} has {len(params)} parameters, which are not those of {lens['model']}")
+        camera = make_camera(lens["id"], lens["model"], width, height, params)
+    shot = PosedImage(entry["name"], entry["folder"], entry["file"], camera, _matrix(entry["viewmat"]))
+    mask = None if entry["mask"] is None else Path(entry["mask"])
+    if entry["split"] not in ("train", "test"):
+        raise ValueError(f"split is {entry['split']!r}")
+    angle_x = None if entry["angle_x"] is None else Numbers(entry["name"], entry)("angle_x")
+    return replace(shot, angle_x=angle_x, mask=mask, split=entry["split"], turns=entry["turns"])
+
+
+def _matrix(rows: Any) -> np.ndarray:
+    matrix = np.array(rows, np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        raise ValueError(f"a matrix has shape {list(matrix.shape)}, or entries that are not finite")
+    return matrix

@@ -3,15 +3,20 @@
 A photograph is decoded, composited over the background where it has alpha, undistorted at its stored size, and then
 shrunk by averaging areas. K follows exactly: K of a photograph stored at another size than its camera's is scaled by
 the ratio of the two, each photograph by its own, and K of the shrunk image by the ratio of the sizes in whole pixels.
+
+A photograph of any camera model becomes one of a pinhole camera with the same principal point. For a pixel centre p of
+the new image, d = K^-1 p is its ray and x = camera.img_from_cam(d) is where the photograph shows it; the new image is
+the photograph sampled there (bilinear, as COLMAP and gsplat). The new K keeps the principal point exactly and both
+focal lengths' ratio; one zoom factor is applied to them, the smallest one with which every new pixel lies inside the
+photograph. It is 1, and the photograph is returned as it is, bit for bit, where there is no distortion. Pixel centres
+are at +0.5, as COLMAP's are.
 """
 
 from __future__ import annotations
 
 import math
-import os
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -21,24 +26,16 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from pop_fast.data.cameras import make_camera
 from pop_fast.data.capture import PosedImage, Progress, View
-from pop_fast.data.pinhole import make_camera
-from pop_fast.data.undistort import Undistortion, undistortion
 from pop_fast.errors import CaptureError
 from pop_fast.io.image_header import read_size
-from pop_fast.io.images import find_image, read_image, read_mask
-from pop_fast.io.jpeg import sound_jpegs
-
-__all__ = ["PhotoOptions", "read_views"]
+from pop_fast.io.images import find_image, in_threads, read_image, read_mask, sound_jpegs
 
 
 @dataclass(frozen=True)
 class PhotoOptions:
-    """How photographs are read; see `pop_fast.data.load_capture`.
-
-    Attributes:
-        part: the list is a part of what its folder holds, so that masks may be there and none of them be its own.
-    """
+    """How photographs are read; see `pop_fast.data.load_capture`."""
 
     factor: int = 1
     masks: bool = True
@@ -46,6 +43,7 @@ class PhotoOptions:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     images: str | None = None
     resize: Literal["area", "bicubic"] = "area"
+    # the list is a part of what its folder holds, so that masks may be there and none of them be its own
     part: bool = False
 
 
@@ -76,34 +74,24 @@ def read_views(
         shots: what is listed.
         options: how to read them.
         progress: called after every photograph.
-        wanted: tells of the shots that have a photograph whose is read; of the others only the cameras are taken, so
-            that they need no memory. None reads all.
+        wanted: tells whose photographs are read, None of all; of the others only the cameras are, and take no memory.
 
     Returns:
         Views in the order of the shots, and notes.
-
-    Raises:
-        CaptureError: a photograph or mask is absent, damaged, or of another shape than its camera.
     """
     photos, notes = _locate(root, listing, shots, options)
     rectify = _rectifier()
-    views: list[View] = []
     chosen = [True] * len(photos) if wanted is None else wanted([photo.shot for photo in photos])
     read = [photo.path for photo, out in zip(photos, chosen, strict=True) if out]
     what = "reading photographs" if read else "reading cameras"
-    with sound_jpegs(read), ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
-        jobs = [
-            pool.submit(_read if out else _camera_alone, photo, options, rectify)
-            for photo, out in zip(photos, chosen, strict=True)
-        ]
-        try:
-            for job in jobs:
-                views.append(job.result())
-                if progress is not None:
-                    progress(what, len(views), len(jobs))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    pairs = list(zip(photos, chosen, strict=True))
+    with sound_jpegs(read):
+        views = in_threads(
+            lambda one: _read(one[0], options, rectify) if one[1] else _camera_alone(one[0], rectify),
+            pairs,
+            what,
+            progress,
+        )
     return views, notes
 
 
@@ -205,7 +193,10 @@ def _read(photo: _Photo, options: PhotoOptions, rectify: Any) -> View:
 def _placed(photo: _Photo, stored: tuple[int, int], rectify: Any) -> tuple[Undistortion, tuple[int, int], np.ndarray]:
     """Find how a photograph of a stored size is undistorted, the size that it is used in, and K of that."""
     width, height = stored
-    camera = photo.shot.camera or _camera_from_angle(photo.shot.angle_x or 1.0, width, height)
+    camera = photo.shot.camera
+    if camera is None:
+        focal = 0.5 * width / math.tan(0.5 * (photo.shot.angle_x or 1.0))
+        camera = make_camera(0, "PINHOLE", width, height, [focal, focal, width / 2, height / 2])
     _check_shape(photo.path, "the photograph", stored, "its camera", (camera.width, camera.height))
     try:
         rectification = rectify(camera, width, height)
@@ -220,9 +211,8 @@ def _placed(photo: _Photo, stored: tuple[int, int], rectify: Any) -> tuple[Undis
     return rectification, size, K
 
 
-def _camera_alone(photo: _Photo, options: PhotoOptions, rectify: Any) -> View:
+def _camera_alone(photo: _Photo, rectify: Any) -> View:
     """Make the view of a photograph whose header alone is read: its camera, and an image that takes no memory."""
-    del options  # they say how pixels are read
     stored = read_size(photo.path)
     if stored is None:
         height, width = read_image(photo.path).shape[:2]
@@ -265,12 +255,6 @@ def _upright(view: View, turns: int) -> View:
     return view
 
 
-def _camera_from_angle(angle_x: float, width: int, height: int) -> Any:
-    focal = 0.5 * width / math.tan(0.5 * angle_x)
-    params = [focal, focal, width / 2, height / 2]
-    return make_camera(0, "PINHOLE", width, height, params)
-
-
 def _check_shape(path: Path, what: str, size: tuple[int, int], whose: str, other: tuple[int, int]) -> None:
     """Accept another size, but only of the same shape to within a pixel of rounding."""
     if not _same_shape(size, other):
@@ -310,17 +294,10 @@ def _read_mask(
 
 
 def shrink_bicubic(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Resize as Pillow does, and so gsplat's example trainer for the photographs of Mip-NeRF 360 (A32).
+    """Resize uint8 [H, W, C] as Pillow does, and so gsplat's example trainer for the photographs of Mip-NeRF 360 (A32).
 
     Rows are resized first, and rounded to bytes before columns are: which of the two one call of Pillow takes first
     depends on its version and the sizes, and a few values with it by one level.
-
-    Args:
-        image: uint8 [H, W, C]
-        size: new width and height, px.
-
-    Returns:
-        uint8 [size[1], size[0], C]
     """
     rows = Image.fromarray(image).resize((size[0], image.shape[0]), Image.Resampling.BICUBIC)
     return np.array(rows.resize(size, Image.Resampling.BICUBIC))
@@ -336,3 +313,118 @@ def _resize_mask(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     if (mask.shape[1], mask.shape[0]) == size:
         return mask
     return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) >= 0.5
+
+
+# a wide lens may be opened up to twice its focal length's field of view, a strong pincushion closed to a quarter
+_ZOOMS = (0.5, 4.0)
+# what counts as no distortion at all, px, and as inside the photograph, in widths or heights of it
+_IDENTITY = 1e-7
+_SLACK = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Undistortion:
+    """A resampling of photographs of one camera at one size."""
+
+    K: np.ndarray  # intrinsics of the pinhole camera, px. float64 [3, 3]
+    # where to sample the photograph, px with centres at integers; None for the identity. 2 x float32 [H, W]
+    maps: tuple[np.ndarray, np.ndarray] | None
+
+    def image(self, image: np.ndarray) -> np.ndarray:
+        """Resample a photograph. uint8 [H, W, D] -> uint8 [H, W, D]"""
+        if self.maps is None:
+            return image
+        return cv2.remap(image, *self.maps, interpolation=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+    def mask(self, mask: np.ndarray) -> np.ndarray:
+        """Resample a mask: the nearest pixel decides. bool [H, W] -> bool [H, W]"""
+        if self.maps is None:
+            return mask
+        near = cv2.remap(
+            mask.astype(np.uint8), *self.maps, interpolation=cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
+        )
+        return near.astype(bool)
+
+
+def intrinsics(camera: Any) -> np.ndarray:
+    """Read the pinhole part of a camera: focal lengths and principal point, px. float64 [3, 3]"""
+    K = np.eye(3)
+    K[0, 0], K[1, 1] = camera.focal_length_x, camera.focal_length_y
+    K[0, 2], K[1, 2] = camera.principal_point_x, camera.principal_point_y
+    return K
+
+
+def undistortion(camera: Any, width: int, height: int) -> Undistortion:
+    """Plan the undistortion of photographs stored at width x height px, whatever size the camera was calibrated at.
+
+    Raises:
+        ValueError: a full-sphere camera, or no zoom between 0.5 and 4 keeps the new image inside the photograph. The
+            message continues "camera <id> ...".
+    """
+    if camera.model_name == "EQUIRECTANGULAR":
+        raise ValueError(
+            "is EQUIRECTANGULAR, a full sphere that no pinhole image can hold; cut it into perspective views"
+        )
+    resize = np.array([width / camera.width, height / camera.height])
+    K = intrinsics(camera)
+    K[:2] *= resize[:, None]
+
+    def source(points: np.ndarray, zoom: float) -> np.ndarray:
+        rays = np.ones((len(points), 3))
+        rays[:, :2] = (points - K[:2, 2]) / (np.array([K[0, 0], K[1, 1]]) * zoom)
+        return camera.img_from_cam(rays) * resize
+
+    fan = _fan(width, height, K[:2, 2])
+    if np.abs(source(fan.reshape(-1, 2), 1.0) - fan.reshape(-1, 2)).max() < _IDENTITY:
+        return Undistortion(K, None)
+    zoom = _smallest_zoom(lambda z: _fits(source(fan.reshape(-1, 2), z).reshape(fan.shape), K[:2, 2], width, height))
+    if zoom is None:
+        raise ValueError(
+            f"({camera.model_name}) has distortion {camera.params.tolist()} that folds the {width}x{height} image over "
+            "itself; calibrate it again, or undistort the photographs first"
+        )
+    maps = np.empty((2, height, width), np.float32)
+    points = np.empty((width, 2))
+    points[:, 0] = np.arange(width) + 0.5
+    # row by row, which stays in the processor's cache
+    for row in range(height):
+        points[:, 1] = row + 0.5
+        # opencv's remap puts pixel centres at integers
+        maps[:, row] = (source(points, zoom) - 0.5).T
+    K[0, 0] *= zoom
+    K[1, 1] *= zoom
+    return Undistortion(K, (maps[0], maps[1]))
+
+
+def _fan(width: int, height: int, center: np.ndarray, steps: int = 48, along: int = 24) -> np.ndarray:
+    """Points on straight lines from the principal point to the outline, corners included. float64 [along, M, 2]"""
+    s = np.linspace(0.0, 1.0, steps + 1)
+    o, one = np.zeros_like(s), np.ones_like(s)
+    sides = [np.stack(side, axis=1) for side in ((s, o), (s, one), (o, s), (one, s))]
+    outline = np.concatenate(sides) * np.array([width, height])
+    fractions = np.linspace(0.0, 1.0, along + 1)[1:, None, None]
+    return center + fractions * (outline - center)
+
+
+def _fits(fan: np.ndarray, center: np.ndarray, width: int, height: int) -> bool:
+    """Tell whether a fan's image lies inside the photograph and never turns back towards the centre.
+
+    Without the second condition a polynomial that bends back far outside, as they all do somewhere, would look inside.
+    """
+    outline = fan[-1] / np.array([width, height])
+    # a comparison with NaN is false: rays that the model cannot project do not fit
+    inside = np.all((outline >= -_SLACK) & (outline <= 1.0 + _SLACK))
+    radii = np.linalg.norm(fan - center, axis=-1)
+    return bool(inside and np.all(np.diff(radii, axis=0) >= 0.0))
+
+
+def _smallest_zoom(fits: Callable[[float], bool], steps: int = 40) -> float | None:
+    low, high = _ZOOMS
+    if fits(low):
+        return low
+    if not fits(high):
+        return None
+    for _ in range(steps):
+        middle = (low * high) ** 0.5
+        low, high = (low, middle) if fits(middle) else (middle, high)
+    return high

@@ -5,32 +5,46 @@ incremental mapping. Every random choice is seeded and the largest model is kept
 
 Cameras are found for the pixels as they are stored, as COLMAP does. Which photographs a viewer would turn by their EXIF
 orientation is written beside the model (`sparse/upright.json`), and `load_capture` turns these and their cameras.
+
+The search runs in a process of its own. COLMAP computes for minutes inside one call, where no signal is heard. A
+process can be ended at any moment, and takes COLMAP's threads, its log and its memory with it. The words of the two
+processes are lines of JSON: one job, and for it any number of reports of progress and one end. Between two reports the
+one that waits counts what COLMAP has written to its database: photographs with features, and pairs that were compared.
+
+It leaves a list of its files, with which replacing a result never removes anything else. The list lies beside the model
+as `sparse/sfm.sha256`, in the format of `sha256sum`, with paths relative to the capture.
 """
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import itertools
 import json
 import os
+import queue
 import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
 import tempfile
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+import threading
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import IO, Any, Final, Literal
 
-from pop_fast.data.capture import Progress
+from pop_fast.children import python_command
+from pop_fast.data.cameras import require_colmap
+from pop_fast.data.capture import Progress, SfmOptions
 from pop_fast.data.colmap import quiet_colmap
 from pop_fast.data.exports import photographs_of_polycam
-from pop_fast.data.photo_quality import Shown, about_mixed_sizes, about_use, measure
-from pop_fast.data.sfm_files import UPRIGHT, SfmOptions, recognise_result, write_list
-from pop_fast.data.sfm_search import Search, check_camera_model, find_cameras
+from pop_fast.data.photo_quality import FIX, Shown, about_mixed_sizes, about_use, measure
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import check_folder, folder_atomically
 from pop_fast.io.image_header import HEIF_SUFFIXES, read_exif
-from pop_fast.io.images import list_images, read_image, unreadable_photographs, write_png
-from pop_fast.io.jpeg import sound_jpegs
-
-__all__ = ["SfmResult", "photo_folder", "photographs", "run_sfm"]
+from pop_fast.io.images import in_threads, list_images, read_image, sound_jpegs, unreadable_photographs, write_png
 
 
 @dataclass(frozen=True)
@@ -60,10 +74,7 @@ def photo_folder(root: Path) -> Path:
 
 
 def photographs(folder: Path) -> list[Path]:
-    """List the photographs of a folder and its subfolders, sorted by relative name; `masks` holds none.
-
-    Of a Polycam export only those that its cameras are of.
-    """
+    """List a folder's photographs, subfolders' too, by name: none of `masks`, of a Polycam export only its own."""
     exported = photographs_of_polycam(folder)
     if exported is not None:
         return list_images(exported)
@@ -111,7 +122,7 @@ def run_sfm(
     capture, target = _place(photos, out_dir)
     names = [path.relative_to(photos) for path in photographs(photos) if not path.resolve().is_relative_to(target)]
     for name in names:
-        if not _is_utf8(str(name)):
+        if any("\ud800" <= letter <= "\udfff" for letter in str(name)):
             raise CaptureError(
                 f"{photos / name}: the name is not UTF-8, which COLMAP's files need; rename the photograph"
             )
@@ -131,8 +142,7 @@ def run_sfm(
     with folder_atomically(target, overwrite, recognise=own) as folder:
         sparse = folder if in_place else folder / "sparse"
         with tempfile.TemporaryDirectory(prefix="pop_sfm_") as work, quiet_colmap():
-            job = _Job(photos, _stage(photos, names, Path(work)), Path(work), progress)
-            best = _find_cameras(job, options)
+            best = find_cameras(Search(str(photos), work, _stage(photos, names, Path(work)), options), progress)
             for image in best.images.values():
                 image.name = names[int(Path(image.name).stem)].as_posix()
             (sparse / "0").mkdir(parents=True)
@@ -146,14 +156,6 @@ def run_sfm(
     error = float(best.compute_mean_reprojection_error())
     notes = () if mixed is None or options.single_camera else (mixed.text,)
     return SfmResult(capture, best.num_reg_images(), len(names), best.num_points3D(), error, notes)
-
-
-def _is_utf8(name: str) -> bool:
-    try:
-        name.encode("utf-8")
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _place(photos: Path, out_dir: str | Path | None) -> tuple[Path, Path]:
@@ -171,67 +173,34 @@ def _place(photos: Path, out_dir: str | Path | None) -> tuple[Path, Path]:
     return capture, target
 
 
-@dataclass(frozen=True)
-class _Job:
-    photos: Path
-    names: list[str]  # in `work / "images"`
-    work: Path
-    progress: Progress | None
-
-
 def _stage(photos: Path, names: list[Path], work: Path) -> list[str]:
     """Give photographs plain numbers for names, because COLMAP's lists of pairs cannot hold a space."""
     (work / "images").mkdir()
-    staged = [f"{i:06d}{_plain_suffix(name)}" for i, name in enumerate(names)]
-    for name, plain in zip(names, staged, strict=True):
-        if name.suffix.lower() in HEIF_SUFFIXES:
-            # which COLMAP does not read
-            write_png(work / "images" / plain, read_image(photos / name)[:, :, :3])
+    staged: list[str] = []
+    for i, name in enumerate(names):
+        suffix = name.suffix.lower()
+        # HEIC is not read by COLMAP
+        plain = work / "images" / f"{i:06d}{'.png' if suffix in HEIF_SUFFIXES else suffix}"
+        staged.append(plain.name)
+        if suffix in HEIF_SUFFIXES:
+            write_png(plain, read_image(photos / name)[:, :, :3])
             continue
         try:
-            (work / "images" / plain).symlink_to((photos / name).resolve())
+            plain.symlink_to((photos / name).resolve())
         except OSError:  # where links need a privilege
-            shutil.copyfile(photos / name, work / "images" / plain)
+            shutil.copyfile(photos / name, plain)
     return staged
-
-
-def _plain_suffix(name: Path) -> str:
-    suffix = name.suffix.lower()
-    return ".png" if suffix in HEIF_SUFFIXES else suffix
 
 
 def _looked_at(photos: Path, names: list[Path], progress: Progress | None) -> list[Shown]:
     """Read all photographs once: damaged and useless ones are found before the long work begins."""
-    found: list[Shown] = []
-    files = [photos / name for name in names]
-    with sound_jpegs(files), ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
-        jobs = [
-            pool.submit(lambda file, name: measure(file, read_image(file), name.as_posix()), file, name)
-            for file, name in zip(files, names, strict=True)
-        ]
-        try:
-            for job in jobs:
-                found.append(job.result())
-                if progress is not None:
-                    progress("checking photographs", len(found), len(names))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    return found
-
-
-def _find_cameras(job: _Job, options: SfmOptions) -> Any:
-    search = Search(
-        photos=str(job.photos),
-        work=str(job.work),
-        names=job.names,
-        camera_model=options.camera_model,
-        single_camera=bool(options.single_camera),
-        max_size=options.max_size,
-        matcher=options.matcher,
-        seed=options.seed,
-    )
-    return find_cameras(search, job.progress)
+    with sound_jpegs([photos / name for name in names]):
+        return in_threads(
+            lambda name: measure(photos / name, read_image(photos / name), name.as_posix()),
+            names,
+            "checking photographs",
+            progress,
+        )
 
 
 def _write_upright(sparse: Path, photos: Path, names: list[Path]) -> None:
@@ -242,3 +211,319 @@ def _write_upright(sparse: Path, photos: Path, names: list[Path]) -> None:
     turned = {name: count for name, count in turns.items() if count}
     if turned:
         (sparse / UPRIGHT).write_text(json.dumps(turned, indent=1) + "\n", encoding="utf-8")
+
+
+_EXHAUSTIVE_UP_TO: Final = 60
+_NEIGHBOURS: Final = 10
+# photographs, and the square of it pairs, between two reports of progress
+_BATCH: Final = 8
+_DONE: Final = b"."
+# s between two looks into the database
+_LOOK_EVERY: Final = 0.5
+# the stages of which COLMAP says nothing itself, and the table of its database that has a row for each one that is done
+_FEATURES: Final = "finding features in photographs"
+_MATCHES: Final = "matching pairs of photographs"
+_CAMERAS: Final = "finding cameras of photographs"
+_TABLES: Final = {_FEATURES: "descriptors", _MATCHES: "two_view_geometries"}
+# letters of what COLMAP says that an error shows
+_LONGEST: Final = 300
+
+
+@dataclass(frozen=True)
+class Search:
+    """What to search."""
+
+    photos: str  # the folder that messages name
+    work: str  # a folder of the search's own, with the photographs in `images`; the model is written to `best`
+    names: list[str]  # of the photographs
+    options: SfmOptions  # with `single_camera` decided
+
+    @property
+    def database(self) -> Path:
+        """COLMAP's database."""
+        return Path(self.work, "database.db")
+
+    @property
+    def images(self) -> Path:
+        """The photographs under plain names."""
+        return Path(self.work, "images")
+
+
+def check_camera_model(name: str) -> None:
+    """Refuse the name of a camera model that COLMAP does not have; the CaptureError names those that it has."""
+    known = [known for known in require_colmap().CameraModelId.__members__ if known != "INVALID"]
+    if name not in known:
+        raise CaptureError(f"camera_model is {name!r}; use one of {', '.join(known)}")
+
+
+def find_cameras(search: Search, progress: Progress | None) -> Any:
+    """Find cameras and points in a process of its own, which ends when this one is interrupted or ends.
+
+    Returns:
+        The largest model, a `pycolmap.Reconstruction`.
+
+    Raises:
+        CaptureError: there is none, or COLMAP failed.
+    """
+    begin = f"import sys; sys.path.append(sys.argv[1]); from {__name__} import main; main()"
+    command = python_command("-c", begin, str(Path(__file__).parents[2]))
+    if progress is not None:
+        # the other process takes seconds to begin
+        progress(_FEATURES, 0, len(search.names))
+    with tempfile.TemporaryFile() as log:
+        child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log)
+        try:
+            end = _listen(child, search, progress)
+            child.wait()
+            if child.stdin is not None:
+                with contextlib.suppress(BrokenPipeError):
+                    child.stdin.write(_DONE)
+                    child.stdin.flush()
+        finally:
+            child.kill()
+            child.wait()
+            for pipe in (child.stdin, child.stdout):
+                if pipe is not None:
+                    with contextlib.suppress(OSError):
+                        pipe.close()
+        if end is None:
+            log.seek(0)
+            said = log.read().decode("utf-8", "replace").strip().rpartition("\n")[2]
+            end = f"COLMAP failed: its process ended with status {child.returncode} {said}".strip()[:_LONGEST]
+            end += f"; fewer threads and smaller images need less memory; {FIX}"
+    if end:
+        raise CaptureError(f"{search.photos}: {end}")
+    return require_colmap().Reconstruction(Path(search.work, "best"))
+
+
+def _listen(child: subprocess.Popen[bytes], search: Search, progress: Progress | None) -> str | None:
+    """Hand over the job and read until its end: "" when a model was found, or an error; None when there was no end."""
+    if child.stdin is None or child.stdout is None:
+        return None
+    with contextlib.suppress(BrokenPipeError):
+        child.stdin.write(json.dumps(asdict(search)).encode() + b"\n")
+        child.stdin.flush()
+    lines: queue.Queue[bytes] = queue.Queue()
+    threading.Thread(target=_hand_on, args=(child.stdout, lines), name="sfm", daemon=True).start()
+    stage, told, total = "", 0, 0
+    while True:
+        try:
+            line = lines.get(timeout=_LOOK_EVERY)
+        except queue.Empty:
+            done = _rows(search.database, _TABLES.get(stage))
+        else:
+            word = json.loads(line) if line else None
+            if not isinstance(word, list):
+                return word
+            stage, done, total = word
+            # another stage, or a model that was given up for another
+            told = 0
+        if progress is not None and stage:
+            told = min(max(told, done), total)
+            progress(stage, told, total)
+
+
+def _hand_on(pipe: IO[bytes], lines: queue.Queue[bytes]) -> None:
+    """Put every line into a queue, and an empty one at the end."""
+    with contextlib.suppress(ValueError, OSError):
+        for line in pipe:
+            lines.put(line)
+    lines.put(b"")
+
+
+def _rows(database: Path, table: str | None) -> int:
+    """Count the rows of a table; 0 where that cannot be done now. COLMAP's database lets others read meanwhile."""
+    if table is None:
+        return 0
+    try:
+        with contextlib.closing(sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True, timeout=0.1)) as opened:
+            return int(opened.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
+    except sqlite3.Error:
+        return 0
+
+
+def main() -> None:
+    """Do the job on standard input; the words go to standard output."""
+    # Ctrl-C reaches every process of a terminal; the one that waits decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    out = os.fdopen(os.dup(1), "w", encoding="ascii")
+    os.dup2(2, 1)
+    given = json.loads(sys.stdin.buffer.readline())
+    search = Search(**given | {"options": SfmOptions(**given["options"])})
+    _watch(search)
+
+    def say(word: Any) -> None:
+        out.write(json.dumps(word) + "\n")
+        out.flush()
+
+    def tell(*report: Any) -> None:
+        say(report)
+
+    try:
+        with quiet_colmap():
+            _extract(search, tell)
+            _match(search, tell)
+            _map(search, tell).write_binary(_made(Path(search.work, "best")))
+        say("")
+    except CaptureError as error:
+        say(str(error))
+    except (ValueError, RuntimeError, IndexError, TypeError, MemoryError) as error:
+        said = " ".join(str(error).split())[:_LONGEST]
+        say(f"COLMAP failed: {said}; {FIX}")
+
+
+def _watch(search: Search) -> None:
+    """Leave a process behind that ends this one, and removes the folder of the search, when the other one is gone.
+
+    A thread could not: COLMAP keeps the interpreter to itself while it computes.
+    """
+    worker = os.getpid()
+    if not hasattr(os, "fork") or os.fork():
+        return
+    # the other process waits for the end of these too
+    os.closerange(1, 64)
+    if os.read(0, 1) != _DONE:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(worker, signal.SIGKILL)
+        shutil.rmtree(search.work, ignore_errors=True)
+    os._exit(0)
+
+
+def _made(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
+def _extract(job: Search, tell: Progress) -> None:
+    """Find features, a few photographs at a time, so that progress can be reported."""
+    pycolmap = require_colmap()
+    n = len(job.names)
+    # listed first and in order, because the threads that find features would number photographs as they finish
+    pycolmap.Database.open(job.database).close()
+    pycolmap.import_images(
+        job.database,
+        job.images,
+        camera_mode=pycolmap.CameraMode.SINGLE if job.options.single_camera else pycolmap.CameraMode.AUTO,
+        image_names=job.names,
+        options=pycolmap.ImageReaderOptions(camera_model=job.options.camera_model),
+    )
+    for start in range(0, n, _BATCH):
+        tell(_FEATURES, start, n)
+        pycolmap.extract_features(
+            job.database,
+            job.images,
+            image_names=job.names[start : start + _BATCH],
+            extraction_options=pycolmap.FeatureExtractionOptions(max_image_size=job.options.max_size),
+            device=pycolmap.Device.cpu,
+        )
+    tell(_FEATURES, n, n)
+
+
+def pairs_of(n: int, matcher: str) -> list[tuple[int, int]]:
+    """List which photographs to match: all with all, or each with its neighbours by name, near and 2^k further on."""
+    if matcher == "exhaustive" or (matcher == "auto" and n <= _EXHAUSTIVE_UP_TO):
+        return list(itertools.combinations(range(n), 2))
+    steps = {*range(1, _NEIGHBOURS + 1), *(2**k for k in range(_NEIGHBOURS))}
+    return sorted((i, i + step) for i in range(n) for step in steps if i + step < n)
+
+
+def _match(job: Search, tell: Progress) -> None:
+    pycolmap = require_colmap()
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = job.options.seed
+    pairs = pairs_of(len(job.names), job.options.matcher)
+    listing = Path(job.work, "pairs.txt")
+    for start in range(0, len(pairs), _BATCH**2):
+        tell(_MATCHES, start, len(pairs))
+        batch = pairs[start : start + _BATCH**2]
+        listing.write_text("".join(f"{job.names[i]} {job.names[j]}\n" for i, j in batch), encoding="utf-8")
+        pycolmap.match_image_pairs(
+            job.database,
+            pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listing),
+            verification_options=verification,
+            device=pycolmap.Device.cpu,
+        )
+    tell(_MATCHES, len(pairs), len(pairs))
+
+
+def _map(job: Search, tell: Progress) -> Any:
+    pycolmap = require_colmap()
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = job.options.seed
+    options.mapper.random_seed = job.options.seed
+    options.triangulation.random_seed = job.options.seed
+    options.min_model_size = 3
+    # bundle adjustment adds in the order in which its threads finish: one thread gives the same bits every time
+    options.num_threads = 1
+    options.mapper.num_threads = 1
+    options.ba_min_num_residuals_for_cpu_multi_threading = 2**31 - 1
+    found = [0]
+
+    def advance(by: int) -> Callable[[], None]:
+        def callback() -> None:
+            found[0] += by
+            tell(_CAMERAS, min(found[0], len(job.names)), len(job.names))
+
+        return callback
+
+    tell(_CAMERAS, 0, len(job.names))
+    out = _made(Path(job.work, "models"))
+    models: dict[int, Any] = pycolmap.incremental_mapping(
+        job.database,
+        job.images,
+        out,
+        options=options,
+        initial_image_pair_callback=advance(2),
+        next_image_callback=advance(1),
+    )
+    best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+    if best is None or best.num_reg_images() < 2 or best.num_points3D() == 0:
+        raise CaptureError(f"no cameras could be found for these {len(job.names)} photographs; {FIX}")
+    return best
+
+
+UPRIGHT = "upright.json"
+_LIST = "sfm.sha256"
+
+
+def write_list(sparse: Path, folder: Path, prefix: str = "") -> None:
+    """List every file of a new result `folder` in its folder `sparse`, with `prefix` before their paths."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    lines = [f"{_sha256(path)}  {prefix}{path.relative_to(folder).as_posix()}\n" for path in files]
+    (sparse / _LIST).write_text("".join(lines), encoding="utf-8", errors="surrogateescape")
+
+
+def read_upright(sparse: Path) -> dict[str, int]:
+    """Read by how many quarter turns clockwise photographs are to be turned, by name; others are absent."""
+    path = sparse / UPRIGHT
+    if not path.is_file():
+        return {}
+    fix = "run pop sfm again with --overwrite"
+    try:
+        turns = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise CaptureError(f"{path}: is not JSON ({error}); {fix}") from error
+    if not isinstance(turns, dict) or not all(type(count) is int and 1 <= count <= 3 for count in turns.values()):
+        raise CaptureError(f"{path}: must hold quarter turns, 1 to 3, by the photograph's name; {fix}")
+    return turns
+
+
+def recognise_result(capture: Path, target: Path) -> Callable[[Path], bool]:
+    """Make a test of whether a file, by its path relative to the `target` to be replaced, is as it was written."""
+    listing = capture / "sparse" / _LIST
+    text = listing.read_text(encoding="utf-8", errors="surrogateescape") if listing.is_file() else ""
+    written = {name: digest for digest, _, name in (line.partition("  ") for line in text.splitlines())}
+
+    def recognise(file: Path) -> bool:
+        path = target / file
+        if path.is_symlink():
+            return False
+        name = path.relative_to(capture).as_posix()
+        return name == f"sparse/{_LIST}" or (name in written and written[name] == _sha256(path))
+
+    return recognise
+
+
+def _sha256(path: Path) -> str:
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -152,7 +152,7 @@ class MiniSplattingStrategy(InriaStrategy):
         """Replace all Gaussians by points of the training views, with their pixels' colours."""
         import torch
 
-        from pop_fast.data.initialize import SH_C0
+        from pop_fast.data.gaussians import SH_C0
 
         points, colors = [], []
         for index in range(context.views.n_views):

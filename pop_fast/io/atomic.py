@@ -42,11 +42,7 @@ _REASONS = {
 
 
 def check_file(path: str | os.PathLike[str]) -> None:
-    """Refuse a file that cannot be written, before the work whose result it is to hold.
-
-    Raises:
-        PopError: a folder is in the way, a part of the path is a file, or its folder may not be written to.
-    """
+    """Refuse a file that cannot be written (PopError), before the work whose result it is to hold."""
     path = Path(path)
     if path.is_dir():
         raise PopError(f"{path}: {_REASONS[errno.EISDIR]}")
@@ -62,9 +58,6 @@ def check_folder(
 ) -> None:
     """Refuse a folder that `folder_atomically` would not make, before the work whose result it is to hold.
 
-    Args:
-        path, overwrite, keeps, recognise: as `folder_atomically`.
-
     Raises:
         PopError: as `folder_atomically`, or a part of the path is a file, or its parent may not be written to.
     """
@@ -75,11 +68,7 @@ def check_folder(
 
 
 def check_place(path: Path) -> None:
-    """Refuse a place in which nothing new can be made, as the nearest folder over it that exists does not allow it.
-
-    Raises:
-        PopError: a part of the path is a file, or that folder may not be written to.
-    """
+    """Refuse a place in which nothing new can be made, as the nearest folder over it that exists does not allow it."""
     parent = next((parent for parent in path.absolute().parents if parent.exists()), None)
     if parent is not None and not parent.is_dir():
         raise PopError(f"{path}: could not be written: {_REASONS[errno.ENOTDIR]}")
@@ -88,11 +77,7 @@ def check_place(path: Path) -> None:
 
 
 def write_atomically(path: str | os.PathLike[str], writer: Callable[[BinaryIO], object]) -> None:
-    """Write one file whole or not at all.
-
-    Args:
-        path: the file to make or to replace; missing parent folders are made.
-        writer: called once with a binary file open for writing (`torch.save(x, file)`, `file.write(data)`, ...).
+    """Write one file whole or not at all; missing parents are made, and `writer` is called once with a binary file.
 
     Raises:
         PopError: the operating system refused (disk full, no permission, ...); names the file and what to do. The
@@ -109,16 +94,10 @@ def write_atomically(path: str | os.PathLike[str], writer: Callable[[BinaryIO], 
 
 @contextmanager
 def file_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Let a library that opens its file by name write one file whole or not at all.
-
-    Args:
-        path: the file to make or to replace; missing parent folders are made.
+    """Let a library that opens its file by name write one file whole or not at all; see `write_atomically`.
 
     Yields:
         Where to write: a file of the same name in a hidden folder beside `path`, for libraries that read the ending.
-
-    Raises:
-        PopError: as `write_atomically`. Errors of the block pass through, and `path` is then as it was.
     """
     path = Path(path)
     with _beside(path) as partial:
@@ -354,9 +333,6 @@ class FolderLock:
     """A lock on a folder itself, for which no file is needed; it holds between processes of one machine.
 
     Where the file system knows no locks there is none, and nothing is refused.
-
-    Args:
-        path: the folder.
     """
 
     def __init__(self, path: Path) -> None:
@@ -365,15 +341,10 @@ class FolderLock:
 
     @property
     def held(self) -> bool:
-        """Tell whether this object holds the lock."""
         return self._handle is not None
 
     def take(self) -> None:
-        """Take the lock of a folder that exists; once is enough.
-
-        Raises:
-            PopError: somebody else holds it.
-        """
+        """Take the lock of a folder that exists, once is enough; a PopError says that somebody else holds it."""
         if self._handle is not None:
             return
         try:

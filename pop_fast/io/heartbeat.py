@@ -1,15 +1,17 @@
-"""A sign of life while long work runs: a bar's clock in a terminal, a line every half minute in a log or a notebook."""
+"""A sign of life while long work runs: a bar and its clock in a terminal, elsewhere a line every half minute."""
 
 from __future__ import annotations
 
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import TracebackType
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-__all__ = ["PERIOD", "Heartbeat", "duration", "so_far"]
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
 # seconds between two lines, and between two looks of a bar
 PERIOD: Final = 30.0
@@ -47,7 +49,6 @@ class Heartbeat:
         self._thread = threading.Thread(target=self._beat, name="heartbeat", daemon=True)
 
     def say(self, text: str) -> None:
-        """Set what the next line tells."""
         self._text = text
 
     def __enter__(self) -> Heartbeat:
@@ -84,16 +85,55 @@ def duration(seconds: float) -> str:
 
 
 def so_far(step: int, of: int, n_gaussians: int, seconds: float, latest: str) -> str:
-    """Tell how far a training is.
-
-    Args:
-        step: steps taken, at least 1.
-        of: steps in all.
-        n_gaussians: how many there are.
-        seconds: that the steps took.
-        latest: what was measured last, in words that begin with a comma, or nothing.
-    """
+    """Tell how far a training is; `latest` is what was measured last, in words that begin with a comma, or nothing."""
     line = f"step {step:,} of {of:,}, {n_gaussians:,} Gaussians{latest}"
     if step == of:
         return f"{line}, measuring and writing"
     return f"{line}, {step / max(seconds, 1e-9):.1f} steps a second, {duration(seconds * (of - step) / step)} left"
+
+
+# s, before which the first ones say little of the rest
+_SURE_AFTER: Final = 1.0
+Report = Callable[[str, int, int], None]
+
+
+@contextmanager
+def bars(show: bool = True) -> Iterator[Report]:
+    """Show one bar a stage on standard error, or lines where that is no terminal; yields the function to report to."""
+    # not at the top: the help of a command does without it
+    from tqdm import tqdm
+
+    current: dict[str, tqdm] = {}
+    began = 0.0
+
+    def report(stage: str, done: int, total: int) -> None:
+        nonlocal began
+        now = time.monotonic()
+        if stage not in current:
+            began = now
+        beat.say(f"{stage}: {done:,} of {total:,}{_left(now - began, done, total)}")
+        if stage not in current:
+            _close(current)
+            current[stage] = tqdm(total=total, desc=stage, disable=None if show else True, leave=False)
+        bar = current[stage]
+        bar.total = total
+        bar.update(done - bar.n)
+
+    with Heartbeat(show, draw=lambda: [bar.refresh() for bar in tuple(current.values())]) as beat:
+        try:
+            yield report
+        finally:
+            _close(current)
+
+
+def _left(seconds: float, done: int, total: int) -> str:
+    """Say how long the rest will take if it takes what the first took; nothing before that is known."""
+    if done == 0 or done >= total or seconds < _SURE_AFTER:
+        return ""
+    return f", {duration(seconds * (total - done) / done)} left"
+
+
+def _close(current: dict[str, tqdm]) -> None:
+    for bar in current.values():
+        bar.close()
+    current.clear()

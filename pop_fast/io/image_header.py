@@ -27,16 +27,11 @@ T = TypeVar("T")
 
 
 def can_read_heif() -> bool:
-    """Tell whether pillow-heif is installed."""
     return find_spec("pillow_heif") is not None
 
 
 def _opened(data: bytes, read: Callable[[Any], T], **how: Any) -> T:
-    """Open a file and read something of it.
-
-    Raises:
-        ValueError: the file is damaged.
-    """
+    """Open a file and read something of it; ValueError of a damaged file."""
     try:
         return read(import_module("pillow_heif").open_heif(data, **how))
     # memory can be had again, and no damage
@@ -53,21 +48,13 @@ def is_heif(data: bytes) -> bool:
 
 
 def heif_size(data: bytes) -> tuple[int, int]:
-    """Return width and height in px, upright, without decoding the pixels.
-
-    Raises:
-        ValueError: the file is damaged.
-    """
+    """Return width and height in px, upright, without decoding the pixels; ValueError of a damaged file."""
     width, height = _opened(data, lambda file: file.size)
     return int(width), int(height)
 
 
 def decode_heif(data: bytes) -> np.ndarray:
-    """Decode a file's first picture: RGB or RGBA, 8 bit, upright. uint8 [H, W, 3 or 4]
-
-    Raises:
-        ValueError: the file is damaged.
-    """
+    """Decode a file's first picture, 8 bit, upright; ValueError of a damaged file. uint8 [H, W, 3 or 4]"""
     pixels = _opened(data, lambda file: np.ascontiguousarray(np.asarray(file)), convert_hdr_to_8bit=True)
     # one channel is gray
     return np.repeat(pixels[..., None], 3, axis=2) if pixels.ndim == 2 else pixels
@@ -100,24 +87,16 @@ _HEAD: Final = 2**20
 
 @dataclass(frozen=True)
 class Exif:
-    """What a camera wrote into a photograph; None where it did not.
+    """What a camera wrote into a photograph; None where it did not."""
 
-    Attributes:
-        orientation: 1 as stored, 3 half a turn, 6 a quarter turn clockwise to be upright, 8 counterclockwise; 2, 4, 5
-            and 7 are mirrored.
-        camera: make and model.
-        exposure: seconds.
-        iso: sensitivity.
-        focal: focal length, mm.
-        focal_35mm: focal length of the same view on 35 mm film, mm.
-    """
-
+    # 1 as stored, 3 half a turn, 6 a quarter turn clockwise to be upright, 8 counterclockwise; 2, 4, 5 and 7
+    # are mirrored
     orientation: int = 1
-    camera: str | None = None
-    exposure: float | None = None
-    iso: float | None = None
-    focal: float | None = None
-    focal_35mm: float | None = None
+    camera: str | None = None  # make and model
+    exposure: float | None = None  # seconds
+    iso: float | None = None  # sensitivity
+    focal: float | None = None  # focal length, mm
+    focal_35mm: float | None = None  # focal length of the same view on 35 mm film, mm
 
 
 def read_size(path: Path) -> tuple[int, int] | None:
@@ -259,12 +238,7 @@ def _chunk(data: bytes, at: int, name: bytes, form: str, name_at: int, length_at
 
 
 def _tags(data: bytes, base: int, offset: int | None = None) -> dict[int, Any]:
-    """Read one TIFF directory: by tag, a text or the first of its numbers.
-
-    Raises:
-        struct.error: it leads out of the file.
-        KeyError: no TIFF block begins at `base`.
-    """
+    """Read one TIFF directory: by tag, a text or the first of its numbers; struct.error, KeyError where none is."""
     order = _TIFF[data[base : base + 4]]
     start = base + (struct.unpack_from(f"{order}I", data, base + 4)[0] if offset is None else offset)
     (count,) = struct.unpack_from(f"{order}H", data, start)

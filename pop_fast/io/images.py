@@ -1,24 +1,36 @@
-"""Photographs and masks: found by name, checked to be complete, decoded with OpenCV as COLMAP does (HEIC by `heif`).
+"""Photographs and masks, found by name, checked and decoded with OpenCV as COLMAP does; pictures of arrays for pages.
 
 EXIF orientation is ignored, because COLMAP ignores it: a model's width and height are those of the stored pixels.
+
+Decoders fill damaged pixels of a JPEG file with gray or wrong colours, and OpenCV reports nothing: libjpeg itself
+prints a line on standard error, which belongs to the whole process. So a process in which nothing else happens decodes
+the files in turn, and announces each on standard error by a NUL and its number: then every line can be assigned to its
+file.
 """
 
 from __future__ import annotations
 
 import base64
 import os
+import re
 import struct
+import subprocess
+import sys
+import tempfile
 import threading
 import zlib
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Final
+from typing import IO, Final, TypeVar
 
 import cv2
 import numpy as np
 
+from pop_fast.children import module_command
 from pop_fast.errors import CaptureError, PopError
 from pop_fast.io.atomic import write_atomically
-from pop_fast.io.budget import PICTURE, check_memory
 from pop_fast.io.image_header import (
     HEIF_SUFFIXES,
     INSTALL,
@@ -30,20 +42,10 @@ from pop_fast.io.image_header import (
     is_heif,
     size_of,
 )
+from pop_fast.io.read_back import PICTURE, check_memory
 
-__all__ = [
-    "FIX",
-    "IMAGE_SUFFIXES",
-    "VIDEO_SUFFIXES",
-    "find_image",
-    "inline_png",
-    "list_images",
-    "read_image",
-    "read_mask",
-    "readable_suffixes",
-    "unreadable_photographs",
-    "write_png",
-]
+T = TypeVar("T")
+R = TypeVar("R")
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 # what cameras write and nothing here reads: HEIF without pillow-heif, and raw formats
@@ -104,13 +106,8 @@ def unreadable_photographs(folder: Path) -> str | None:
 def find_image(folder: Path, name: str) -> Path | None:
     """Find the file of an image by its relative name, under another image extension where the exact one is absent.
 
-    Files are paired by name and never by their place in a sorted list, so one missing file cannot shift the others.
-
-    Returns:
-        The file, or None.
-
-    Raises:
-        CaptureError: two files of the same stem fit and neither is the exact name.
+    Files are paired by name and never by their place in a sorted list, so one missing file cannot shift the others. A
+    CaptureError says that two files of the same stem fit and neither is the exact name.
     """
     exact = folder / name
     if exact.is_file():
@@ -133,12 +130,9 @@ def find_image(folder: Path, name: str) -> Path | None:
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Read a photograph as stored: RGB or RGBA, 8 bit.
+    """Read a photograph as stored: RGB or RGBA (not premultiplied), 8 bit. uint8 [H, W, 3 or 4]
 
     Gray becomes RGB; 16-bit samples are divided by 257 and rounded; EXIF orientation is ignored.
-
-    Returns:
-        uint8 [H, W, 3] or, with an alpha channel, [H, W, 4] (not premultiplied).
 
     Raises:
         CaptureError: the file is absent, truncated, corrupt, empty or not an image.
@@ -153,15 +147,33 @@ def read_image(path: Path) -> np.ndarray:
     raise CaptureError(f"{path}: has {image.shape[2]} channels; save it as gray, RGB or RGBA")
 
 
-def read_mask(path: Path) -> np.ndarray:
-    """Read a mask: True (keep) where the picture is brighter than half; colour is averaged, alpha ignored.
+def in_threads(
+    read: Callable[[T], R],
+    items: Sequence[T],
+    what: str,
+    progress: Callable[[str, int, int], None] | None,
+    most: int = 8,
+) -> list[R]:
+    """Read items several at a time, in their order; after an error or an interruption no further one is begun.
 
-    Returns:
-        bool [H, W].
-
-    Raises:
-        CaptureError: as `read_image`.
+    `progress` is called by this thread, with what is done, how many are, and of how many.
     """
+    found: list[R] = []
+    with ThreadPoolExecutor(min(most, os.cpu_count() or 1)) as pool:
+        jobs = [pool.submit(read, item) for item in items]
+        try:
+            for job in jobs:
+                found.append(job.result())
+                if progress is not None:
+                    progress(what, len(found), len(jobs))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return found
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """Read a mask, True (keep) where the picture is brighter than half; alpha is ignored. bool [H, W]"""
     image = read_image(path)
     return image[:, :, :3].mean(axis=2) > 127.5
 
@@ -182,34 +194,36 @@ def inline_png(image: np.ndarray, longest: int) -> str:
 
 
 # of OpenCV's log, as a number because OpenCV 4 has no name for it in Python
-SILENT: Final = 0
+_SILENT: Final = 0
 
 
-def set_log_level(level: int) -> int:
+def _set_log_level(level: int) -> int:
     """Set the level of OpenCV's own log, by the function's name in OpenCV 4 or in 5, and return the level before."""
     return (cv2.setLogLevel if hasattr(cv2, "setLogLevel") else cv2.utils.logging.setLogLevel)(level)  # type: ignore[attr-defined]
 
 
 class _Quiet:
-    """Keep OpenCV's own log off the terminal while any thread decodes: what matters of it is raised as one line."""
+    """Keep the log of OpenCV and ffmpeg off the terminal in any thread: what matters of it is raised as one line."""
 
     def __init__(self) -> None:
         self._lock, self._inside, self._level = threading.Lock(), 0, 0
 
     def __enter__(self) -> None:
+        # ffmpeg's own words about a damaged file
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
         with self._lock:
             if self._inside == 0:
-                self._level = set_log_level(SILENT)
+                self._level = _set_log_level(_SILENT)
             self._inside += 1
 
     def __exit__(self, *_: object) -> None:
         with self._lock:
             self._inside -= 1
             if self._inside == 0:
-                set_log_level(self._level)
+                _set_log_level(self._level)
 
 
-_QUIET = _Quiet()
+QUIET: Final = _Quiet()
 
 
 def _decode(path: Path) -> np.ndarray:
@@ -231,7 +245,7 @@ def _decode(path: Path) -> np.ndarray:
         raise CaptureError(f"{path}: is no image that states its size as PNG, JPEG, WebP, TIFF and BMP do; {FIX}")
     try:
         # IMREAD_UNCHANGED keeps alpha and 16 bit, and leaves the EXIF orientation alone
-        with _QUIET:
+        with QUIET:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
@@ -334,3 +348,190 @@ def _jpeg_scan_defect(data: np.ndarray, start: int) -> str | None:
         if np.any(inside):
             return f"the JPEG file is corrupt: unexpected marker at byte {int(marks[inside][0])}"
     return None
+
+
+# a process takes as long to start as to read so many
+_A_LISTENER_FOR = 64
+_LISTENERS = 4
+_DAMAGE = re.compile(
+    rb"premature end of data segment|bad Huffman code|bad arithmetic code|found marker \w+ instead of RST\d"
+    rb"|Premature end of JPEG file|(\d+) extraneous bytes before marker \w+"
+)
+# some cameras pad the coded pixels with a few bytes
+_PADDING = 64
+
+
+@contextmanager
+def jpeg_damage(paths: Sequence[Path]) -> Iterator[dict[Path, str]]:
+    """Listen to what libjpeg says of the JPEG files among photographs, while the block reads them or does other work.
+
+    The files are decoded a second time, small, in up to four further processes; see `main`.
+
+    Yields:
+        One line for every damaged file, in the order of `paths`; filled in when the block ends without an error.
+    """
+    files = [path for path in paths if path.suffix.lower() in (".jpg", ".jpeg")]
+    count = min(_LISTENERS, os.cpu_count() or 1, -(-len(files) // _A_LISTENER_FOR)) if sys.executable else 0
+    shares = [files[start::count] for start in range(count)]
+    found: dict[Path, str] = {}
+    with ExitStack() as stack:
+        logs = [stack.enter_context(tempfile.TemporaryFile()) for _ in shares]
+        listeners = [_listen(stack, share, log) for share, log in zip(shares, logs, strict=True)]
+        yield found
+        damage: dict[Path, str] = {}
+        for share, log, listener in zip(shares, logs, listeners, strict=True):
+            listener.wait()
+            damage |= _damage(share, log)
+        for path in files:
+            if path in damage:
+                found[path] = f"{path}: the JPEG file is corrupt: {damage[path]}; {FIX}"
+
+
+@contextmanager
+def sound_jpegs(paths: Sequence[Path]) -> Iterator[None]:
+    """Refuse damaged JPEG files, naming the first, when the block that reads them has ended without an error."""
+    with jpeg_damage(paths) as damage:
+        yield
+    for message in damage.values():
+        raise CaptureError(message)
+
+
+def _listen(stack: ExitStack, files: Sequence[Path], log: IO[bytes]) -> subprocess.Popen[bytes]:
+    command = module_command(__name__)
+    # a file and not a pipe, which would have to be fed while the block runs
+    with tempfile.TemporaryFile() as names:
+        names.write(b"\0".join(os.fsencode(path.absolute()) for path in files))
+        names.seek(0)
+        listener = subprocess.Popen(command, stdin=names, stdout=subprocess.DEVNULL, stderr=log)
+    stack.callback(listener.wait)
+    stack.callback(listener.kill)
+    return listener
+
+
+def _damage(files: Sequence[Path], log: IO[bytes]) -> dict[Path, str]:
+    """Read what was said of each file, and keep what means lost pixels."""
+    log.seek(0)
+    found: dict[Path, str] = {}
+    for said in log.read().split(b"\0")[1:]:
+        number, _, words = said.partition(b"\n")
+        complaint = _DAMAGE.search(words)
+        if complaint and int(complaint[1] or _PADDING + 1) > _PADDING:
+            found[files[int(number)]] = complaint[0].decode("ascii")
+    return found
+
+
+def main() -> None:
+    """Decode the JPEG files whose names standard input holds, separated by NUL."""
+    for number, name in enumerate(sys.stdin.buffer.read().split(b"\0")):
+        os.write(2, b"\0%d\n" % number)
+        try:
+            # an eighth of the size: all coded pixels are read, and few computed
+            cv2.imdecode(np.fromfile(os.fsdecode(name), np.uint8), cv2.IMREAD_REDUCED_GRAYSCALE_8)
+        except (OSError, cv2.error):
+            continue  # whoever reads the photograph itself says so
+
+
+COLORMAP: Final = "magma"
+_MAX_SIDE: Final = 640
+
+
+def colormap_table(name: str = COLORMAP) -> np.ndarray:
+    """Give the colours of one of matplotlib's maps; magma, which is perceptually uniform, for errors. uint8 [256, 3]"""
+    from matplotlib import colormaps
+
+    return np.round(colormaps[name](np.linspace(0.0, 1.0, 256))[:, :3] * 255.0).astype(np.uint8)
+
+
+def to_uint8(image: np.ndarray) -> np.ndarray:
+    """Round an image in [0, 1] to 8 bit, clamped."""
+    return np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def error_magnitude(image: np.ndarray, photo: np.ndarray) -> np.ndarray:
+    """Take each pixel's error: the mean over the channels of |image - photo|, in [0, 1]. [H, W] from uint8 [H, W, 3]"""
+    return np.abs(image.astype(np.float32) - photo.astype(np.float32)).mean(axis=2) / 255.0
+
+
+def error_scale(errors: list[np.ndarray]) -> float:
+    """Choose one top of the scale for all views: their joint 99th percentile, rounded up to a step of 0.05."""
+    if not errors:
+        return 0.1
+    top = float(np.quantile(np.concatenate([e.ravel()[:: max(1, e.size // 50_000)] for e in errors]), 0.99))
+    return min(max(np.ceil(top / 0.05 - 1e-4) * 0.05, 0.05), 1.0)
+
+
+def error_picture(error: np.ndarray, top: float) -> np.ndarray:
+    """Colour an error map: black-violet is 0, pale yellow is `top` and more. uint8 [H, W, 3]"""
+    return colormap_table()[np.clip(np.round(error / top * 255.0), 0, 255).astype(np.uint8)]
+
+
+def id_colors(ids: np.ndarray) -> np.ndarray:
+    """Colour Gaussian ids, int [H, W], so that one id always has one colour and neighbours differ; -1 (none) is black.
+
+    The id is hashed (splitmix64), its bits give a hue and one of two levels of saturation and brightness.
+    """
+    with np.errstate(over="ignore"):
+        z = ids.astype(np.int64).astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        z = z ^ (z >> np.uint64(31))
+    hue = ((z & np.uint64(0xFF)) * np.uint64(180) // np.uint64(256)).astype(np.uint8)
+    saturation = np.where(z & np.uint64(0x100), 120, 200).astype(np.uint8)
+    value = np.where(z & np.uint64(0x200), 235, 170).astype(np.uint8)
+    colors = cv2.cvtColor(np.stack([hue, saturation, value], axis=-1), cv2.COLOR_HSV2RGB)
+    colors[ids < 0] = 0
+    return colors
+
+
+def fit(picture: np.ndarray, nearest: bool = False, max_side: int = _MAX_SIDE) -> np.ndarray:
+    """Shrink a picture so that its longer side is at most `max_side` px; smaller ones stay as they are."""
+    scale = max_side / max(picture.shape[:2])
+    if scale >= 1.0:
+        return picture
+    size = (max(1, round(picture.shape[1] * scale)), max(1, round(picture.shape[0] * scale)))
+    return cv2.resize(picture, size, interpolation=cv2.INTER_NEAREST if nearest else cv2.INTER_AREA)
+
+
+def data_uri(picture: np.ndarray, lossless: bool = False) -> str:
+    """Pack an RGB picture, uint8 [H, W, 3], into a data URI: PNG when lossless, else JPEG at quality 88."""
+    kind, options = ("png", [cv2.IMWRITE_PNG_COMPRESSION, 9]) if lossless else ("jpeg", [cv2.IMWRITE_JPEG_QUALITY, 88])
+    ok, data = cv2.imencode(f".{kind}", np.ascontiguousarray(picture[:, :, ::-1]), options)
+    if not ok:
+        raise ValueError(f"picture of shape {list(picture.shape)} cannot be written as {kind}")
+    return f"data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode('ascii')}"
+
+
+def colorbar_css(name: str = COLORMAP) -> str:
+    """Give the colours of a map as a CSS gradient from the bottom to the top of the scale."""
+    stops = colormap_table(name)[np.linspace(0, 255, 12).astype(int)]
+    return "linear-gradient(90deg," + ",".join(f"#{r:02x}{g:02x}{b:02x}" for r, g, b in stops) + ")"
+
+
+DEPTH_COLORS: Final = "viridis_r"
+_NOTHING: Final = (112, 112, 118)
+
+
+def depth_range(depths: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Choose one range for all depth maps: their joint 1st to 99th percentile, without NaN."""
+    known = [depth[np.isfinite(depth)][:: max(1, depth.size // 50_000)] for depth in depths]
+    joined = np.concatenate(known) if known else np.zeros(0)
+    if not len(joined):
+        return 0.1, 1.0
+    near, far = (max(float(np.quantile(joined, q)), 1e-12) for q in (0.01, 0.99))
+    return near, max(far, near * (1.0 + 1e-6))
+
+
+def depth_picture(depth: np.ndarray, near: float, far: float) -> np.ndarray:
+    """Colour a depth map [H, W] by its logarithm, near in yellow and far in violet, grey where it is not finite.
+
+    A garden has its background many times as far away as its table: evenly spaced colours would leave the table one.
+    """
+    known = np.isfinite(depth)
+    level = np.log(np.clip(np.where(known, depth, near), near, far) / near) / np.log(far / near)
+    picture = colormap_table(DEPTH_COLORS)[np.round(255.0 * level).astype(np.uint8)]
+    picture[~known] = _NOTHING
+    return picture
+
+
+if __name__ == "__main__":
+    main()

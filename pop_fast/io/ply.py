@@ -1,36 +1,33 @@
-"""Read and write splats in the PLY layout of the 3DGS reference code, which every viewer opens.
+"""Read and write PLY: point clouds, and splats in the layout of the 3DGS reference code, which every viewer opens.
 
 One row a Gaussian, little-endian float32: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_0..44, opacity, scale_0..2,
 rot_0..3. Opacities are logits, scales logarithms, rotations wxyz of any norm; f_rest is channel-major: fifteen
 coefficients of red, then green, then blue. A header comment `SplatRenderMode: mip` marks antialiased splats, and one
-`pop-frame:` says which world they are in.
+`pop-frame:` says which world they are in, as an object of JSON does in other formats.
+
+A header is a promise that anybody can write: so many rows of so many bytes. It is held against the grammar and the
+file's size before a row is read. Rows of fixed size are read as one block; the few files of other kinds (ASCII, or
+lists in or before the vertices) go row by row through plyfile, from memory: a file that is mapped can still end the
+process, by what its header says or because somebody shortens it.
 """
 
 from __future__ import annotations
 
+import io
 import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
-import torch
 
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
-from pop_fast.io.frame import Frame
-from pop_fast.io.ply_rows import Header, column, read_header, read_vertices, vertices_of
 
-__all__ = [
-    "MODE",
-    "Frame",
-    "asks_for_antialiasing",
-    "checked_params",
-    "frame_of",
-    "is_antialiased",
-    "load_ply",
-    "params_of_ply",
-    "ply_bytes",
-    "save_ply",
-]
+if TYPE_CHECKING:
+    import torch
 
 _SHAPES = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3)}
 MODE = "SplatRenderMode:"
@@ -78,11 +75,6 @@ def save_ply(
 
 
 def ply_bytes(params: dict[str, torch.Tensor], antialiased: bool = False, frame: Frame | None = None) -> bytes:
-    """Return what `save_ply` writes.
-
-    Raises:
-        PopError: a parameter is absent, of the wrong shape, NaN or Inf.
-    """
     return _file(checked_params(params), antialiased, frame)
 
 
@@ -127,15 +119,7 @@ def load_ply(path: str | os.PathLike[str]) -> dict[str, torch.Tensor]:
 
 
 def params_of_ply(data: bytes, path: Path) -> dict[str, torch.Tensor]:
-    """Read splats from a PLY file's bytes; see `load_ply`.
-
-    Args:
-        data: the bytes.
-        path: their name, for errors.
-
-    Raises:
-        PopError: as `load_ply`.
-    """
+    """Read splats from a PLY file's bytes; see `load_ply`."""
     return _params(vertices_of(data, path), path)
 
 
@@ -175,6 +159,9 @@ def _params(rows: np.ndarray, path: Path) -> dict[str, torch.Tensor]:
         "sh0": columns(*(f"f_dc_{i}" for i in range(3)))[:, None, :],
         "shN": rest,
     }
+    # headers and points are read without torch
+    import torch
+
     return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()}
 
 
@@ -189,11 +176,7 @@ def asks_for_antialiasing(header: Header) -> bool:
 
 
 def frame_of(path: str | os.PathLike[str]) -> Frame | None:
-    """Tell which world a PLY file's splats are in, by its comment; None where there is none, as of other programs.
-
-    Raises:
-        PopError: the comment is not one that this program writes.
-    """
+    """Tell which world a PLY file's splats are in, by its comment; None where there is none, as of other programs."""
     return Frame.of_comments(read_header(Path(path)).comments, Path(path))
 
 
@@ -222,3 +205,294 @@ def checked_params(params: dict[str, torch.Tensor]) -> dict[str, np.ndarray]:
     if n and norms.min() == 0.0:
         raise PopError(f"quats[{int(np.argmin(norms))}] is zero; every quaternion must have a norm > 0")
     return arrays
+
+
+_ORDERS: Final = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_SIGNED: Final = {"char": "i1", "short": "i2", "int": "i4", "float": "f4", "double": "f8"}
+_UNSIGNED: Final = {"uchar": "u1", "ushort": "u2", "uint": "u4"}
+_WITH_BITS: Final = {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
+_KINDS: Final = _SIGNED | _UNSIGNED | _WITH_BITS | {"float32": "f4", "float64": "f8"}
+# comments apart, a splat's header has 2 kB
+_LONGEST: Final = 2**20
+
+
+@dataclass
+class Element:
+    """A kind of rows: name and type of each property, or the type of a list's length where it is a list."""
+
+    name: str
+    count: int
+    columns: list[tuple[str, str]]
+    lists: bool = False
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a PLY file says of itself."""
+
+    order: str  # "<" or ">" of a binary file, "" of an ASCII one
+    elements: tuple[Element, ...]  # in the order of their rows
+    comments: tuple[str, ...]  # without the word "comment"
+    length: int  # bytes up to the first row
+
+
+def read_header(path: Path) -> Header:
+    """Read the header alone; a PopError says that it is absent or cut off, or names the line that breaks a rule."""
+    return header_of(file_bytes(path, "PLY file", _LONGEST), path)
+
+
+def file_bytes(path: Path, what: str = "file", most: int = -1) -> bytes:
+    """Return a file's bytes, or so many from its beginning; a PopError says that it is absent or cannot be read."""
+    try:
+        with open(path, "rb") as file:
+            return file.read(most)
+    except FileNotFoundError:
+        raise PopError(f"{path}: the {what} is absent; check the path") from None
+    except OSError as error:
+        raise PopError(f"{path}: could not be read: {error.strerror}; check the path and its permissions") from error
+
+
+def header_of(data: bytes, path: Path) -> Header:
+    """Read the header at the beginning of a file's bytes."""
+    try:
+        return _parse(data[:_LONGEST])
+    except ValueError as error:
+        raise PopError(f"{path}: the PLY file is truncated or corrupt: {error}; copy or write it again") from error
+
+
+def read_vertices(path: Path) -> np.ndarray:
+    """Return the rows of the element `vertex`, read-only, with a field for each property.
+
+    Raises:
+        PopError: as `read_header`; or the file has no vertices as element, or fewer rows than its header says.
+    """
+    # a file that is no splat is recognised by its beginning
+    _vertex_elements(read_header(path), path)
+    try:
+        data = file_bytes(path)
+    except MemoryError as error:
+        raise PopError(f"{path}: does not fit into memory; crop or thin it out first") from error
+    return vertices_of(data, path)
+
+
+def vertices_of(data: bytes, path: Path) -> np.ndarray:
+    """Return the rows of the element `vertex` of a file's bytes; see `read_vertices`."""
+    header = header_of(data, path)
+    read = _vertex_elements(header, path)
+    try:
+        _check_size(header, len(data))
+        if header.order and not any(element.lists for element in read):
+            return _block(header, read, data)
+        return _row_by_row(header, data)
+    except (ValueError, IndexError, OverflowError, MemoryError, TypeError) as error:
+        raise PopError(f"{path}: the PLY file is truncated or corrupt: {error}; copy or write it again") from error
+
+
+def _vertex_elements(header: Header, path: Path) -> tuple[Element, ...]:
+    """Return the elements up to `vertex`."""
+    names = [element.name for element in header.elements]
+    if "vertex" not in names:
+        raise PopError(f"{path}: has no element 'vertex'; it is not a point cloud or a splat")
+    return header.elements[: names.index("vertex") + 1]
+
+
+def column(path: Path, rows: np.ndarray, name: str, kind: type) -> np.ndarray:
+    """Return one property of all rows as numbers of a type; a PopError says that it is a list."""
+    if rows.dtype[name].kind == "O":
+        raise PopError(f"{path}: vertex.{name} is a list; it must be one number a vertex")
+    return rows[name].astype(kind)
+
+
+def _row_by_row(header: Header, data: bytes) -> np.ndarray:
+    # not at the top: what this program writes itself is read without it
+    from plyfile import PlyData, PlyParseError
+
+    # it reads headers as ASCII, and comments are written in any language
+    head = bytes(byte if byte < 128 else ord("?") for byte in data[: header.length])
+    try:
+        return PlyData.read(io.BytesIO(head + data[header.length :]))["vertex"].data
+    except PlyParseError as error:
+        raise ValueError(str(error)) from error
+
+
+def _block(header: Header, read: tuple[Element, ...], data: bytes) -> np.ndarray:
+    at, rows = header.length, np.empty(0)
+    for element in read:
+        kind = np.dtype([(name, header.order + column) for name, column in element.columns])
+        rows = np.frombuffer(data, kind, element.count, at)
+        at += rows.nbytes
+    return rows
+
+
+def _check_size(header: Header, size: int) -> None:
+    """Raise ValueError when the file cannot hold what its header says."""
+    least = 0
+    for element in header.elements:
+        # in ASCII a number takes a digit and what ends it; the file's last one may have no end
+        widths = [np.dtype(kind).itemsize if header.order else 2 for _, kind in element.columns]
+        least += element.count * sum(widths)
+    least -= 0 if header.order else 1
+    if least > size - header.length:
+        rows = ", ".join(f"{element.count} of {element.name}" for element in header.elements)
+        raise ValueError(f"{size - header.length} bytes after the header cannot be its rows ({rows})")
+
+
+def _parse(head: bytes) -> Header:
+    ends = [end for end in (b"\r\n", b"\n", b"\r") if head.startswith(b"ply" + end)]
+    if not ends:
+        raise ValueError("it does not begin with the line 'ply'")
+    text, found, _ = head.partition(ends[0] + b"end_header" + ends[0])
+    if not found:
+        raise ValueError("its header has no end")
+    order: str | None = None
+    elements: list[Element] = []
+    comments: list[str] = []
+    for number, line in enumerate(text.split(ends[0])[1:], start=2):
+        words = line.decode("ascii", "replace").split()
+        match words:
+            case ["format", kind, "1.0"] if kind in _ORDERS and order is None and not elements:
+                order = _ORDERS[kind]
+            case ["comment" | "obj_info", *rest]:
+                comments.append(" ".join(rest))
+            case ["element", name, count] if order is not None and re.fullmatch(r"[0-9]{1,18}", count):
+                elements.append(Element(name, int(count), []))
+            case ["property", kind, name] if elements and kind in _KINDS:
+                elements[-1].columns.append((name, _KINDS[kind]))
+            case ["property", "list", length, kind, name] if elements and {length, kind} <= _KINDS.keys():
+                elements[-1].columns.append((name, _KINDS[length]))
+                elements[-1].lists = True
+            case []:
+                pass
+            case _:
+                raise ValueError(f"line {number} of its header, {' '.join(words)[:60]!r}, is not what PLY allows there")
+    if order is None:
+        raise ValueError("its header names no format")
+    for element in elements:
+        names = [name for name, _ in element.columns]
+        if not names or len(set(names)) < len(names):
+            raise ValueError(f"element {element.name!r} has {'two properties of a name' if names else 'no properties'}")
+    return Header(order, tuple(elements), tuple(comments), len(text) + len(found))
+
+
+# the square of a distance must stay a number in single precision, and a scene of this size is a corrupt file
+FARTHEST = 1e15
+# a float colour may lie a little over 1 without being one of those up to 255
+_BRIGHTEST = 2.0
+
+
+def find_bad_coordinate(xyz: np.ndarray) -> tuple[int, int] | None:
+    """Find the first coordinate that is NaN, Inf or beyond `FARTHEST`: its row and axis, or None. xyz: [P, 3]"""
+    bad = np.argwhere(~(np.abs(xyz) <= FARTHEST))
+    return (int(bad[0, 0]), int(bad[0, 1])) if len(bad) else None
+
+
+def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read positions float64 [P, 3] and colours uint8 [P, 3] (mid-gray where the file has none).
+
+    Colours are stored as floats in [0, 1], or as numbers up to 255 or up to 65535; the largest tells which.
+
+    Raises:
+        PopError: as `read_vertices`; a coordinate is absent, NaN, Inf or absurd, or a colour is none of these.
+    """
+    rows = read_vertices(path)
+    names = rows.dtype.names or ()
+    for name in "xyz":
+        if name not in names:
+            raise PopError(f"{path}: vertex has no property {name!r}; a point cloud needs x, y and z")
+    xyz = np.stack([column(path, rows, name, np.float64) for name in "xyz"], axis=1)
+    bad = find_bad_coordinate(xyz)
+    if bad is not None:
+        row, axis = bad
+        raise PopError(
+            f"{path}: vertex[{row}].{'xyz'[axis]} is {xyz[row, axis]}; every coordinate must be finite and within "
+            f"{FARTHEST:.0e}"
+        )
+    if not {"red", "green", "blue"} <= set(names):
+        return xyz, np.full((len(xyz), 3), 128, np.uint8)
+    return xyz, _colors(path, rows)
+
+
+def _colors(path: Path, rows: np.ndarray) -> np.ndarray:
+    names = ("red", "green", "blue")
+    fractions = any(rows.dtype[name].kind == "f" for name in names)
+    rgb = np.stack([column(path, rows, name, np.float64) for name in names], axis=1)
+    bad = np.argwhere(~((rgb >= 0.0) & (rgb <= 65535.0)))
+    if len(bad):
+        row, which = (int(i) for i in bad[0])
+        raise PopError(
+            f"{path}: vertex[{row}].{names[which]} is {rgb[row, which]:g}; a colour must be in [0, 1], up to 255 or up "
+            "to 65535"
+        )
+    largest = rgb.max(initial=0.0)
+    if fractions and largest <= _BRIGHTEST:
+        rgb = 255.0 * np.minimum(rgb, 1.0)
+    elif largest > 255.0:
+        rgb /= 257.0
+    return np.rint(rgb).astype(np.uint8)
+
+
+# what the comment of a PLY's header begins with, and the name of the object in JSON
+COMMENT: Final = "pop-frame:"
+KEY: Final = "pop_frame"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The world that a splat is in."""
+
+    # "capture" is the capture's own, "training" the one that `pop train` moves it into
+    name: Literal["capture", "training"]
+    # similarity, training frame = transform @ capture's own frame; None where it is not known. [4, 4]
+    transform: tuple[tuple[float, ...], ...] | None = None
+
+    @classmethod
+    def of_training(cls, transform: Any) -> Frame:
+        """Return the frame of a training that a similarity, an array [4, 4], moved, or that None left where it was."""
+        return cls("capture") if transform is None else cls("training", tuple(map(tuple, transform.tolist())))
+
+    def comment(self) -> str:
+        """Return the comment of a PLY's header, without the word "comment"."""
+        rows = () if self.transform is None else self.transform
+        return " ".join([COMMENT, self.name, *(f"{x:.17g}" for row in rows for x in row)])
+
+    def entry(self) -> dict[str, Any]:
+        """Return what JSON holds under the name `KEY`."""
+        return {"name": self.name, **({} if self.transform is None else {"transform": self.transform})}
+
+    @classmethod
+    def of_comments(cls, comments: Sequence[str], path: Path) -> Frame | None:
+        """Read the frame from the comments of a PLY's header; None where they have none, as of other programs."""
+        for comment in comments:
+            if comment.startswith(COMMENT):
+                name, *numbers = comment.removeprefix(COMMENT).split() or [""]
+                found = cls._checked(name, numbers or None)
+                if found is None:
+                    raise PopError(f"{path}: comment {comment[:60]!r} is damaged; remove it, or export the splat again")
+                return found
+        return None
+
+    @classmethod
+    def of_entry(cls, holder: Any, path: Path) -> Frame | None:
+        """Read the frame from an object of JSON that may hold it under the name `KEY`; None where it does not."""
+        if not isinstance(holder, Mapping) or KEY not in holder:
+            return None
+        entry = holder[KEY]
+        found = cls._checked(entry.get("name"), entry.get("transform")) if isinstance(entry, Mapping) else None
+        if found is None:
+            raise PopError(f"{path}: {KEY} is {str(entry)[:60]!r}, which is damaged; export the splat again")
+        return found
+
+    @classmethod
+    def _checked(cls, name: Any, numbers: Any) -> Frame | None:
+        """Return the frame of a name and of 16 numbers or none, in rows or not; None where they make no frame."""
+        if name not in ("capture", "training"):
+            return None
+        if numbers is None:
+            return cls(name)
+        try:
+            values = np.array(numbers, np.float64).reshape(4, 4)
+            # what cannot be undone moves nothing back
+            sound = np.isfinite(values).all() and np.isfinite(np.linalg.inv(values)).all()
+        except (ValueError, TypeError, OverflowError, np.linalg.LinAlgError):
+            return None
+        return cls(name, tuple(map(tuple, values.tolist()))) if sound else None

@@ -1,4 +1,9 @@
-"""Read what a run has written (JSON, arrays, checkpoints), and refuse by file and field what it cannot have written."""
+"""Read what a run has written (JSON, arrays, checkpoints) and may be damaged, and judge what memory a file may take.
+
+A few kilobytes can state any size, and deflate makes a thousand bytes of one. What a reader will need is known from
+headers: counts, widths and heights, sizes of members. It may be a little at any rate, and beyond that so many times
+the file as no real one needs; and it must be free.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from pop_fast.errors import PopError
-from pop_fast.io.budget import check_members
+from pop_fast.machine import free_bytes
 
 _TEXTS: Final = frozenset({"method", "capture", "machine", "backend", "lpips_net", "lpips_reason", "view"})
 _NUMBERS: Final = frozenset(
@@ -29,11 +34,7 @@ _LARGEST: Final = 1e150
 
 
 def read_json(path: Path, fix: str) -> dict[str, Any]:
-    """Read a JSON file that holds an object.
-
-    Raises:
-        PopError: it cannot be read or holds something else; ends in `fix`.
-    """
+    """Read a JSON file that holds an object; a PopError that it does not, or cannot be read, ends in `fix`."""
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
@@ -45,11 +46,7 @@ def read_json(path: Path, fix: str) -> dict[str, Any]:
 
 
 def parse_json(text: str, where: str, fix: str) -> Any:
-    """Parse JSON.
-
-    Raises:
-        PopError: it is not JSON, or nested deeper or with longer numbers than Python reads.
-    """
+    """Parse JSON; a PopError says that it is none, or nested deeper or with longer numbers than Python reads."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -57,11 +54,7 @@ def parse_json(text: str, where: str, fix: str) -> Any:
 
 
 def check_record(record: Any, where: str, fix: str, needed: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return a record of statistics whose known entries are the numbers and texts that a run writes, or null.
-
-    Raises:
-        PopError: names the entry as `where: entry`.
-    """
+    """Return a record of statistics whose known entries are what a run writes; a PopError names another one."""
     if not isinstance(record, dict):
         raise PopError(f"{where}: holds {type(record).__name__}; it must be an object; {fix}")
     for key in needed:
@@ -93,16 +86,13 @@ def _shown(value: Any) -> str:
 
 
 def read_arrays(path: Path, forms: Mapping[str, tuple[str, int]], fix: str) -> dict[str, np.ndarray]:
-    """Read arrays from an .npz file.
+    """Read arrays from an .npz file; a PopError names one that is absent or of another form, and ends in `fix`.
 
     Args:
         path: the file.
         forms: by name the kinds that an array may have, as in `numpy.dtype.kind`, and how many axes it has; a name with
             a "?" behind it may be absent.
         fix: what to do about a damaged file.
-
-    Raises:
-        PopError: it is damaged, or an array is absent or of another form; names it.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -131,12 +121,8 @@ def read_torch_file(path: Path, fix: str) -> Any:
     `torch.save` writes a zip whose members carry CRC-32 checksums, and torch's own reader skips these: a flipped bit in
     a tensor would be read as another number.
 
-    Args:
-        path: the file.
-        fix: what to do about a damaged file, for the message.
-
     Raises:
-        PopError: the file is absent, cannot be read, or is damaged.
+        PopError: the file is absent, cannot be read, or is damaged; ends in `fix`.
     """
     import torch
 
@@ -156,11 +142,7 @@ def read_torch_file(path: Path, fix: str) -> Any:
 
 
 def _damage(file: Any) -> str | None:
-    """Say what is wrong with a zip of stored members, or None.
-
-    Raises:
-        Exception: of many kinds, when it is not a zip or the list of its members is damaged.
-    """
+    """Say what is wrong with a zip of stored members, or None; errors of many kinds come where it is none."""
     with zipfile.ZipFile(file) as archive:
         for member in archive.infolist():
             # torch.save never compresses; what does may come to any number of bytes when it is read
@@ -168,3 +150,46 @@ def _damage(file: Any) -> str | None:
                 return f"{member.filename} in it is compressed, which torch.save never does"
         bad = archive.testzip()
     return f"{bad} in it does not agree with its checksum" if bad else None
+
+
+# what any file may need, bytes, and any picture: one of a single colour packs well, and 89 million pixels are read
+_ANY: Final = 2**26
+PICTURE: Final = 2**29
+# times the file's size; splats that pack well need 60
+_MOST_TIMES: Final = 200
+
+
+def check_memory(path: Path | str, needed: int, packed: int, what: str, fix: str, floor: int = _ANY) -> None:
+    """Refuse what needs more memory than its file makes likely, or than there is; a PopError names both sizes in MB.
+
+    Args:
+        path: the file, for the error.
+        needed: bytes, by what the file states.
+        packed: the file's own bytes.
+        what: states it, for the error.
+        fix: what to do, for the error.
+        floor: bytes that are always likely.
+    """
+    if needed <= _ANY:
+        return
+    if needed > max(floor, _MOST_TIMES * packed):
+        raise PopError(
+            f"{path}: {what} would take {_mb(needed)} of memory to read, and the file has {_mb(packed)}, "
+            f"which holds no such content; {fix}"
+        )
+    free = free_bytes()
+    if free is not None and needed > free:
+        raise PopError(f"{path}: {what} would take {_mb(needed)} of memory to read, and {_mb(free)} are free; {fix}")
+
+
+def check_members(path: Path | str, archive: zipfile.ZipFile, packed: int, fix: str, times: int = 1) -> None:
+    """Refuse a zip whose members would come to too much, at `times` bytes for one of theirs; see `check_memory`."""
+    members = archive.infolist()
+    if members:
+        largest = max(members, key=lambda member: member.file_size)
+        needed = times * sum(member.file_size for member in members)
+        check_memory(path, needed, packed, f"{largest.filename[:80]!r} and what else is in it", fix)
+
+
+def _mb(size: int) -> str:
+    return f"{size / 1e6:,.1f} MB"

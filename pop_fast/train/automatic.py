@@ -206,9 +206,8 @@ def choose_terms(capture: Capture, config: TrainConfig, stops: float | None) -> 
     """
     import numpy as np
 
-    from pop_fast.data.exposure_drift import UNEVEN, exposures_of
-    from pop_fast.data.normalize import neighbour_degrees
-    from pop_fast.data.photo_quality import DRIFT_STOPS
+    from pop_fast.data.capture import neighbour_degrees
+    from pop_fast.data.photo_quality import DRIFT_STOPS, UNEVEN, exposures_of
 
     trained = capture.train_views(config.test_every)
     apart = neighbour_degrees(np.stack([view.viewmat for view in trained])) if trained else None
@@ -302,7 +301,7 @@ def measure_speed(config: TrainConfig, capture: Capture) -> Speed:
     Raises:
         PopError: as `TrainingRun`.
     """
-    from pop_fast.data.initialize import initialize_params
+    from pop_fast.data.gaussians import initialize_params
     from pop_fast.train.environment import reproducible
 
     start = time.perf_counter()

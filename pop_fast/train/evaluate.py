@@ -18,8 +18,7 @@ from torch import Tensor
 from pop_fast.data import apply_similarity, to_capture_frame
 from pop_fast.errors import PopError
 from pop_fast.io.formats import decoded, encoded, format_names
-from pop_fast.io.images import write_png
-from pop_fast.io.pictures import error_magnitude, error_picture, id_colors
+from pop_fast.io.images import error_magnitude, error_picture, id_colors, write_png
 from pop_fast.stages.appearance import color_correct
 from pop_fast.stages.losses import WINDOW_SIZE, ssim
 from pop_fast.train.config import TrainConfig

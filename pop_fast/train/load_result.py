@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.data.capture import Progress
     from pop_fast.data.load import Photographs
-    from pop_fast.io.frame import Frame
+    from pop_fast.io.ply import Frame
 
 RECORD = "capture.json"
 
@@ -148,7 +148,7 @@ def _unbundled(folder: Path) -> Path | None:
 
 def _frame_of_run(config: TrainConfig) -> Frame:
     """Return the world that a run trains in."""
-    from pop_fast.io.frame import Frame
+    from pop_fast.io.ply import Frame
 
     return Frame("training" if config.normalize else "capture")
 

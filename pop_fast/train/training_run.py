@@ -22,7 +22,7 @@ from torch.nn import Parameter
 from tqdm import tqdm
 
 from pop_fast.data.capture import Capture
-from pop_fast.data.initialize import initialize_params
+from pop_fast.data.gaussians import initialize_params
 from pop_fast.density.passes import Passes
 from pop_fast.density.protocol import DensificationStep, Draws, ForeignStrategy, Strategy
 from pop_fast.errors import PopError

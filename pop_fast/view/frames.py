@@ -47,13 +47,6 @@ def picture_names(views: Sequence[str], suffix: str = ".png") -> list[Path]:
     share. Views that differ only in their suffix keep it (x.jpg.png, x.png.png), and what still meets is numbered.
     Names that differ only in case count as the same, because some file systems hold them to be.
 
-    Args:
-        views: names of views as their capture lists them.
-        suffix: of the pictures, with its dot.
-
-    Returns:
-        Relative paths in the order of the views, all different. [len(views)]
-
     Example:
         >>> [path.as_posix() for path in picture_names(["/data/a/0.jpg", "/data/b/0.jpg", "../c/1.png"])]
         ['a/0.png', 'b/0.png', 'c/1.png']
@@ -74,11 +67,7 @@ def picture_names(views: Sequence[str], suffix: str = ".png") -> list[Path]:
 
 
 def inside(folder: Path, name: Path) -> Path:
-    """Join a relative name to a folder.
-
-    Raises:
-        PopError: the file would lie outside the folder.
-    """
+    """Join a relative name to a folder; a PopError refuses a file that would lie outside it."""
     path = folder / name
     if not path.resolve().is_relative_to(folder.resolve()):
         raise PopError(f"{name}: leads out of {folder}; give it a name without '..' and without a root")
@@ -99,11 +88,7 @@ def _key(path: Path) -> str:
 
 
 def check_one_size(video: VideoFile, views: Sequence[ViewTensors]) -> None:
-    """Check that all views make frames of one size.
-
-    Raises:
-        PopError: they do not.
-    """
+    """Refuse views that do not all make frames of one size."""
     # in pairs of pixels, as an odd last row or column is left out of a video
     sizes = {tuple(side // 2 for side in view.photo.shape[:2]): view for view in reversed(views)}
     if len(sizes) > 1:
@@ -123,9 +108,6 @@ def planned_views(capture: Capture, config: TrainConfig, path: str, frames: int)
         config: `test_every` is read.
         path: "views", the name of a path, or a file that `pop view` recorded, whose angles of view are used.
         frames: cameras of a path.
-
-    Raises:
-        PopError: there is nothing to render, or too little to make the path of, or the file is no path.
     """
     if path == "views":
         views = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
@@ -169,12 +151,8 @@ def rendered(
 ) -> Iterator[np.ndarray]:
     """Render views one by one. uint8 [H, W, 3] each
 
-    Args:
-        splat: what to render.
-        config: how.
-        views: the cameras.
-        as_measured: count Gaussians per pixel, as measurements do, which rounds sums otherwise: only then are the bytes
-            always those that training has left.
+    With `as_measured` Gaussians per pixel are counted, as measurements do, which rounds sums otherwise: only then are
+    the bytes always those that training has left.
     """
     backend, note = renderer(config.backend)
     if note:
@@ -216,14 +194,7 @@ def write_inria_folder(splat: Splat, capture: Capture, out: Path, overwrite: boo
         cfg_args  cameras.json  point_cloud/iteration_N/point_cloud.ply
         test/ours_N/renders/00000.png  test/ours_N/gt/00000.png
 
-    Args:
-        splat: what to write, in the frame of `capture`.
-        capture: its cameras and photographs.
-        out: the folder to make.
-        overwrite: replace a folder that an earlier export wrote, if nothing else is in it.
-
-    Raises:
-        PopError: `out` is there and may not be replaced, or cannot be written.
+    The splat is in the frame of `capture`. With `overwrite`, a folder with nothing but an earlier export is replaced.
     """
     transform = capture.world_transform
     steps = Recipe.max_steps if splat.step is None else splat.step + 1

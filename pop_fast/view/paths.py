@@ -23,10 +23,10 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from pop_fast.data.normalize import camera_centers, focus_point, look_at_one_point
+from pop_fast.data.capture import camera_centers, focus_point, look_at_one_point
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import file_atomically
-from pop_fast.io.images import SILENT, set_log_level
+from pop_fast.io.images import QUIET
 
 # an orbit keeps out of a gap between cameras that is as wide as this and so many times wider than any other
 _WIDE_GAP: Final = np.pi / 2.0
@@ -43,13 +43,6 @@ def orbit(viewmats: np.ndarray, n_frames: int) -> np.ndarray:
     Where they stand all round it is a full circle. Else it goes from the middle of their arc to one end, to the other
     and back, so that nothing is shown from where no photograph was taken. Cameras that look at no one point, as on a
     walk or in a room, have nothing to turn about: the path then glides through them, from the first to the last.
-
-    Args:
-        viewmats: cameras of the capture in the order of their names, world -> camera. [M, 4, 4]
-        n_frames: cameras on the path.
-
-    Returns:
-        Cameras on the path, world -> camera. [n_frames, 4, 4]
     """
     if not look_at_one_point(viewmats):
         passed = np.linspace(0, len(viewmats) - 1, min(len(viewmats), max(2, n_frames // _GLIDE)))
@@ -67,13 +60,9 @@ def orbit(viewmats: np.ndarray, n_frames: int) -> np.ndarray:
 
 
 def camera_arc(angles: np.ndarray) -> tuple[float, float] | None:
-    """Find the arc that cameras stand on: the circle without its largest gap.
+    """Find the arc that cameras stand on by their angles, radians: the circle without its largest gap.
 
-    Args:
-        angles: where they stand about the point they look at, radians. [M]
-
-    Returns:
-        The middle and half the width of the arc, radians; None where no gap stands out, for a full circle.
+    Its middle and half its width, radians; None where no gap stands out, for a full circle.
     """
     around = np.sort(np.mod(angles, 2.0 * np.pi))
     gaps = np.diff(around, append=around[0] + 2.0 * np.pi)
@@ -87,15 +76,7 @@ def camera_arc(angles: np.ndarray) -> tuple[float, float] | None:
 
 
 def ellipse(viewmats: np.ndarray, n_frames: int) -> np.ndarray:
-    """Circle on the ellipse that the cameras themselves spread over, rising and sinking once a turn.
-
-    Args:
-        viewmats: cameras of the capture, world -> camera. [M, 4, 4]
-        n_frames: cameras on the path.
-
-    Returns:
-        Cameras on the path, world -> camera, evenly spaced along the ellipse. [n_frames, 4, 4]
-    """
+    """Circle on the ellipse that the cameras themselves spread over, rising and sinking once a turn."""
     up, focus = mean_up(viewmats), focus_point(viewmats)
     offsets = camera_centers(viewmats) - focus
     flat = offsets - (offsets @ up)[:, None] * up
@@ -112,15 +93,7 @@ def ellipse(viewmats: np.ndarray, n_frames: int) -> np.ndarray:
 
 
 def interpolate(viewmats: np.ndarray, n_frames: int) -> np.ndarray:
-    """Glide through the given cameras in order: cubic splines through centres and rotations.
-
-    Args:
-        viewmats: cameras of the capture in the order to visit, world -> camera. [M, 4, 4], M >= 2
-        n_frames: cameras on the path; its first and last are the given first and last.
-
-    Returns:
-        Cameras on the path, world -> camera. [n_frames, 4, 4]
-    """
+    """Glide through two or more cameras, from the first to the last: cubic splines through centres and rotations."""
     if len(viewmats) < 2:
         raise ValueError(f"viewmats has {len(viewmats)} cameras; a path through them needs at least 2")
     knots = np.arange(len(viewmats), dtype=np.float64)
@@ -130,6 +103,7 @@ def interpolate(viewmats: np.ndarray, n_frames: int) -> np.ndarray:
     return _viewmats(rotations, centers)
 
 
+# of cameras of a capture [M, 4, 4], in the order of their names, so many on a path; world -> camera
 PATHS: Final[dict[str, Callable[[np.ndarray, int], np.ndarray]]] = {
     "orbit": orbit,
     "ellipse": ellipse,
@@ -195,10 +169,6 @@ class VideoFile:
     Raises:
         PopError: at once, for a name or a rate that no video can have; when frames are added, for one of another size;
             when the block ends, for a file that does not play to its last frame. `path` is then as it was.
-
-    Example:
-        with VideoFile(Path("path.webm"), fps=30) as video:
-            video.add(frame)  # uint8 [H, W, 3], RGB
     """
 
     def __init__(self, path: Path, fps: float = 30.0) -> None:
@@ -224,7 +194,7 @@ class VideoFile:
 
     def __enter__(self) -> VideoFile:
         self._part = self._steps.enter_context(file_atomically(self.path))
-        self._steps.enter_context(_quiet())
+        self._steps.enter_context(QUIET)
         self._steps.push(self._finish)
         return self
 
@@ -281,23 +251,12 @@ class VideoFile:
 @cache
 def has_h264() -> bool:
     """Tell whether this build of OpenCV can write H.264, by writing a frame."""
-    with tempfile.TemporaryDirectory(prefix="pop_video_") as folder, _quiet():
+    with tempfile.TemporaryDirectory(prefix="pop_video_") as folder, QUIET:
         code = cv2.VideoWriter.fourcc(*_CODECS[".mp4"])
         writer = cv2.VideoWriter(str(Path(folder, "probe.mp4")), code, 30.0, (64, 64))
         works = writer.isOpened()
         writer.release()
         return works
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep the log of OpenCV and ffmpeg off the terminal: what goes wrong is found by playing the file, and raised."""
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    level = set_log_level(SILENT)
-    try:
-        yield
-    finally:
-        set_log_level(level)
 
 
 @contextmanager

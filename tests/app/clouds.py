@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pop_fast.io.formats import FORMATS
 from pop_fast.io.formats.cloud import Cloud
-from pop_fast.io.frame import Frame
+from pop_fast.io.ply import Frame
 
 
 def _floats(low: float, high: float) -> st.SearchStrategy[float]:

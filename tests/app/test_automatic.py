@@ -15,7 +15,7 @@ import pytest
 
 from benchmarks import estimates
 from benchmarks.few_photographs import left_of, table_of
-from pop_fast.cli.train_checks import chooses_for_itself
+from pop_fast.cli.train_options import chooses_for_itself
 from pop_fast.data.capture import Capture
 from pop_fast.data.unpack import capture_folder, unpack
 from pop_fast.errors import CaptureError

@@ -26,9 +26,8 @@ from pop_fast.blocks import jobs
 from pop_fast.blocks.plan import Job, Partition, Plan, divide, grid_of, make_plan, read_plan
 from pop_fast.children import module_command
 from pop_fast.cli import main
-from pop_fast.data.block import write_block
 from pop_fast.data.capture import Capture
-from pop_fast.data.load import list_capture, load_capture
+from pop_fast.data.load import list_capture, load_capture, write_block
 from pop_fast.errors import PopError
 from pop_fast.train.checkpoint import load_splats
 from pop_fast.train.results import ResultFolder, read_config

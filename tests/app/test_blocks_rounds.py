@@ -18,8 +18,7 @@ from pop_fast.blocks.plan import Job, read_job, read_plan
 from pop_fast.blocks.rounds import write_round_block
 from pop_fast.blocks.run import TAKEN
 from pop_fast.cli import main
-from pop_fast.data.load import load_capture
-from pop_fast.data.random_points import in_picture
+from pop_fast.data.load import in_picture, load_capture
 from pop_fast.train.checkpoint import load_splats, save_checkpoint
 from pop_fast.train.evaluate import evaluate
 from pop_fast.train.load_result import CaptureRecord, load_splat, read_record

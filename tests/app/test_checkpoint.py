@@ -18,8 +18,7 @@ import torch
 
 from pop_fast.data.capture import Capture
 from pop_fast.errors import PopError
-from pop_fast.io.ply import load_ply, save_ply
-from pop_fast.io.ply_rows import read_points
+from pop_fast.io.ply import load_ply, read_points, save_ply
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from tests.app.conftest import Outcome, Pop, in_a_child, pop_in_a_child

@@ -17,10 +17,9 @@ import pytest
 
 from paper_repro.cli import COMMANDS as REPRO_COMMANDS
 from pop_fast.children import module_command, python_command
-from pop_fast.cli import COMMANDS, main
-from pop_fast.cli.errors import describe
+from pop_fast.cli import COMMANDS, describe, main
 from pop_fast.cli.train import arguments, rename_aliases
-from pop_fast.cli.train_checks import about_large
+from pop_fast.cli.train_options import about_large
 from pop_fast.data.capture import Capture, View
 from pop_fast.data.sfm import SfmResult
 from pop_fast.errors import PopError
@@ -227,7 +226,7 @@ def test_building_cuda_says_what_is_missing_first_and_the_compiler_s_words_apart
     def fail(*_: Any, **__: Any) -> None:
         raise BuildError("compiling the CUDA extension failed; nvcc said:\nerror: expected a ;")
 
-    monkeypatch.setattr("pop_fast.cli.build_cuda.build", fail)
+    monkeypatch.setattr("pop_fast.cli.build.build_cuda", fail)
     outcome = pop("build-cuda")
     assert outcome.status == 2
     assert outcome.err.strip() == "pop: error: compiling the CUDA extension failed; nvcc said:"
@@ -238,7 +237,7 @@ def test_a_fault_of_the_program_keeps_its_traceback(pop: Pop, monkeypatch: pytes
     def broken(_: object) -> None:
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr("pop_fast.view.report.page.write_report", broken)
+    monkeypatch.setattr("pop_fast.view.report.source.write_report", broken)
     with pytest.raises(ZeroDivisionError):
         pop("report", ".")
 
@@ -247,7 +246,7 @@ def test_ctrl_c_anywhere_exits_with_130(pop: Pop, monkeypatch: pytest.MonkeyPatc
     def interrupted(_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pop_fast.view.report.page.write_report", interrupted)
+    monkeypatch.setattr("pop_fast.view.report.source.write_report", interrupted)
     outcome = pop("report", ".")
     assert outcome.status == 130
     assert outcome.err.strip() == "pop: interrupted"
@@ -277,7 +276,7 @@ def test_results_are_complete_before_the_report_and_whatever_becomes_of_it(
         raise fault
 
     with monkeypatch.context() as patch:
-        patch.setattr("pop_fast.view.report.page.write_report", broken)
+        patch.setattr("pop_fast.view.report.source.write_report", broken)
         outcome = pop("train", shared_capture, "--out", folder, *TRAIN)
     assert {"ckpts/ckpt_29_rank0.pt", "ply/point_cloud_29.ply", "stats/val_step0029.json", "cfg.json"} <= set(found)
     assert outcome.status == status

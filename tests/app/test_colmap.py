@@ -15,9 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pop_fast.data import Capture, load_capture
-from pop_fast.data.colmap import read_model
-from pop_fast.data.colmap_files import model_name, parameter_count
-from pop_fast.data.pinhole import PINHOLES, make_camera
+from pop_fast.data.cameras import PINHOLES, make_camera
+from pop_fast.data.colmap import model_name, parameter_count, read_model
 from tests.app.captures import (
     HEIGHT,
     PINHOLE,

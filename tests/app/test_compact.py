@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from pop_fast.cli.limits import Output
+from pop_fast.cli.options import Output
 from pop_fast.density import shrink
 from pop_fast.errors import PopError
 from pop_fast.io.formats import FORMATS, encoded, format_names, levels, load_splat_file

@@ -21,13 +21,12 @@ import pytest
 import zstandard
 
 from benchmarks.faults.ksplat import ksplat_of
-from pop_fast.data.video import take_frames
+from pop_fast.data.unpack import take_frames
 from pop_fast.errors import PopError
-from pop_fast.io import budget
-from pop_fast.io.budget import check_memory
+from pop_fast.io import read_back
 from pop_fast.io.formats import FORMATS, encoded, load_splat_file
 from pop_fast.io.images import read_image
-from pop_fast.io.read_back import read_arrays
+from pop_fast.io.read_back import check_memory, read_arrays
 from tests.app.clouds import many
 from tests.app.conftest import Pop, in_a_child
 from tests.app.damage import says
@@ -333,6 +332,7 @@ from pathlib import Path
 import numpy as np, torch
 from pop_fast.errors import PopError
 from pop_fast.io.formats import load_splat_file
+from pop_fast.io import read_back
 from pop_fast.io.images import read_image
 
 for path in sys.argv[1:]:
@@ -385,7 +385,7 @@ def test_what_is_not_free_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     image = np.random.default_rng(0).integers(0, 256, (3000, 4200, 3), np.uint8)
     (tmp_path / "a.bmp").write_bytes(cv2.imencode(".bmp", image)[1].tobytes())
     assert read_image(tmp_path / "a.bmp").shape == image.shape
-    monkeypatch.setattr(budget, "free_bytes", lambda: 50 * MB)
+    monkeypatch.setattr(read_back, "free_bytes", lambda: 50 * MB)
     with pytest.raises(
         PopError, match=r"a\.bmp: its header's size of 4200x3000 px would take .* and 52\.4 MB are free"
     ):
@@ -413,7 +413,7 @@ def test_pictures_of_one_colour_are_no_bombs(tmp_path: Path) -> None:
 
 
 def test_a_small_need_is_never_questioned(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(budget, "free_bytes", lambda: 0)
+    monkeypatch.setattr(read_back, "free_bytes", lambda: 0)
     check_memory("a", 2**26, 1, "x", "y")
     with pytest.raises(PopError, match=r"^a: x would take .* and 0\.0 MB are free; y$"):
         check_memory("a", 2**26 + 1, 2**30, "x", "y")
@@ -430,7 +430,7 @@ def test_a_video_whose_frames_find_no_room_is_refused(tmp_path: Path, monkeypatc
     for shade in (50, 200):
         film.write(np.full((3072, 3072, 3), shade, np.uint8))
     film.release()
-    monkeypatch.setattr(budget, "free_bytes", lambda: 50 * MB)
+    monkeypatch.setattr(read_back, "free_bytes", lambda: 50 * MB)
     with pytest.raises(
         PopError, match=r"a\.avi: its frames of 3072x3072 px would take .* and 52\.4 MB are free; convert"
     ):

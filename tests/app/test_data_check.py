@@ -17,8 +17,8 @@ from PIL.TiffImagePlugin import IFDRational
 
 from benchmarks.faults.corpus import HERE
 from pop_fast.data import load_capture, sfm
+from pop_fast.demo.make import render_view
 from pop_fast.demo.scene import make_scene
-from pop_fast.demo.tracer import render_view
 from pop_fast.io import images
 from tests.app.captures import colmap_capture, look_at, photograph, ring, write_model, write_photograph
 from tests.app.conftest import Pop

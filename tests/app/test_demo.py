@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 
 from pop_fast.data import load_capture
 from pop_fast.demo import make_demo
-from pop_fast.demo.scene import make_scene
-from pop_fast.demo.shapes import Ball, Box, Frustum, Shape, Torus
-from pop_fast.demo.tracer import first_hits, render_view
+from pop_fast.demo.make import first_hits, render_view
+from pop_fast.demo.scene import Ball, Box, Frustum, Shape, Torus, make_scene
 from pop_fast.io import images
 from tests.app.captures import assert_one_line, look_at
 

@@ -25,10 +25,8 @@ from pop_fast.stages.losses import photometric_3dgs, photometric_pop
 from pop_fast.train.config import TrainConfig
 from pop_fast.view.explain import ExplainedView, explain_pixel, explain_view
 from pop_fast.view.explain.diff import difference, first_flip
-from pop_fast.view.explain.maps import termination_depths
-from pop_fast.view.explain.model import WIDTH, table
-from pop_fast.view.explain.pixel import candidates, oracle_splats, walk
-from pop_fast.view.explain.scene import with_objective
+from pop_fast.view.explain.pixel import WIDTH, candidates, oracle_splats, table, walk
+from pop_fast.view.explain.scene import termination_depths, with_objective
 from pop_ref.constants import PAPER, PROFILES, Profile
 from pop_ref.records import Splats
 from tests.app.browser import browser

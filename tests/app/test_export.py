@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.faults.ksplat import ksplat_of
-from pop_fast.cli.limits import FormatName
+from pop_fast.cli.options import FormatName
 from pop_fast.data import load_capture
 from pop_fast.data.colmap import read_model
 from pop_fast.density import shrink

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pop_fast.data import Capture, load_capture
-from pop_fast.data.exposure_drift import GAMMA, UNEVEN, Exposures, exposures, exposures_of, levels_at
+from pop_fast.data.photo_quality import GAMMA, UNEVEN, Exposures, exposures, exposures_of, levels_at
 from pop_fast.demo import make_demo
 from pop_fast.train import TrainConfig
 from pop_fast.train.automatic import choose_terms

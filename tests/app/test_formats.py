@@ -28,8 +28,7 @@ from pop_fast.io.formats import decoded as from_bytes
 from pop_fast.io.formats.cloud import SH_C0, Cloud, morton_order
 from pop_fast.io.formats.compressed_ply import chunked
 from pop_fast.io.formats.sog import codebook, nearest, row_palette
-from pop_fast.io.frame import Frame
-from pop_fast.io.ply import load_ply, save_ply
+from pop_fast.io.ply import Frame, load_ply, save_ply
 from pop_fast.train.load_result import load_splat
 from pop_ref.covariance import covars_from_quats_scales
 from pop_ref.harmonics import sh_basis

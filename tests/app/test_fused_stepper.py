@@ -18,7 +18,7 @@ from cuda_ext.arrays import CudaMemoryError
 from pop_fast.api.backend import require_backend
 from pop_fast.api.backends import CUDA
 from pop_fast.blocks.rounds import hold_last, shown_in
-from pop_fast.data.initialize import initialize_params
+from pop_fast.data.gaussians import initialize_params
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.train import TrainConfig, TrainingRun

@@ -19,15 +19,23 @@ import pytest
 import torch
 
 from pop_fast.cli.view import stands_of_capture
-from pop_fast.io.pictures import id_colors
+from pop_fast.io.images import id_colors
 from pop_fast.train import TrainingRun
 from pop_fast.train.engines import renderer
 from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
 from pop_fast.train.views import ViewTensors, render_layers, render_view
 from pop_fast.view.live import KeyCamera, RecordedPath, SplatScene, ViewState, read_path
-from pop_fast.view.live.draw import follow, scene_of
+from pop_fast.view.live.draw import (
+    field_of_view,
+    follow,
+    from_capture,
+    path_of,
+    pose_of_viewmat,
+    scene_of,
+    to_capture,
+    viewmat_of_pose,
+)
 from pop_fast.view.live.server import Pace
-from pop_fast.view.live.state import field_of_view, from_capture, path_of, pose_of_viewmat, to_capture, viewmat_of_pose
 from pop_fast.view.paths import frames_in
 from tests.app.browser import browser
 from tests.app.conftest import Pop

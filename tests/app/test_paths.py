@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from pop_fast.data.normalize import camera_centers, focus_point, look_at_one_point, neighbour_degrees
+from pop_fast.data.capture import camera_centers, focus_point, look_at_one_point, neighbour_degrees
 from pop_fast.errors import PopError
 from pop_fast.view import paths
 from pop_fast.view.paths import (

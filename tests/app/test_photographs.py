@@ -22,8 +22,7 @@ from pop_fast.data.read_images import _upright, shrink_bicubic
 from pop_fast.errors import CaptureError
 from pop_fast.io import images
 from pop_fast.io.image_header import Exif, can_read_heif, read_exif, read_size, size_of
-from pop_fast.io.images import list_images, read_image
-from pop_fast.io.jpeg import sound_jpegs
+from pop_fast.io.images import list_images, read_image, sound_jpegs
 from tests.app.captures import (
     HEIGHT,
     WIDTH,

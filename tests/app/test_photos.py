@@ -17,10 +17,10 @@ from PIL import Image
 from pop_fast.data import load_capture, run_sfm, sfm
 from pop_fast.data.capture import View
 from pop_fast.data.photo_quality import sharpness
-from pop_fast.data.sfm_search import pairs_of
-from pop_fast.data.video import take_frames
+from pop_fast.data.sfm import pairs_of
+from pop_fast.data.unpack import take_frames
+from pop_fast.demo.make import render_view
 from pop_fast.demo.scene import make_scene
-from pop_fast.demo.tracer import render_view
 from pop_fast.errors import CaptureError, PopError
 from pop_fast.io import images
 from pop_fast.io.images import list_images, read_image
@@ -159,7 +159,7 @@ def _cameras_are_known(monkeypatch: pytest.MonkeyPatch) -> None:
     def find(job: Any, *_: Any) -> Any:
         return make_model(job.names[:3], ring(len(job.names[:3])))
 
-    monkeypatch.setattr(sfm, "_find_cameras", find)
+    monkeypatch.setattr(sfm, "find_cameras", find)
 
 
 def fill(folder: Path, names: tuple[str, ...] = ("0.png", "1.png", "2.png")) -> Path:
@@ -262,13 +262,13 @@ def test_photographs_in_a_format_that_is_not_read_are_named_with_the_way_to_conv
 @pytest.mark.usefixtures("_cameras_are_known")
 def test_the_search_for_cameras_is_told_apart_from_loading(pop: Pop, tmp_path: Path, monkeypatch: Any) -> None:
     fill(tmp_path / "photos", tuple(f"{i}.png" for i in range(4)))
-    searched = sfm._find_cameras
+    searched = sfm.find_cameras
 
     def slowly(*given: Any) -> Any:
         time.sleep(1.0)
         return searched(*given)
 
-    monkeypatch.setattr(sfm, "_find_cameras", slowly)
+    monkeypatch.setattr(sfm, "find_cameras", slowly)
     done = pop.done("train", tmp_path / "photos", "--out", tmp_path / "out", "--max-steps", "2", *TRAIN, "--skip-sizes")
     lines = done.out.splitlines()
     assert lines[0] in ("cameras found in 1 s", "cameras found in 2 s", "cameras found in 3 s")
@@ -290,7 +290,7 @@ def _upright_cameras_are_known(monkeypatch: pytest.MonkeyPatch) -> None:
     def find(job: Any, *_: Any) -> Any:
         return make_model(job.names, ring(len(job.names)), [camera("PINHOLE", PINHOLE, 40, 30)])
 
-    monkeypatch.setattr(sfm, "_find_cameras", find)
+    monkeypatch.setattr(sfm, "find_cameras", find)
 
 
 def shoot(folder: Path) -> Path:

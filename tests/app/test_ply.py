@@ -18,8 +18,7 @@ from plyfile import PlyData, PlyElement
 
 from pop_fast.errors import PopError
 from pop_fast.io.formats import save_as
-from pop_fast.io.ply import is_antialiased, load_ply, save_ply
-from pop_fast.io.ply_rows import read_points
+from pop_fast.io.ply import is_antialiased, load_ply, read_points, save_ply
 from tests.app.captures import assert_one_line
 from tests.app.conftest import pop_in_a_child
 from tests.app.damage import says

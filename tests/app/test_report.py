@@ -18,15 +18,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pop_fast.data import load_capture
-from pop_fast.data.capture import View
-from pop_fast.data.normalize import neighbour_degrees
+from pop_fast.data.capture import View, neighbour_degrees
 from pop_fast.errors import PopError
-from pop_fast.io import pictures
-from pop_fast.io.frame import Frame
-from pop_fast.io.pictures import colormap_table
-from pop_fast.io.ply import save_ply
+from pop_fast.io import images
+from pop_fast.io.images import colormap_table, depth_picture, depth_range
+from pop_fast.io.ply import Frame, save_ply
 from pop_fast.train.engines import renderer
 from pop_fast.train.load_result import load_splat
+from pop_fast.view.document import Chart, Series, Window, draw, draw_histogram, nice_ticks, short_number
 from pop_fast.view.paths import frames_in
 from pop_fast.view.report import checks, write_report
 from pop_fast.view.report.checks import (
@@ -39,9 +38,7 @@ from pop_fast.view.report.checks import (
     stops_between,
     write_checks,
 )
-from pop_fast.view.report.curves import Chart, Series, Window, draw, draw_histogram, nice_ticks, short_number
 from pop_fast.view.report.model import verdict
-from pop_fast.view.report.sections import depth_picture, depth_range
 from pop_fast.view.report.source import read_result, running_mean, thin_out
 from tests.app.browser import browser
 from tests.app.conftest import TRAIN, TRAIN_AND_CHECK, Pop
@@ -223,39 +220,39 @@ def test_thinning_keeps_both_ends_and_order(n: int) -> None:
 @given(st.lists(st.integers(0, 2**31 - 1), min_size=1, max_size=20))
 def test_an_id_keeps_its_colour_and_no_one_is_black(ids: list[int]) -> None:
     array = np.array([[*ids, -1]])
-    colors = pictures.id_colors(array)
+    colors = images.id_colors(array)
     assert np.all(colors[0, -1] == 0)
     assert np.all(colors[0, :-1].max(axis=1) > 60)
-    np.testing.assert_array_equal(pictures.id_colors(array[:, ::-1])[:, ::-1], colors)
+    np.testing.assert_array_equal(images.id_colors(array[:, ::-1])[:, ::-1], colors)
 
 
 def test_neighbouring_ids_get_different_colours() -> None:
-    colors = pictures.id_colors(np.arange(1000).reshape(1, -1))[0].astype(int)
+    colors = images.id_colors(np.arange(1000).reshape(1, -1))[0].astype(int)
     assert (np.abs(np.diff(colors, axis=0)).sum(axis=1) > 20).mean() > 0.95
 
 
 def test_error_maps_share_one_scale_that_rises_in_brightness() -> None:
-    table = pictures.colormap_table().astype(float) @ [0.2126, 0.7152, 0.0722]
+    table = images.colormap_table().astype(float) @ [0.2126, 0.7152, 0.0722]
     assert np.all(np.diff(table) > -0.6)  # rounding to 8 bit
     photo = np.zeros((4, 4, 3), np.uint8)
-    errors = [pictures.error_magnitude(np.full_like(photo, v), photo) for v in (0, 51)]
-    assert pictures.error_scale(errors) == pytest.approx(0.2)
-    assert np.all(pictures.error_picture(errors[0], 0.2) == pictures.colormap_table()[0])
-    assert np.all(pictures.error_picture(errors[1], 0.2) == pictures.colormap_table()[-1])
+    errors = [images.error_magnitude(np.full_like(photo, v), photo) for v in (0, 51)]
+    assert images.error_scale(errors) == pytest.approx(0.2)
+    assert np.all(images.error_picture(errors[0], 0.2) == images.colormap_table()[0])
+    assert np.all(images.error_picture(errors[1], 0.2) == images.colormap_table()[-1])
 
 
 @pytest.mark.parametrize("lossless", [True, False])
 def test_a_data_uri_holds_the_picture(lossless: bool) -> None:
     picture = np.kron(np.arange(16, dtype=np.uint8).reshape(4, 4)[..., None] * [3, 9, 15], np.ones((8, 8, 1)))
     picture = picture.astype(np.uint8)
-    data = base64.b64decode(pictures.data_uri(picture, lossless).partition(",")[2])
+    data = base64.b64decode(images.data_uri(picture, lossless).partition(",")[2])
     back = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1].astype(int)
     assert np.abs(back - picture).max() <= (0 if lossless else 12)
 
 
 def test_pictures_are_shrunk_to_fit_and_never_enlarged() -> None:
-    assert pictures.fit(np.zeros((300, 900, 3), np.uint8), max_side=600).shape == (200, 600, 3)
-    assert pictures.fit(np.zeros((30, 90, 3), np.uint8), max_side=600).shape == (30, 90, 3)
+    assert images.fit(np.zeros((300, 900, 3), np.uint8), max_side=600).shape == (200, 600, 3)
+    assert images.fit(np.zeros((30, 90, 3), np.uint8), max_side=600).shape == (30, 90, 3)
 
 
 # What the report says of a finished splat: floaters, exposure, depth, the orbit, the command.

@@ -128,7 +128,7 @@ large = Large()
 atexit.register(print, "what was registered for the end is done")
 
 from pop_fast.data import load
-from pop_fast.data.pinhole import require_colmap
+from pop_fast.data.cameras import require_colmap
 
 def slowly(*_, **__):
     require_colmap()

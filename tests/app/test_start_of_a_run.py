@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pop_fast.cli import capture_options, explain, export, render
 from pop_fast.cli import eval as eval_command
-from pop_fast.cli.finish import table_lines
+from pop_fast.cli import explain, export, options, render
+from pop_fast.cli.export import table_lines
 from pop_fast.data import load, sfm
 from pop_fast.demo import make
 from pop_fast.errors import PopError
@@ -289,12 +289,12 @@ def nothing_long(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (render, eval_command, explain, export):
         monkeypatch.setattr(module, "load_splat", begun)
     for owner, name in (
-        (capture_options, "open_capture"),
+        (options, "open_capture"),
         (load, "run_sfm"),
         (load, "read_views"),
         (sfm, "find_cameras"),
         (sfm, "measure"),
-        (make, "_photograph"),
+        (make, "render_view"),
         (formats, "load_splat_file"),
     ):
         monkeypatch.setattr(owner, name, begun)

@@ -16,14 +16,12 @@ import torch
 
 from pop_fast.api.backend import get_backend
 from pop_fast.api.backends import FAST
-from pop_fast.cli import progress
-from pop_fast.cli.progress import bars
 from pop_fast.data import Capture, View
-from pop_fast.data.initialize import initialize_params
+from pop_fast.data.gaussians import initialize_params
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.io import heartbeat
-from pop_fast.io.heartbeat import Heartbeat, duration
+from pop_fast.io.heartbeat import Heartbeat, bars, duration
 from pop_fast.io.ply import load_ply
 from pop_fast.train import TrainingRun
 from pop_fast.train.evaluate import average, measure, population, psnr
@@ -464,7 +462,7 @@ class Terminal(io.StringIO):
 def test_the_time_that_is_left_is_told(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(heartbeat, "PERIOD", 0.01)
     clock = [100.0]
-    monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(heartbeat.time, "monotonic", lambda: clock[0])
     with bars() as report:
         report("matching pairs of photographs", 0, 300)
         clock[0] += 60.0

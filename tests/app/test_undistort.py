@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from pop_fast.api.rasterize import rasterization
 from pop_fast.data import apply_similarity, load_capture, to_capture_frame
-from pop_fast.data.normalize import normalizing_transform, transform_points, transform_viewmats
-from pop_fast.data.similarity import rotate_sh
-from pop_fast.data.undistort import intrinsics, undistortion
+from pop_fast.data.capture import normalizing_transform, transform_points, transform_viewmats
+from pop_fast.data.gaussians import rotate_sh
+from pop_fast.data.read_images import intrinsics, undistortion
 from pop_fast.errors import PopError
 from pop_fast.stages.covariance import covars_from_quats_scales
 from pop_fast.stages.harmonics import colors_from_sh, sh_basis

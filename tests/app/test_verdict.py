@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pop_fast.cli.arguments import parse
+from pop_fast.cli import parse
 from pop_fast.cli.data_check import Args as DataCheck
 from pop_fast.cli.export import Args as Export
 from pop_fast.cli.train import arguments as train_arguments

@@ -16,11 +16,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from pop_fast.cli import COMMANDS, main
+from pop_fast.cli import COMMANDS, describe, main, message, printable
 from pop_fast.cli.completion import bash, fish, options_of
-from pop_fast.cli.errors import describe, message, printable
 from pop_fast.cli.train import arguments
-from pop_fast.cli.train_checks import takes_hours
+from pop_fast.cli.train_options import takes_hours
 from pop_fast.data import load_capture, run_sfm
 from pop_fast.io.ply import load_ply
 from pop_fast.stages.tiles import tile_lists

@@ -256,7 +256,7 @@ def test_a_run_begins_without_what_it_does_not_need(script: str, heavy: tuple[st
 NAMES_THE_PYTHON = {
     "cuda_ext/build.py": 2,  # CMake's own Python, which is told -P; a program beside it
     "docs/commands.py": 1,  # the folder of its programs
-    "pop_fast/io/jpeg.py": 1,  # whether there is one
+    "pop_fast/io/images.py": 1,  # whether there is one
 }
 STARTS_PYTHON = re.compile(r"^python[\d.]*$")
 

@@ -38,13 +38,12 @@ EXEMPT = {
     "pop_ref.learn.grading:read_grade": "one line of a child process; its test hands it what a student may print",
     "pop_fast.cli.learn:_graded_apart": "hands read_grade what its own child process says",
     "pop_fast.view.document": OWN,
-    "pop_fast.view.html": OWN,
     "pop_fast.compiled.build": OWN,
     "pop_fast.compiled.library": SYSTEM,
     "pop_fast.compiled.native_step": "opens a handle of the compiled library, no file",
     "pop_fast.machine": SYSTEM,
     "pop_fast.train.environment": SYSTEM,
-    "pop_fast.cli.limits:_photographs": "takes what load_checkpoint has judged",
+    "pop_fast.cli.options:_photographs": "takes what load_checkpoint has judged",
     "pop_fast.blocks.run:merge": "takes what read_round has judged",
     "paper_repro.figures.qualitative:_view": "takes what read_view has judged",
     "paper_repro.published:publish": "takes what read_view has judged",
@@ -57,8 +56,11 @@ EXEMPT = {
     "paper_repro.cli:main": "the null device",
     "pop_fast.cli.explain:_explain": "parses what it has made itself",
     "pop_fast.demo.make:_write_model": "makes a model, and reads none",
-    "pop_fast.data.sfm_search": "reads what the search has written, and what its own child process says",
-    "pop_fast.io.jpeg:main": "a child process that decodes what has been read; its end harms nobody",
+    **dict.fromkeys(
+        (f"pop_fast.data.sfm:{name}" for name in ("_extract", "_listen", "_rows", "find_cameras", "main")),
+        "reads what the search has written, and what its own child process says",
+    ),
+    "pop_fast.io.images:main": "a child process that decodes what has been read; its end harms nobody",
     "cuda_ext.gpu_check.shared:Command._words": "the end of a log that it has written, with any bytes",
     "cuda_ext.gpu_check.several:_train": "shows what its own training has written",
     "cuda_ext.gpu_check.training": "the same",
@@ -215,10 +217,10 @@ def test_a_function_that_opens_a_file_is_noticed() -> None:
     for key in (
         ("pop_fast.io.images", "_decode"),
         ("pop_fast.io.image_header", "heif_exif"),
-        ("pop_fast.data.block", "read_block"),  # through read_json
+        ("pop_fast.data.load", "read_block"),  # through read_json
         ("pop_fast.blocks.plan", "read_job"),
         ("pop_fast.train.checkpoint", "load_splats"),  # through read_torch_file
-        ("pop_fast.data.video", "_open"),
+        ("pop_fast.data.unpack", "_open"),
         ("paper_repro.results", "_lines"),
     ):
         assert key in known

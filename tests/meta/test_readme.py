@@ -164,7 +164,7 @@ def test_every_command_of_the_readme_is_understood(line: str, capsys: pytest.Cap
     if name == "train":
         module.arguments(rest)
     else:
-        importlib.import_module("pop_fast.cli.arguments").parse(module.Args, rest, name)
+        importlib.import_module("pop_fast.cli").parse(module.Args, rest, name)
     assert capsys.readouterr().err == ""
 
 

@@ -15,7 +15,7 @@ import pop_ref.refinement
 from pop_fast.api.backend import get_backend
 from pop_fast.api.backends import CUDA
 from pop_fast.data.capture import Capture
-from pop_fast.data.initialize import initialize_params
+from pop_fast.data.gaussians import initialize_params
 from pop_fast.errors import PopError
 from pop_fast.stages import appearance as stages
 from pop_fast.train import TrainingRun

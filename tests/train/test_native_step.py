@@ -18,7 +18,7 @@ from benchmarks.faults.runs import same
 from pop_fast.api.backend import get_backend
 from pop_fast.api.backends import CompiledBackend
 from pop_fast.compiled import native_step
-from pop_fast.data.initialize import initialize_params
+from pop_fast.data.gaussians import initialize_params
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.stages.tiles import TileLists, tile_lists

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from pop_fast.data.capture import Capture, View
-from pop_fast.data.initialize import initialize_params
+from pop_fast.data.gaussians import initialize_params
 from pop_fast.density.protocol import Draws
 from pop_fast.train import TrainingRun
 from pop_fast.train.engines import torch_engine

@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.errors import PopError
-from pop_fast.io.frame import Frame
-from pop_fast.io.ply import checked_params
+from pop_fast.io.ply import Frame, checked_params
 
 SH_C0: Final = 0.28209479177387814
 # columns of f_rest by degree, over three
@@ -36,34 +35,22 @@ _FIELDS: Final = ("means", "log_scales", "quats", "logits", "sh0", "rest")
 
 @dataclass(frozen=True)
 class Cloud:
-    """Gaussians with raw parameters, float32.
+    """Gaussians with raw parameters, float32."""
 
-    Attributes:
-        means: centres, world units. [N, 3]
-        log_scales: [N, 3]
-        quats: wxyz, of norm 1. [N, 4]
-        logits: of the opacities. [N]
-        sh0: colour of degree 0. [N, 3]
-        rest: colours of the higher degrees. [N, 0|3|8|15, 3]
-        antialiased: to be drawn with antialiasing.
-        frame: the world that they are in, where it is known.
-    """
-
-    means: np.ndarray
-    log_scales: np.ndarray
-    quats: np.ndarray
-    logits: np.ndarray
-    sh0: np.ndarray
-    rest: np.ndarray
-    antialiased: bool = False
-    frame: Frame | None = None
+    means: np.ndarray  # centres, world units. [N, 3]
+    log_scales: np.ndarray  # [N, 3]
+    quats: np.ndarray  # wxyz, of norm 1. [N, 4]
+    logits: np.ndarray  # of the opacities. [N]
+    sh0: np.ndarray  # colour of degree 0. [N, 3]
+    rest: np.ndarray  # colours of the higher degrees. [N, 0|3|8|15, 3]
+    antialiased: bool = False  # to be drawn with antialiasing
+    frame: Frame | None = None  # the world that they are in, where it is known
 
     def __len__(self) -> int:
         return len(self.means)
 
     @property
     def degree(self) -> int:
-        """Highest colour degree."""
         return COEFFICIENTS.index(self.rest.shape[1])
 
     @property
@@ -79,16 +66,7 @@ class Cloud:
 
     @classmethod
     def of(cls, params: Mapping[str, Tensor], antialiased: bool = False, frame: Frame | None = None) -> Cloud:
-        """Take over raw parameters; colour degrees in which all coefficients are exactly 0 are left out.
-
-        Args:
-            params: means [N, 3], scales [N, 3], quats [N, 4], opacities [N], sh0 [N, 1, 3], shN [N, 0|3|8|15, 3], raw.
-            antialiased: to be drawn with antialiasing.
-            frame: the world that they are in, where it is known.
-
-        Raises:
-            PopError: a parameter is absent, of the wrong shape, NaN or Inf, or a quaternion is zero.
-        """
+        """Take over raw parameters; colour degrees in which all coefficients are exactly 0 are left out."""
         arrays = checked_params(dict(params))
         quats = arrays["quats"].astype(np.float64)
         quats /= np.linalg.norm(quats, axis=1, keepdims=True)
@@ -120,7 +98,6 @@ class Cloud:
         return {name: torch.from_numpy(np.array(value, np.float32)) for name, value in arrays.items()}
 
     def take(self, rows: np.ndarray) -> Cloud:
-        """Return the Gaussians of these rows, in this order."""
         return replace(self, **{name: getattr(self, name)[rows] for name in _FIELDS})
 
     def turned(self, axis: str) -> Cloud:
@@ -133,11 +110,7 @@ class Cloud:
         return replace(self, means=self.means * signs, quats=quats, rest=rest)
 
     def checked(self, path: Path) -> Cloud:
-        """Return this as it was read from a file, if all of it can be drawn.
-
-        Raises:
-            PopError: a value is NaN or Inf, or a quaternion is zero; names the file, the row and the field.
-        """
+        """Return this as it was read from a file, if all of it can be drawn; a PopError names file, row and field."""
         for name in _FIELDS:
             bad = np.argwhere(~np.isfinite(getattr(self, name)))
             if len(bad):
@@ -161,15 +134,10 @@ def to_bytes(values: np.ndarray) -> np.ndarray:
 
 
 def morton_order(means: np.ndarray) -> np.ndarray:
-    """Order centres along a space-filling curve, so that neighbours in the file are neighbours in space.
+    """Order centres [N, 3] along a space-filling curve, so that neighbours in the file are neighbours in space.
 
-    Far-away centres are pulled in by a logarithm first: a few of them would leave the rest in one cell.
-
-    Args:
-        means: [N, 3]
-
-    Returns:
-        A permutation, ties in the order they have. int64 [N]
+    Far-away centres are pulled in by a logarithm first: a few of them would leave the rest in one cell. A permutation,
+    ties in the order they have. int64 [N]
     """
     if len(means) == 0:
         return np.zeros(0, np.int64)
@@ -186,10 +154,7 @@ def morton_order(means: np.ndarray) -> np.ndarray:
 
 
 def drop_largest(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Leave out the component of the largest magnitude, after a change of sign that makes it positive.
-
-    Args:
-        quats: of norm 1. [N, 4]
+    """Leave out the component of the largest magnitude of unit quaternions, after a change of sign that makes it > 0.
 
     Returns:
         Which was left out, int64 [N], and the others in order, within sqrt(1/2) of 0. float64 [N, 3]

@@ -16,9 +16,7 @@ import numpy as np
 
 from pop_fast.errors import PopError
 from pop_fast.io.formats.cloud import SH_C0, Cloud, drop_largest, logits_of_bytes, restore_largest, to_bytes
-from pop_fast.io.frame import Frame
-from pop_fast.io.ply import MODE, asks_for_antialiasing
-from pop_fast.io.ply_rows import header_of, read_header
+from pop_fast.io.ply import MODE, Frame, asks_for_antialiasing, header_of, read_header
 
 _CHUNK: Final = 256
 _RANGES: Final = tuple(
@@ -38,21 +36,13 @@ _WRITE_AGAIN: Final = "copy or write the file again"
 
 
 def is_compressed(path: Path) -> bool:
-    """Tell whether a PLY file is of this kind, by its header.
-
-    Raises:
-        PopError: as `read_header`.
-    """
+    """Tell whether a PLY file is of this kind, by its header."""
     columns = {element.name: {name for name, _ in element.columns} for element in read_header(path).elements}
     return "chunk" in columns and set(_WORDS) <= columns.get("vertex", set())
 
 
 def chunked(cloud: Cloud) -> np.ndarray:
-    """Order Gaussians so that those of a chunk are close together: halves along the widest axis, down to chunks.
-
-    Returns:
-        A permutation. int64 [N]
-    """
+    """Order Gaussians so that those of a chunk are close together: halves along the widest axis. int64 [N]"""
     means = cloud.means
     waiting, done = [np.arange(len(means))], list[np.ndarray]()
     while waiting:
@@ -128,15 +118,7 @@ def _packed_rotation(quats: np.ndarray) -> np.ndarray:
 
 
 def decode(data: bytes, path: Path) -> Cloud:
-    """Read compressed PLY.
-
-    Args:
-        data: the file's bytes.
-        path: its name, for errors.
-
-    Raises:
-        PopError: it is damaged or cut off; names the element.
-    """
+    """Read compressed PLY."""
     elements = _elements(data, path)
     if "chunk" not in elements or "vertex" not in elements:
         raise PopError(f"{path}: has no element 'chunk' or 'vertex': it is no compressed PLY")

@@ -11,28 +11,19 @@ from torch import Tensor
 
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
-from pop_fast.io.format_registry import FORMATS, PLY, format_names
-from pop_fast.io.formats import sog
+from pop_fast.io.formats import FORMATS, PLY, format_names, sog
 from pop_fast.io.formats.cloud import Cloud
 from pop_fast.io.formats.compressed_ply import is_compressed
 from pop_fast.io.formats.table import READ_ONLY
-from pop_fast.io.frame import Frame
-from pop_fast.io.ply import asks_for_antialiasing, params_of_ply, ply_bytes
-from pop_fast.io.ply_rows import header_of
+from pop_fast.io.ply import Frame, asks_for_antialiasing, file_bytes, header_of, params_of_ply, ply_bytes
 
 
 class Stored(NamedTuple):
-    """What a file holds.
+    """What a file holds."""
 
-    Attributes:
-        params: raw parameters, as `pop_fast.io.ply.load_ply` returns them.
-        antialiased: to be drawn with antialiasing.
-        frame: the world that they are in, where the file says it.
-    """
-
-    params: dict[str, Tensor]
-    antialiased: bool
-    frame: Frame | None
+    params: dict[str, Tensor]  # raw parameters, as `pop_fast.io.ply.load_ply` returns them
+    antialiased: bool  # to be drawn with antialiasing
+    frame: Frame | None  # the world that they are in, where the file says it
 
 
 def splat_suffixes() -> tuple[str, ...]:
@@ -115,16 +106,7 @@ def encoded(
 
 
 def decoded(name: str, data: bytes, path: Path = Path("memory")) -> Stored:
-    """Read a splat from a file's bytes.
-
-    Args:
-        name: of the format.
-        data: the bytes.
-        path: their name, for errors.
-
-    Raises:
-        PopError: the bytes are damaged; names the field.
-    """
+    """Read a splat of a format from a file's bytes, whose errors name `path`."""
     if name == PLY:
         params, header = params_of_ply(data, path), header_of(data, path)
         return Stored(params, asks_for_antialiasing(header), Frame.of_comments(header.comments, path))
@@ -142,24 +124,14 @@ def save_as(
     antialiased: bool = False,
     frame: Frame | None = None,
 ) -> int:
-    """Write a splat in a format, atomically.
-
-    Returns:
-        The number of bytes.
-
-    Raises:
-        PopError: as `encoded`, or the file cannot be written.
-    """
+    """Write a splat in a format, atomically; returns the number of bytes."""
     data = encoded(name, params, antialiased, frame)
     write_atomically(path, lambda file: file.write(data))
     return len(data)
 
 
 def load_splat_file(path: str | os.PathLike[str]) -> Stored:
-    """Read a splat in any format.
-
-    Args:
-        path: the file; for SOG in a folder that folder, or its meta.json.
+    """Read a splat in any format from its file; for SOG in a folder from that folder, or its meta.json.
 
     Raises:
         PopError: the file is absent, of an unknown kind or damaged; names the field.
@@ -173,20 +145,11 @@ def load_splat_file(path: str | os.PathLike[str]) -> Stored:
     if path.name.lower() == sog.META:
         return _stored(sog.decode_folder(path))
     if suffix in READ_ONLY:
-        return _stored(READ_ONLY[suffix](_bytes(path), path))
+        return _stored(READ_ONLY[suffix](file_bytes(path), path))
     if not is_splat_file(path):
         raise PopError(f"{path}: the name must end in one of {', '.join(readable_names())}")
     name = named_format(path)
     if name in (PLY, "compressed-ply"):
         # either may stand under the name of the other
         name = "compressed-ply" if is_compressed(path) else PLY
-    return decoded(name, _bytes(path), path)
-
-
-def _bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise PopError(f"{path}: the file is absent; check the path") from None
-    except OSError as error:
-        raise PopError(f"{path}: could not be read: {error.strerror}; check the path and its permissions") from error
+    return decoded(name, file_bytes(path), path)

@@ -22,7 +22,7 @@ import numpy as np
 from pop_fast.errors import PopError
 from pop_fast.io.formats import spz
 from pop_fast.io.formats.cloud import COEFFICIENTS, SH_C0, Cloud, to_bytes
-from pop_fast.io.frame import KEY, Frame
+from pop_fast.io.ply import KEY, Frame
 
 NAME: Final = "KHR_gaussian_splatting"
 SPZ_NAME: Final = "KHR_gaussian_splatting_compression_spz_2"
@@ -42,15 +42,7 @@ def encode(cloud: Cloud) -> bytes:
 
 
 def encode_spz(cloud: Cloud, sh_step: float = spz.SH_STEP) -> bytes:
-    """Write .glb with an SPZ stream; the order of the Gaussians is kept.
-
-    Args:
-        cloud: what to write.
-        sh_step: as of `spz.encode`.
-
-    Raises:
-        PopError: as `spz.encode`.
-    """
+    """Write .glb with an SPZ stream, as `spz.encode` does; the order of the Gaussians is kept."""
     return _glb(cloud.turned("z"), {}, spz.encode(replace(cloud, frame=None), version=2, sh_step=sh_step))
 
 
@@ -99,8 +91,10 @@ def _glb(turned: Cloud, data: Mapping[str, bytes], stream: bytes | None) -> byte
         "mode": 0,
         "extensions": {NAME: extension},
     }
+    # what glTF has no place for
+    extras = {"antialiased": turned.antialiased, **({} if turned.frame is None else {KEY: turned.frame.entry()})}
     content: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "pop-splatting", "extras": _extras(turned)},
+        "asset": {"version": "2.0", "generator": "pop-splatting", "extras": extras},
         "extensionsUsed": used,
         **({} if stream is None else {"extensionsRequired": used}),
         "scene": 0,
@@ -118,22 +112,8 @@ def _glb(turned: Cloud, data: Mapping[str, bytes], stream: bytes | None) -> byte
     return _MAGIC + struct.pack("<II", 2, 12 + len(chunks)) + chunks
 
 
-def _extras(cloud: Cloud) -> dict[str, Any]:
-    """Return what the asset holds that glTF has no place for."""
-    return {"antialiased": cloud.antialiased, **({} if cloud.frame is None else {KEY: cloud.frame.entry()})}
-
-
 def decode(data: bytes, path: Path) -> Cloud:
-    """Read the first splat of a .glb file, with float32 attributes or an SPZ stream.
-
-    Args:
-        data: the file's bytes.
-        path: its name, for errors.
-
-    Raises:
-        PopError: it is damaged, holds no splat, stores it in a way that is not known here, or moves it by a node;
-            names the entry.
-    """
+    """Read the first splat of a .glb file, with float32 attributes or an SPZ stream."""
     content, body = _chunks(data, path)
     try:
         primitive = _splat(content, path)
@@ -228,7 +208,6 @@ def _from_attributes(content: Mapping[str, Any], body: bytes, attributes: Mappin
 
 
 def _part(content: Mapping[str, Any], body: bytes, index: int, path: Path) -> bytes:
-    """Return a buffer view of the binary chunk."""
     entry = content["bufferViews"][index]
     if entry.get("buffer", 0) != 0 or "uri" in content["buffers"][0]:
         raise PopError(f"{path}: bufferViews[{index}] lies outside of the file; pack it into one .glb")

@@ -12,7 +12,6 @@ from __future__ import annotations
 import io
 import json
 import math
-import struct
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -24,9 +23,10 @@ import torch
 from torch import Tensor
 
 from pop_fast.errors import PopError
-from pop_fast.io.budget import check_members, check_memory
 from pop_fast.io.formats.cloud import COEFFICIENTS, Cloud, drop_largest, logits_of_bytes, restore_largest, to_bytes
-from pop_fast.io.frame import KEY, Frame
+from pop_fast.io.image_header import size_of
+from pop_fast.io.ply import KEY, Frame
+from pop_fast.io.read_back import check_members, check_memory
 
 _CODES: Final = 256
 _ROUNDS: Final = 8
@@ -39,12 +39,7 @@ _BLOCK: Final = 2**23
 def codebook(values: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
     """Choose 256 numbers near which values lie: Lloyd's algorithm in one dimension, from between quantiles and a grid.
 
-    Args:
-        values: [M]
-        weights: how much the square of each one's error counts, 0 or more; all the same where absent. [M]
-
-    Returns:
-        Rising. float32 [256]
+    `weights` say how much the square of each one's error counts, all the same where absent. Rising. float32 [256]
     """
     if len(values) == 0:
         return np.zeros(_CODES, np.float32)
@@ -81,7 +76,7 @@ def row_palette(rows: np.ndarray, weights: np.ndarray, count: int) -> tuple[np.n
         count: palette rows, at most.
 
     Returns:
-        The palette, float32 [C, D] with C of `count` or less, and every row's index in it. int64 [N]
+        The palette, float32 [C, D], and every row's index in it. int64 [N]
     """
     all_rows = torch.from_numpy(np.ascontiguousarray(rows, np.float32))
     all_weights = torch.from_numpy(np.ascontiguousarray(weights, np.float32))
@@ -146,15 +141,7 @@ _WRITE_AGAIN: Final = "copy or write the file again"
 
 
 def encode(cloud: Cloud, shared_by: int = _SHARED_BY) -> bytes:
-    """Write SOG; the order of the Gaussians is kept, and should be one where neighbours are close.
-
-    Args:
-        cloud: what to write.
-        shared_by: Gaussians for a row of the palette of colours, as far as its size allows.
-
-    Returns:
-        The bytes of the ZIP file.
-    """
+    """Write SOG, a row of the palette of colours for `shared_by` Gaussians, which should be ordered by place."""
     n = len(cloud)
     width = max(1, math.isqrt(max(n - 1, 0)) + 1)
     height = max(1, -(-n // width))
@@ -234,15 +221,7 @@ def _zipped(meta: Mapping[str, Any], images: Mapping[str, np.ndarray]) -> bytes:
 
 
 def decode(data: bytes, path: Path) -> Cloud:
-    """Read SOG, as one file.
-
-    Args:
-        data: the file's bytes.
-        path: its name, for errors.
-
-    Raises:
-        PopError: it is damaged, of another version, or an image does not fit; names the entry.
-    """
+    """Read SOG, as one file."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             check_members(path, archive, len(data), _WRITE_AGAIN)
@@ -252,14 +231,7 @@ def decode(data: bytes, path: Path) -> Cloud:
 
 
 def decode_folder(path: Path) -> Cloud:
-    """Read SOG whose images lie as files in the folder of its meta.json.
-
-    Args:
-        path: meta.json.
-
-    Raises:
-        PopError: as `decode`, or a file is absent.
-    """
+    """Read SOG whose images lie as files in the folder of its meta.json; see `decode`."""
     try:
         held = sum(image.stat().st_size for image in path.parent.glob("*.webp"))
     except OSError as error:
@@ -268,7 +240,6 @@ def decode_folder(path: Path) -> Cloud:
 
 
 def _unzipped(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
-    """Return an entry."""
     size = archive.getinfo(name).file_size
     if name == META and size > _LARGEST_META:
         raise PopError(f"{path}: {META} has {size} bytes; {_WRITE_AGAIN}")
@@ -276,7 +247,6 @@ def _unzipped(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
 
 
 def _file(folder: Path, name: str, path: Path) -> bytes:
-    """Return a file of the folder."""
     if Path(name).name != name:
         raise PopError(f"{path}: names the file {name!r}, which is not in its folder; put it there, and name it so")
     try:
@@ -355,7 +325,8 @@ def _rest(meta: Mapping[str, Any], pixels: Any, path: Path) -> np.ndarray:
 
 def _pixels(data: bytes, name: str, least: int, path: Path) -> np.ndarray:
     """Return an image's pixels in reading order, with four channels. uint8 [M, 4]"""
-    width, height = _size(data)
+    sound = len(data) >= 32 and data[:4] == b"RIFF" and (data[12:16] != b"VP8L" or data[20] == 0x2F)
+    width, height = (size_of(data) if sound else None) or (0, 0)
     if width * height < least:
         raise PopError(f"{path}: {name} is {width}x{height} pixels; {least} are needed: {_WRITE_AGAIN}")
     if width * height > 4 * least + 2**16:
@@ -367,20 +338,3 @@ def _pixels(data: bytes, name: str, least: int, path: Path) -> np.ndarray:
     # where all are opaque, there may be no fourth channel
     fourth = image[..., 3].reshape(-1, 1) if image.shape[2] == 4 else np.full((len(flat), 1), 255, np.uint8)
     return np.concatenate([flat, fourth], axis=1)
-
-
-def _size(data: bytes) -> tuple[int, int]:
-    """Return the width and the height that a WebP file states, 0 where it is none."""
-    if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(data) < 32:
-        return 0, 0
-    kind = data[12:16]
-    if kind == b"VP8L" and data[20] == 0x2F:
-        bits = struct.unpack("<I", data[21:25])[0]
-        return (bits & 0x3FFF) + 1, ((bits >> 14) & 0x3FFF) + 1
-    if kind == b"VP8X":
-        width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
-        return width, height
-    if kind == b"VP8 ":
-        width, height = struct.unpack("<HH", data[26:30])
-        return width & 0x3FFF, height & 0x3FFF
-    return 0, 0

@@ -25,9 +25,9 @@ from typing import Final
 import numpy as np
 
 from pop_fast.errors import PopError
-from pop_fast.io.budget import check_memory
 from pop_fast.io.formats.cloud import COEFFICIENTS, Cloud, drop_largest, logits_of_bytes, restore_largest, to_bytes
-from pop_fast.io.frame import KEY, Frame
+from pop_fast.io.ply import KEY, Frame
+from pop_fast.io.read_back import check_memory
 
 MAGIC: Final = 0x5053474E
 # magic, version, count, degree, fractional bits, flags, and a zero byte or the number of streams
@@ -77,15 +77,13 @@ def encode(cloud: Cloud, version: int = 3, sh_step: float = SH_STEP) -> bytes:
         version: 2, 3 or 4; 2 has other rotations, and 4 is compressed otherwise.
         sh_step: what the coefficients of a Gaussian of typical visibility are multiples of, in 1/128; 1 to 64.
 
-    Returns:
-        The file's bytes.
-
     Raises:
         PopError: a centre is too far from the origin for 24 bits, or version 4's package is not installed.
     """
     turned = cloud.turned("x")
     bits = _fraction_bits(turned.means)
-    extensions = b"" if cloud.frame is None else _extension(_FRAME, json.dumps({KEY: cloud.frame.entry()}).encode())
+    world = b"" if cloud.frame is None else json.dumps({KEY: cloud.frame.entry()}).encode()
+    extensions = _EXTENSION.pack(_FRAME, len(world)) + world if world else b""
     flags = (_ANTIALIASED if cloud.antialiased else 0) | (_EXTENDED if extensions else 0)
     columns = [
         _centres(turned, bits).astype("<i4").reshape(-1, 1).view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),
@@ -106,20 +104,12 @@ def encode(cloud: Cloud, version: int = 3, sh_step: float = SH_STEP) -> bytes:
 
 
 def _zstandard() -> ModuleType:
-    """Return the package, which only version 4 needs.
-
-    Raises:
-        PopError: it is not installed.
-    """
+    """Return the package, which only version 4 needs; a PopError says that it is not installed."""
     try:
         import zstandard
     except ImportError as error:
         raise PopError(f"SPZ version 4 needs the package zstandard ({error}); pip install zstandard") from error
     return zstandard
-
-
-def _extension(kind: int, payload: bytes) -> bytes:
-    return _EXTENSION.pack(kind, len(payload)) + payload
 
 
 def _fraction_bits(means: np.ndarray) -> int:
@@ -166,16 +156,7 @@ def _typical(visibility: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class _Head:
-    """What a header promises.
-
-    Attributes:
-        version: 2 to 4.
-        n: Gaussians.
-        degree: of the colours.
-        bits: of a centre's fraction.
-        flags: as the format has them.
-        streams: of version 4, how many there are.
-    """
+    """What a header promises: of `bits` of a centre's fraction, and in version 4 so many streams."""
 
     version: int
     n: int
@@ -191,15 +172,7 @@ class _Head:
 
 
 def decode(data: bytes, path: Path) -> Cloud:
-    """Read SPZ.
-
-    Args:
-        data: the file's bytes.
-        path: its name, for errors.
-
-    Raises:
-        PopError: it is damaged, cut off, or of another version; names the field.
-    """
+    """Read SPZ."""
     unpack = _of_streams if data[:4] == struct.pack("<I", MAGIC) else _of_gzip
     head, columns, extensions = unpack(data, path)
     n = head.n

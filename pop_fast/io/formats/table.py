@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from pop_fast.io.formats import compressed_ply, dot_splat, gltf, ksplat, sog, spz
+from pop_fast.io.formats import compressed_ply, dot_splat, gltf, sog, spz
 from pop_fast.io.formats.cloud import Cloud, morton_order
 
 
@@ -152,8 +152,8 @@ SPLAT: Final = Format(
         "view dependence": "all of it",
     },
     readers="antimatter15/splat, SuperSplat, Babylon.js, Spark, viser",
-    encode=dot_splat.encode,
-    decode=dot_splat.decode,
+    encode=dot_splat.encode_splat,
+    decode=dot_splat.decode_splat,
     order=dot_splat.largest_first,
     has_frame=False,
 )
@@ -190,4 +190,4 @@ GLTF_SPZ: Final = replace(
 )
 
 # what is read and not written, by suffix
-READ_ONLY: Final[Mapping[str, Callable[[bytes, Path], Cloud]]] = {".ksplat": ksplat.decode}
+READ_ONLY: Final[Mapping[str, Callable[[bytes, Path], Cloud]]] = {".ksplat": dot_splat.decode_ksplat}

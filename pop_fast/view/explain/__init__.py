@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pop_fast.view.explain.model import PixelExplanation, Row
-from pop_fast.view.explain.pixel import explain_pixel
+from pop_fast.view.explain.pixel import PixelExplanation, Row, explain_pixel
 from pop_fast.view.explain.scene import ExplainedView, explain_view
 
 __all__ = ["ExplainedView", "PixelExplanation", "Row", "explain_pixel", "explain_view"]

@@ -15,9 +15,8 @@ import torch
 
 from pop_fast.api.backend import backend_names, get_backend
 from pop_fast.errors import PopError
-from pop_fast.view.explain.maps import Map, scaled
 from pop_fast.view.explain.pixel import Step, Walk, candidates, oracle_splats, walk
-from pop_fast.view.explain.scene import TILE_SIZE, ExplainedView
+from pop_fast.view.explain.scene import TILE_SIZE, ExplainedView, Map, scaled
 from pop_ref.camera import in_front
 from pop_ref.constants import PROFILES, Profile
 from pop_ref.dominance import dominant_id
@@ -26,34 +25,20 @@ from pop_ref.records import Splats
 
 @dataclass(frozen=True)
 class Flip:
-    """One decision, D1 to D8, that two renderers take differently.
-
-    Attributes:
-        decision: its label.
-        gaussian: which it is about.
-        depth: of that Gaussian.
-        first: what the one does, with operand and threshold.
-        second: what the other does.
-        more: how many entries behind it also meet another fate, most of them in consequence.
-    """
+    """One decision, D1 to D8, that two renderers take differently at a Gaussian."""
 
     decision: str
     gaussian: int
     depth: float
-    first: str
-    second: str
-    more: int = 0
+    first: str  # what the one does, with operand and threshold
+    second: str  # what the other does
+    more: int = 0  # how many entries behind it also meet another fate, most of them in consequence
 
 
 def first_flip(ids: np.ndarray, walks: tuple[Walk, Walk], profiles: tuple[Profile, Profile]) -> Flip | None:
-    """Find where two walks over the same candidates part, from the front.
+    """Find where two walks over the same candidates part, from the front; `ids` are the Gaussians of their rows.
 
     Entries that one list holds only to skip them are no parting: they change nothing.
-
-    Args:
-        ids: Gaussian of every row of both walks' splats.
-        walks: the two.
-        profiles: their constants.
     """
     flips = list(_flips(ids, walks, profiles))
     if flips:
@@ -167,31 +152,20 @@ class Side:
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """What `difference` found.
-
-    Attributes:
-        names: of the two.
-        lines: the result in words.
-        region: left, top, width and height of what was compared, px.
-        n_colors: pixels whose colours 8 bits can tell apart.
-        n_dominant: pixels with another dominant Gaussian.
-        n_blended: pixels that blend another number of Gaussians.
-        largest: the largest difference of a channel.
-        at: the pixel `flip` is about: the one asked for, or the worst where that one does not differ.
-        flip: the first decision there that falls otherwise; None where values differ and no decision does.
-        maps: pictures of the region.
-    """
+    """What `difference` found."""
 
     names: tuple[str, str]
-    lines: tuple[str, ...]
-    region: tuple[int, int, int, int]
-    n_colors: int
-    n_dominant: int
-    n_blended: int
-    largest: float
+    lines: tuple[str, ...]  # the result in words
+    region: tuple[int, int, int, int]  # left, top, width and height of what was compared, px
+    n_colors: int  # pixels whose colours 8 bits can tell apart
+    n_dominant: int  # pixels with another dominant Gaussian
+    n_blended: int  # pixels that blend another number of Gaussians
+    largest: float  # the largest difference of a channel
+    # the pixel `flip` is about: the one asked for, or the worst where that one does not differ
     at: tuple[int, int]
+    # the first decision there that falls otherwise; None where values differ and no decision does
     flip: Flip | None
-    maps: tuple[Map, ...]
+    maps: tuple[Map, ...]  # pictures of the region
 
     def plain(self) -> dict[str, Any]:
         """Give everything but the pictures, for JSON."""
@@ -200,19 +174,9 @@ class Difference:
 
 
 def difference(scene: ExplainedView, a: str, b: str, x: int, y: int) -> Difference:
-    """Compare two renderers on a view, and at a pixel.
+    """Compare two renderers, profiles or backends, on a view, and at a pixel.
 
     The oracle is slow, so where it is one of the two only the pixel's tile is compared.
-
-    Args:
-        scene: the view.
-        a: a profile or a backend.
-        b: another one.
-        x: column of the pixel.
-        y: row of the pixel.
-
-    Raises:
-        PopError: a name is neither a profile nor a backend that can run here.
     """
     width, height = scene.view.width, scene.view.height
     left, top = x // TILE_SIZE * TILE_SIZE, y // TILE_SIZE * TILE_SIZE

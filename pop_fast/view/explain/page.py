@@ -8,24 +8,19 @@ from html import escape
 
 import numpy as np
 
-from pop_fast.io.pictures import data_uri, fit, id_colors
+from pop_fast.io.images import data_uri, fit, id_colors
 from pop_fast.view.document import asset, document, element
-from pop_fast.view.explain.maps import Map, crop
-from pop_fast.view.explain.model import PixelExplanation, Row, weighty
+from pop_fast.view.explain.pixel import PixelExplanation, Row, weighty
+from pop_fast.view.explain.scene import Map, crop
 from pop_ref.constants import PROFILES
 
 Box = tuple[int, int, int, int]
 
 
 def stage(e: PixelExplanation, rows: Sequence[Row], picture: np.ndarray, box: Box, inner: Box | None) -> str:
-    """Lay ellipses and the pixel's mark over a picture.
+    """Lay ellipses and the pixel's mark over a picture of the part `box` of the view: left, top, width and height, px.
 
-    Args:
-        e: the explanation.
-        rows: the splats to draw, the heaviest first.
-        picture: uint8, of the part `box` of the view.
-        box: left, top, width and height, px.
-        inner: a part to outline, or None for a close-up.
+    The heaviest splats come first; `inner` is a part to outline, or None for a close-up.
     """
     floor = PROFILES[e.profile].alpha_floor
     # the heaviest is drawn last, on top, where the pointer finds it
@@ -98,7 +93,6 @@ def light_bar(e: PixelExplanation) -> str:
 
 
 def css_color(color: Sequence[float]) -> str:
-    """Write a colour as #rrggbb, clamped."""
     return "#" + "".join(f"{round(255 * min(max(c, 0.0), 1.0)):02x}" for c in color)
 
 
@@ -107,37 +101,26 @@ _ZOOM = (21, 81)  # px, the smallest and the largest close-up
 
 
 def page(e: PixelExplanation, maps: Sequence[Map], differences: Sequence[str] = ()) -> str:
-    """Lay out the page.
-
-    Args:
-        e: the explanation.
-        maps: of the same view, `view_maps`' and any others.
-        differences: lines that tell where two renderers part, if that was asked.
-    """
+    """Lay out the page, with maps of the same view, and lines that tell where two renderers part, if that was asked."""
     pictures = {entry.name: entry.picture for entry in maps}
     drawn = sorted(e.blended, key=lambda row: -row.weight)[:_DRAWN]
+    about = f"{e.width} x {e.height} px, profile {e.profile}, {e.n_gaussians:,} Gaussians; loss {e.objective}"
+    about += f" + {e.lambda_pop:g} L_POP" if e.lambda_pop else ""
     body = "".join(
         [
             f"<header><h1>Why pixel ({e.x}, {e.y}) of {escape(e.view)} looks like that</h1>",
-            f"<p>{_subtitle(e)}</p></header>",
+            f"<p>{escape(about)}</p></header>",
             _tiles(e),
             _stages(e, drawn, pictures),
             _light(e),
             _walk(e),
-            _differences(differences),
-            _maps(maps),
+            f"<h2>Where two renderers part</h2><pre>{escape(chr(10).join(differences))}</pre>" if differences else "",
+            f'<h2>The view as maps</h2><div class="maps">{"".join(map(_map, maps))}</div>',
             "<footer>Written by <code>pop explain</code>; the numbers are the oracle's, in float64.</footer>",
         ]
     )
     style = asset("report", "page.css") + asset("explain", "page.css")
     return document(f"{e.view} ({e.x}, {e.y})", style, body, asset("explain", "page.js"))
-
-
-def _subtitle(e: PixelExplanation) -> str:
-    term = f" + {e.lambda_pop:g} L_POP" if e.lambda_pop else ""
-    return escape(
-        f"{e.width} x {e.height} px, profile {e.profile}, {e.n_gaussians:,} Gaussians; loss {e.objective}{term}"
-    )
 
 
 def _tiles(e: PixelExplanation) -> str:
@@ -286,14 +269,6 @@ def _row(row: Row, chosen: bool, has_pop: bool) -> str:
 def _dot(color: Sequence[float]) -> str:
     values = " ".join(f"{c:.3f}" for c in color)
     return f'<span class="swatch" title="{values}" style="background:{css_color(color)}"></span>'
-
-
-def _differences(lines: Sequence[str]) -> str:
-    return f"<h2>Where two renderers part</h2><pre>{escape(chr(10).join(lines))}</pre>" if lines else ""
-
-
-def _maps(maps: Sequence[Map]) -> str:
-    return f'<h2>The view as maps</h2><div class="maps">{"".join(_map(entry) for entry in maps)}</div>'
 
 
 def _map(entry: Map) -> str:

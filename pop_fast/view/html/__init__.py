@@ -10,18 +10,17 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from importlib.resources import files
 from typing import Any, Final
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from pop_fast.data.capture import View
-from pop_fast.data.normalize import focus_point, look_at_one_point
+from pop_fast.data.capture import View, focus_point, look_at_one_point
 from pop_fast.io.formats import encoded
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.views import evenly
+from pop_fast.view.document import asset
 
 # of a larger capture, an even selection
 _MOST: Final = 60
@@ -29,15 +28,7 @@ _MOST: Final = 60
 
 @dataclass(frozen=True)
 class PageCamera:
-    """A pinhole camera.
-
-    Attributes:
-        name: what the page shows of it.
-        viewmat: world -> camera, y down, z forward. [4, 4]
-        K: intrinsics, px. [3, 3]
-        width: px
-        height: px
-    """
+    """A pinhole camera: its name, world -> camera [4, 4] with y down and z forward, intrinsics [3, 3] and size, px."""
 
     name: str
     viewmat: np.ndarray
@@ -143,7 +134,7 @@ def page_of(
     title: str,
     level: int = 0,
 ) -> bytes:
-    """Make the page.
+    """Make the page's bytes.
 
     It draws as the training's rasterizer does: the same projection, low-pass, cut-offs of alpha and background, colours
     to degree 3. It loses what SPZ loses, ends no pixel early, and holds sums of layers in half precision.
@@ -155,12 +146,6 @@ def page_of(
         sh_degree: highest colour band to draw.
         title: of the page.
         level: how coarsely view dependence is written, as of SPZ.
-
-    Returns:
-        The file's bytes.
-
-    Raises:
-        PopError: the splat does not fit into SPZ.
     """
     drawn = {**params, "shN": params["shN"][:, : (sh_degree + 1) ** 2 - 1]}
     scene = _scene(params["means"].detach().cpu(), cameras, config)
@@ -168,9 +153,9 @@ def page_of(
     scripts = [
         ("scene", "application/json", json.dumps(scene).replace("<", "\\u003c")),
         ("splat", "application/octet-stream", data),
-        ("splat-vert", "x-shader/x-vertex", _asset("splat.vert")),
-        ("splat-frag", "x-shader/x-fragment", _asset("splat.frag")),
-        ("sorter", "text/x-worker", _asset("sorter.js")),
+        ("splat-vert", "x-shader/x-vertex", asset("html", "splat.vert")),
+        ("splat-frag", "x-shader/x-fragment", asset("html", "splat.frag")),
+        ("sorter", "text/x-worker", asset("html", "sorter.js")),
     ]
     held = "\n".join(f'<script id="{name}" type="{kind}">{content}</script>' for name, kind, content in scripts)
     buttons = "".join(
@@ -186,12 +171,12 @@ def page_of(
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width,initial-scale=1">'
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
-        f"<title>{escape(title)}</title><style>{_asset('page.css')}</style></head>"
+        f"<title>{escape(title)}</title><style>{asset('html', 'page.css')}</style></head>"
         f'<body><canvas id="view" tabindex="0" aria-label="{escape(title)}: {escape(_KEYS)}"></canvas>'
         '<div id="message" role="status"></div>'
         f'<div id="panel"><span class="buttons">{buttons}</span><span id="name"></span>'
         f'<span id="help">{keys}</span></div>'
-        f"{held}<script>{_asset('viewer.js')}</script></body></html>\n"
+        f"{held}<script>{asset('html', 'viewer.js')}</script></body></html>\n"
     ).encode()
 
 
@@ -215,7 +200,3 @@ def _scene(means: Tensor, cameras: Sequence[PageCamera], config: TrainConfig) ->
         "floor": profile.alpha_floor,
         "ceiling": profile.alpha_ceiling,
     }
-
-
-def _asset(name: str) -> str:
-    return files("pop_fast.view.html").joinpath(name).read_text(encoding="utf-8")

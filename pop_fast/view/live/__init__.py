@@ -1,6 +1,5 @@
 """A splat in the browser, drawn by the package's own renderers: from a state to a picture, and the server around it."""
 
-from pop_fast.view.live.draw import Drawing, SplatScene
-from pop_fast.view.live.state import MODES, Box, KeyCamera, Mode, RecordedPath, ViewState, read_path
+from pop_fast.view.live.draw import MODES, Box, Drawing, KeyCamera, Mode, RecordedPath, SplatScene, ViewState, read_path
 
 __all__ = ["MODES", "Box", "Drawing", "KeyCamera", "Mode", "RecordedPath", "SplatScene", "ViewState", "read_path"]

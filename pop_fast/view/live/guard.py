@@ -36,11 +36,7 @@ _IDLE: Final = ("FileTransferPartAck", "GuiButtonHoldMessage")
 
 
 def passed_on(data: Any, rules: Mapping[str, Rule]) -> bool:
-    """Tell whether a message is for viser to read.
-
-    Args:
-        data: as it came.
-        rules: of the controls, by viser's names of them.
+    """Tell whether a message is for viser to read, by the rules of the controls; those are under viser's names of them.
 
     Raises:
         PopError: it is none that the viewer's page sends; says what is wrong with it.
@@ -193,9 +189,7 @@ class Guard:
         listening: the socket that it listens on.
         tell: is called with a line on what was refused of a connection that was let in.
 
-    Attributes:
-        token: a random word that stands in the address.
-        rules: what the controls of all panels may be set to, by viser's names of the controls.
+    `token` is a random word that stands in the address, `rules` what the controls of all panels may be set to.
     """
 
     def __init__(self, host: str, listening: socket.socket, tell: Callable[[str], None]) -> None:
@@ -250,22 +244,11 @@ class Guard:
 
         ours = {"process_request": process_request, "create_connection": self._connections(websockets)}
         limits = {"max_size": _LONGEST_MESSAGE, "max_queue": 4, "open_timeout": _PATIENCE, "close_timeout": 1.0}
-        return {
-            **given,
-            **ours,
-            **limits,
-            "ping_interval": _PATIENCE,
-            "ping_timeout": _PATIENCE,
-            "sock": self._listening,
-        }
+        limits |= {"ping_interval": _PATIENCE, "ping_timeout": _PATIENCE}
+        return {**given, **ours, **limits, "sock": self._listening}
 
     def refusal(self, request: Any, arrived_at: str) -> tuple[HTTPStatus, str] | None:
-        """Return why a request is refused, or None.
-
-        Args:
-            request: with `path` and `headers`, as websockets has it.
-            arrived_at: the address of this machine that it came to.
-        """
+        """Return why a request, that came to an address of this machine, is refused, or None."""
         hosts, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
         socket_asked = bool(request.headers.get_all("Upgrade"))
         allowed = self._names(arrived_at)
@@ -343,11 +326,7 @@ def is_any(host: str) -> bool:
 
 
 def listen(host: str, port: int, tries: int = 100) -> socket.socket:
-    """Listen on an address, or on the next free port where this one is in use.
-
-    Raises:
-        PopError: it cannot be listened on; within a second or so.
-    """
+    """Listen on an address, or on the next free port where this one is in use."""
     place, family = _resolved(host), socket.AF_INET
     if ":" in place:
         family = socket.AF_INET6

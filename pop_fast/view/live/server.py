@@ -23,10 +23,8 @@ import numpy as np
 
 from pop_fast.errors import PopError
 from pop_fast.view.html import view_distances
-from pop_fast.view.live.draw import SplatScene
+from pop_fast.view.live.draw import Panel, SplatScene, ViewState, field_of_view, pose_of_viewmat, viewmat_of_pose
 from pop_fast.view.live.guard import Guard, is_any, listen
-from pop_fast.view.live.panel import Panel
-from pop_fast.view.live.state import ViewState, pose_of_viewmat, viewmat_of_pose
 
 if TYPE_CHECKING:
     from pop_fast.view.html import PageCamera
@@ -54,7 +52,6 @@ class Pace:
         self._seconds_per_pixel: float | None = None
 
     def moved(self, now: float) -> None:
-        """Note that the camera moved."""
         self._moved_at, self._stale = now, True
 
     def changed(self) -> None:
@@ -93,13 +90,9 @@ class Pace:
         self._stale = False
 
     def size(self, kind: Kind, width: int, height: int, longest: int) -> tuple[int, int]:
-        """Choose a picture's width and height, px, of the window's shape.
+        """Choose a picture's width and height, px, of the window's shape: quick ones are as large as the time allows.
 
-        Args:
-            kind: quick ones are as large as the time allows.
-            width: of the window, px.
-            height: likewise.
-            longest: the longer side of a sharp picture, px.
+        `longest` is the longer side of a sharp picture, px.
         """
         width, height = max(width, 1), max(height, 1)
         scale = min(1.0, longest / max(width, height))
@@ -125,23 +118,13 @@ class Stand:
 
 
 def stands_of(cameras: Sequence[PageCamera], photos: Sequence[np.ndarray | None], means: Any) -> list[Stand]:
-    """Make places to look from of cameras and their photographs.
-
-    Args:
-        cameras: one or more.
-        photos: as many, uint8 [H, W, 3] or None.
-        means: centres of the Gaussians. [N, 3]
-    """
+    """Make places to look from of cameras and their photographs, uint8 [H, W, 3] or None."""
     distances = view_distances(cameras, means)
     return [Stand(*entry) for entry in zip(cameras, distances, photos, strict=True)]
 
 
 def require_viser() -> Any:
-    """Import viser.
-
-    Raises:
-        PopError: it is absent or broken; says how to get it.
-    """
+    """Import viser; a PopError says how to get it where it is absent or broken."""
     try:
         # by name: type checkers run without it
         return importlib.import_module("viser")
@@ -161,13 +144,6 @@ class LiveViewer:
 
     Raises:
         PopError: viser is absent, or the address cannot be listened on.
-
-    Example:
-        with LiveViewer(scene, stands, "garden") as viewer:
-            print(viewer.url)
-            while True:
-                viewer.wait()
-                viewer.draw_due()
     """
 
     def __init__(
@@ -210,7 +186,6 @@ class LiveViewer:
 
     @property
     def watched(self) -> bool:
-        """Whether a browser is connected."""
         return bool(self._views)
 
     def show(self, scene: SplatScene, note: str = "") -> None:
@@ -227,13 +202,9 @@ class LiveViewer:
         self._wake.clear()
 
     def draw_due(self, share: float = 1.0) -> int:
-        """Draw what is due, at most one picture a browser; an error closes the browser's view.
+        """Draw what is due, at most one picture a browser, and return how many; an error closes the browser's view.
 
-        Args:
-            share: of the time that drawing may take; until it is so much, nothing is drawn.
-
-        Returns:
-            How many pictures were drawn.
+        Drawing may take a share of the time; until it is so much, nothing is drawn.
         """
         begun = time.monotonic()
         if begun < self._free_at:
@@ -243,7 +214,6 @@ class LiveViewer:
         return drawn
 
     def close(self) -> None:
-        """End the server."""
         with redirect_stdout(io.StringIO()):
             self._server.stop()
 
@@ -305,8 +275,7 @@ def pose_at(stand: Stand) -> tuple[Any, Any, Any, float]:
     """Return position, look-at point, up direction and vertical angle (radians) of a place to look from."""
     camera = stand.camera
     forward, up = camera.viewmat[2, :3], -camera.viewmat[1, :3]
-    fov = float(2.0 * np.arctan2(camera.height / 2.0, camera.K[1, 1]))
-    return camera.eye, camera.eye + stand.distance * forward, up, fov
+    return camera.eye, camera.eye + stand.distance * forward, up, field_of_view(camera.K, camera.height)
 
 
 class _View:
@@ -320,9 +289,7 @@ class _View:
         names = [stand.camera.name for stand in self._stands]
         transform, rules = viewer._scene.world_transform, viewer._guard.rules
         self.panel = Panel(client, names, viewer._title, viewer.box, transform, rules, self._held)
-        self.panel.on_change(self._changed)
-        self.panel.on_stand(self.look_from)
-        self.panel.on_frustums(self._show_frustums)
+        self.panel.changed, self.panel.stand, self.panel.frustums = self._changed, self.look_from, self._show_frustums
         client.camera.on_update(self._held(self._moved))
 
     def look_from(self, index: int) -> None:
@@ -402,7 +369,7 @@ class _View:
         wxyz, position = pose_of_viewmat(camera.viewmat)
         added = self._client.scene.add_camera_frustum(
             f"/cameras/{index}",
-            fov=float(2.0 * np.arctan2(camera.height / 2.0, camera.K[1, 1])),
+            fov=field_of_view(camera.K, camera.height),
             aspect=camera.width / camera.height,
             scale=0.06 * stand.distance,
             thickness=0.001 * stand.distance,

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 from pop_fast.lazy import given_by
 
 if TYPE_CHECKING:
-    from pop_fast.view.report.page import write_report
+    from pop_fast.view.report.source import write_report
 
 __all__ = ["write_report"]
 
 # training colours its pictures with a module of this package, long before there is anything to report
-__getattr__ = given_by(__name__, {"page": ("write_report",)})
+__getattr__ = given_by(__name__, {"source": ("write_report",)})

@@ -16,12 +16,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pop_fast.data.capture import Capture, View
-from pop_fast.data.exposure_drift import GAMMA
-from pop_fast.data.normalize import neighbour_degrees
+from pop_fast.data.capture import Capture, View, neighbour_degrees
+from pop_fast.data.photo_quality import GAMMA
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
-from pop_fast.io.pictures import fit
+from pop_fast.io.images import fit, to_uint8
 from pop_fast.io.read_back import read_json
 from pop_fast.stages.appearance import expose
 from pop_fast.train.config import TrainConfig
@@ -59,42 +58,34 @@ _FIX: Final = "write it again with 'pop report --check', or remove the file"
 
 @dataclass(frozen=True)
 class Checks:
-    """What was measured.
+    """What was measured."""
 
-    Attributes:
-        photographs: training views there are.
-        train_psnr: mean over the training views that were rendered, dB.
-        train_measured: how many these are.
-        held_out_psnr: mean over the held-out views, dB; None where there are none.
-        held_out: of each of these views, as `judged_psnr` takes them, dB.
-        matched_psnr: the mean after each channel of each render was scaled to its photograph's brightness, dB.
-        neighbour_degrees: median over the training cameras of the angle to the nearest other one, seen from the point
-            that they look at.
-        stops: how much brighter each photograph is than its render, in stops of exposure, by view.
-        floaters: share of each held-out view's pixels (training views where none is held out) that Gaussians cover by a
-            tenth or more which are nearer than half the distance of the nearest points; empty without points.
-        orbit_floaters: the same of the views of the orbit, which stand between the photographs, by their number.
-        without_floaters: mean of `held_out` once Gaussians whose centres stand where floaters do are left out, dB; None
-            where there are none, or no such views.
-        misfits: share of each rendered training view that is far from its photograph where the rest is near.
-        steps: that were taken; None where an older version has measured.
-        exposures_learned: whether the run learned each training photograph's exposure, with which those views are
-            measured; `stops` are without.
-    """
-
-    photographs: int
-    train_psnr: float
-    train_measured: int
-    held_out_psnr: float | None = None
+    photographs: int  # training views there are
+    train_psnr: float  # mean over the training views that were rendered, dB
+    train_measured: int  # how many these are
+    held_out_psnr: float | None = None  # mean over the held-out views, dB; None where there are none
+    # of each of these views, as `judged_psnr` takes them, dB
     held_out: Mapping[str, float] = field(default_factory=dict)
+    # the mean after each channel of each render was scaled to its photograph's brightness, dB
     matched_psnr: float | None = None
+    # median over the training cameras of the angle to the nearest other one, seen from the point that they look
+    # at
     neighbour_degrees: float | None = None
+    # how much brighter each photograph is than its render, in stops of exposure, by view
     stops: Mapping[str, float] = field(default_factory=dict)
+    # share of each held-out view's pixels (training views where none is held out) that Gaussians cover by a
+    # tenth or more which are nearer than half the distance of the nearest points; empty without points
     floaters: Mapping[str, float] = field(default_factory=dict)
+    # the same of the views of the orbit, which stand between the photographs, by their number
     orbit_floaters: Mapping[str, float] = field(default_factory=dict)
+    # mean of `held_out` once Gaussians whose centres stand where floaters do are left out, dB; None where there
+    # are none, or no such views
     without_floaters: float | None = None
+    # share of each rendered training view that is far from its photograph where the rest is near
     misfits: Mapping[str, float] = field(default_factory=dict)
-    steps: int | None = None
+    steps: int | None = None  # that were taken; None where an older version has measured
+    # whether the run learned each training photograph's exposure, with which those views are measured; `stops`
+    # are without
     exposures_learned: bool = False
 
     @property
@@ -112,17 +103,7 @@ def write_checks(
     backend: Any,
     step: int,
 ) -> Checks:
-    """Measure a splat and write what a report shows of it.
-
-    Args:
-        folder: the result folder.
-        capture: in the frame of the splat.
-        params: raw parameters.
-        config: of the run.
-        sh_degree: highest active colour band.
-        backend: what renders.
-        step: the last step taken, from 0; it names the files.
-    """
+    """Measure a splat, whose last step names the files, and write what a report shows of it."""
     results = ResultFolder(folder)
 
     def looked(view: View, chosen: Mapping[str, Tensor] = params) -> Layers:
@@ -171,7 +152,9 @@ def write_checks(
     text = json.dumps(asdict(checks), indent=2) + "\n"
     target = folder / "report_data" / f"checks_step{step}.json"
     write_atomically(target, lambda file: file.write(text.encode()))
-    _film(folder / "videos" / f"orbit_step{step}.webm", turn, looked)
+    with VideoFile(folder / "videos" / f"orbit_step{step}.webm", _ORBIT_FPS) as video:
+        for view in turn:
+            video.add(to_uint8(looked(view).image))
     return checks
 
 
@@ -179,19 +162,14 @@ def _keep_picture(results: ResultFolder, stem: str, view: View, layers: Layers) 
     """Write what the report shows of a view that measurements kept no pictures of."""
     tensors = ViewTensors.of(view)
     found = measure(torch.from_numpy(layers.image), tensors.target(), tensors.mask)
-    render = np.round(np.clip(layers.image, 0.0, 1.0) * 255.0).astype(np.uint8)
+    render = to_uint8(layers.image)
     results.write_arrays(stem, name=view.name, render=render, photo=view.image, psnr=found.psnr, ssim=found.ssim)
 
 
 def near_limit(view: View, points: np.ndarray) -> float | None:
     """Give the camera z up to which nothing was photographed: half that of the nearest points in the picture.
 
-    Args:
-        view: the camera.
-        points: of the capture, world. [P, 3]
-
-    Returns:
-        The limit, world units; None where too few points are in the picture to tell.
+    None where too few of the points [P, 3] are in the picture to tell.
     """
     # a row of numbers for each axis: of hundreds of views and as many thousand points, that takes a fifth of the time
     seen = view.viewmat[:3, :3] @ points.T + view.viewmat[:3, 3:]
@@ -213,20 +191,10 @@ def nearer_than(params: Mapping[str, Tensor], view: View, limit: float) -> dict[
 
 
 def are_floaters(means: Tensor, capture: Capture, test_every: int) -> Tensor:
-    """Tell which centres stand in the picture of a photograph's or the orbit's camera where nothing was photographed.
+    """Tell which centres [N, 3] stand in the picture of a photograph's or the orbit's camera too near to it. bool [N]
 
-    What reaches into such a picture from outside of it stays: of that, much is seen well by other photographs.
-
-    Args:
-        means: world. [N, 3]
-        capture: in the same frame, with its own sparse points.
-        test_every: as `Capture.train_views`; held-out cameras look too.
-
-    Returns:
-        bool [N]
-
-    Raises:
-        PopError: the points are random ones, which say nothing of where things are.
+    What reaches into such a picture from outside of it stays: of that, much is seen well by other photographs. Held-out
+    cameras look too. Random points say nothing of where things are, and a PopError says so.
     """
     if _RANDOM in capture.source:
         raise PopError(f"{capture.name}: has no sparse points of its own, without which floaters are not told from it")
@@ -246,11 +214,7 @@ def are_floaters(means: Tensor, capture: Capture, test_every: int) -> Tensor:
 
 def stops_between(photo: np.ndarray, render: np.ndarray) -> float:
     """Tell how much brighter a photograph is than a render, in stops: the median over pixels that are neither very dark
-    nor nearly white; 0 where there are none.
-
-    Args:
-        photo: in [0, 1]. [P, 3]
-        render: likewise. [P, 3]
+    nor nearly white; 0 where there are none. Both are in [0, 1]. [P, 3]
     """
     theirs, ours = photo.mean(axis=1), render.mean(axis=1)
     telling = (np.minimum(ours, theirs) > _DARK) & (np.maximum(ours, theirs) < 1.0 - _DARK)
@@ -260,12 +224,8 @@ def stops_between(photo: np.ndarray, render: np.ndarray) -> float:
 def misfit_share(view: View, render: np.ndarray) -> float:
     """Tell which share of a photograph is far from its render while most of it is near: what moved, or mirrors.
 
-    Args:
-        view: the photograph; what its mask leaves out does not count.
-        render: in [0, 1]. [H, W, 3]
-
-    Returns:
-        Blocks whose mean error is six times the median block's and 0.06 or more, of all blocks.
+    Blocks whose mean error is six times the median block's and 0.06 or more, of all blocks; what a mask leaves out does
+    not count.
     """
     error = np.abs(render - view.image[..., :3] / np.float32(255.0)).mean(axis=2)
     kept = np.ones_like(error) if view.mask is None else view.mask.astype(error.dtype)
@@ -336,18 +296,8 @@ def orbit_views(train: Sequence[View]) -> list[View]:
     return [View(f"frame {i} of the orbit", blank, viewmat, K) for i, viewmat in enumerate(path)]
 
 
-def _film(path: Path, views: Sequence[View], looked: Any) -> None:
-    with VideoFile(path, _ORBIT_FPS) as video:
-        for view in views:
-            video.add(np.round(np.clip(looked(view).image, 0.0, 1.0) * 255.0).astype(np.uint8))
-
-
 def read_checks(path: Path) -> Checks:
-    """Read checks_step{step}.json.
-
-    Raises:
-        PopError: it is damaged; names the entry.
-    """
+    """Read checks_step{step}.json; a PopError names the entry that is damaged."""
     entry = read_json(path, _FIX)
     by_view = {"held_out", "stops", "floaters", "orbit_floaters", "misfits"}
     for name, value in entry.items():

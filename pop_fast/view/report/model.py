@@ -11,11 +11,11 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from pop_fast.data.normalize import FAR_APART
+from pop_fast.data.capture import FAR_APART
 from pop_fast.data.photo_quality import FEW
 from pop_fast.train.automatic import LOOKS
+from pop_fast.view.document import Window
 from pop_fast.view.report.checks import Checks
-from pop_fast.view.report.curves import Window
 from pop_ref.settings import Recipe
 
 # training views are always matched better, dB
@@ -42,18 +42,12 @@ Kind = Literal["good", "look", "bad"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One sentence of the verdict.
+    """One sentence of the verdict."""
 
-    Attributes:
-        kind: whether it is as it should be, worth a look, or what spoils the result.
-        about: what it is about, in a word or two.
-        text: the sentence.
-        next: what to type after `pop`, where it is not good; DATA is the capture and RESULT the result's folder.
-    """
-
-    kind: Kind
-    about: str
-    text: str
+    kind: Kind  # whether it is as it should be, worth a look, or what spoils the result
+    about: str  # what it is about, in a word or two
+    text: str  # the sentence
+    # what to type after `pop`, where it is not good; DATA is the capture and RESULT the result's folder
     next: tuple[str, ...] = ()
 
 
@@ -334,48 +328,32 @@ class ReportView:
 
 @dataclass(frozen=True)
 class ReportData:
-    """All that the page shows.
+    """All that the page shows."""
 
-    Attributes:
-        title: the result's name.
-        subtitle: method, capture, date: one line.
-        headline: the tiles at the top.
-        curves: name -> (iterations, values); names are those of `pop_fast.view.report.page`.
-        max_steps: iterations of the whole run.
-        windows: shaded stretches of the schedule.
-        resets: iterations of opacity resets.
-        histograms: opacities at the start, in the middle, at the end.
-        dominant: a view's dominant ids and its render, when they were kept.
-        views: held-out views, the worst first.
-        n_held_out: how many held-out views were measured.
-        config: setting -> value, in reading order.
-        changes: one mapping a densification step or reset.
-        files: a row a file format: name, size, bytes a Gaussian, share of the PLY's size, PSNR.
-        viewer: the page that shows the splat.
-        verdict: how it went, in sentences.
-        checked: whether what the verdict needs was measured.
-        orbit: a video of a turn about the scene, and what it is called in the folder.
-        commands: what was typed, and in which folder.
-        links: files of the folder that are worth opening: name, path in the folder, size in bytes.
-    """
-
-    title: str
-    subtitle: str
-    headline: Sequence[Tile]
+    title: str  # the result's name
+    subtitle: str  # method, capture, date: one line
+    headline: Sequence[Tile]  # the tiles at the top
+    # name -> (iterations, values); names are those of `pop_fast.view.report.page`
     curves: Mapping[str, tuple[Sequence[float], Sequence[float]]]
-    max_steps: int
-    windows: Sequence[Window] = field(default_factory=tuple)
-    resets: Sequence[int] = field(default_factory=tuple)
+    max_steps: int  # iterations of the whole run
+    windows: Sequence[Window] = field(default_factory=tuple)  # shaded stretches of the schedule
+    resets: Sequence[int] = field(default_factory=tuple)  # iterations of opacity resets
+    # opacities at the start, in the middle, at the end
     histograms: Sequence[Histogram] = field(default_factory=tuple)
+    # a view's dominant ids and its render, when they were kept
     dominant: tuple[str, np.ndarray, np.ndarray] | None = None
-    views: Sequence[ReportView] = field(default_factory=tuple)
-    n_held_out: int | None = None
-    config: Mapping[str, Any] = field(default_factory=dict)
+    views: Sequence[ReportView] = field(default_factory=tuple)  # held-out views, the worst first
+    n_held_out: int | None = None  # how many held-out views were measured
+    config: Mapping[str, Any] = field(default_factory=dict)  # setting -> value, in reading order
+    # one mapping a densification step or reset
     changes: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
+    # a row a file format: name, size, bytes a Gaussian, share of the PLY's size, PSNR
     files: Sequence[Sequence[str]] = field(default_factory=tuple)
-    viewer: str | None = None
-    verdict: Sequence[Finding] = field(default_factory=tuple)
-    checked: bool = False
+    viewer: str | None = None  # the page that shows the splat
+    verdict: Sequence[Finding] = field(default_factory=tuple)  # how it went, in sentences
+    checked: bool = False  # whether what the verdict needs was measured
+    # a video of a turn about the scene, and what it is called in the folder
     orbit: tuple[str, bytes] | None = None
-    commands: Sequence[tuple[str, str]] = field(default_factory=tuple)
+    commands: Sequence[tuple[str, str]] = field(default_factory=tuple)  # what was typed, and in which folder
+    # files of the folder that are worth opening: name, path in the folder, size in bytes
     links: Sequence[tuple[str, str, int]] = field(default_factory=tuple)

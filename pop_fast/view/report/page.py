@@ -2,30 +2,18 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping, Sequence
 from html import escape
-from pathlib import Path
 from typing import Any, Final
+from urllib.parse import quote
 
 import numpy as np
 
-from pop_fast.io import pictures
-from pop_fast.io.atomic import write_atomically
-from pop_fast.view.document import asset, document
-from pop_fast.view.report.curves import Chart, Series, draw, draw_histogram
-from pop_fast.view.report.model import Histogram, ReportData, Tile
-from pop_fast.view.report.sections import (
-    command_section,
-    is_framed,
-    open_section,
-    orbit_section,
-    sizes_section,
-    verdict_section,
-    viewer_script,
-    viewer_section,
-    views_section,
-)
-from pop_fast.view.report.source import read_result
+from pop_fast.io import images
+from pop_fast.train.results import shell_line
+from pop_fast.view.document import Chart, Series, asset, document, draw, draw_histogram
+from pop_fast.view.report.model import Finding, Histogram, ReportData, ReportView, Tile
 
 # (title, ((curve, legend, colour, dots), ...), log axis, axis from zero, unit)
 _CHARTS: Final = (
@@ -55,7 +43,6 @@ _CHARTS: Final = (
 
 
 def page(data: ReportData) -> str:
-    """Lay out the whole page."""
     body = "".join(
         [
             f"<header><h1>{escape(data.title)}</h1><p>{escape(data.subtitle)}</p></header>",
@@ -142,7 +129,7 @@ def _dominance(data: ReportData) -> str:
     name, ids, render = data.dominant
     n_owners = len(np.unique(ids[ids >= 0]))
     share = 100.0 * float((ids >= 0).mean())
-    ids_uri = pictures.data_uri(pictures.fit(pictures.id_colors(ids), nearest=True), lossless=True)
+    ids_uri = images.data_uri(images.fit(images.id_colors(ids), nearest=True), lossless=True)
     return (
         "<h2>Who owns each pixel</h2>"
         "<p>The dominant Gaussian of a pixel is the one with the largest blending weight there. "
@@ -150,7 +137,7 @@ def _dominance(data: ReportData) -> str:
         '<div class="view"><div class="pair">'
         f'<figure><img class="ids" alt="dominant Gaussians of {escape(name)}" src="{ids_uri}">'
         f'<figcaption class="caption">{n_owners:,} Gaussians own {share:.1f} % of the pixels</figcaption></figure>'
-        f'<figure><img alt="render of {escape(name)}" src="{pictures.data_uri(pictures.fit(render))}">'
+        f'<figure><img alt="render of {escape(name)}" src="{images.data_uri(images.fit(render))}">'
         f'<figcaption class="caption">{escape(name)}</figcaption></figure></div></div>'
     )
 
@@ -193,18 +180,178 @@ def _cell(value: Any) -> str:
     return str(value)
 
 
-def write_report(result_dir: str | Path) -> Path:
-    """Write report.html into a result folder, from the files in it alone.
+# a video that is larger than this is linked, not put into the report
+_LARGEST_FILM: Final = 8 * 2**20
+_SIGNS: Final = {"good": ("✓", "as it should be"), "look": ("!", "worth a look"), "bad": ("✗", "spoils the result")}
+_UNCHECKED: Final = (
+    "<p>Overfitting, exposure, floaters, depth and the orbit were not looked at; "
+    "<code>pop report RESULT --check</code> does it, where the capture is.</p>"
+)
 
-    Returns:
-        The page's path.
 
-    Raises:
-        PopError: the folder is not a result of `pop train`, or one of its files cannot be read.
+def verdict_section(findings: Sequence[Finding], checked: bool) -> str:
+    if not findings and checked:
+        return ""
+    rows = "".join(
+        f'<li class="{finding.kind}"><i title="{_SIGNS[finding.kind][1]}">{_SIGNS[finding.kind][0]}</i>'
+        f"<b>{escape(finding.about)}</b><span>{escape(finding.text)}{_to_type(finding)}</span></li>"
+        for finding in findings
+    )
+    return f'<h2>Verdict</h2>{"" if checked else _UNCHECKED}<ul class="verdict">{rows}</ul>'
+
+
+def _to_type(finding: Finding) -> str:
+    return f" <code>{escape(shell_line(['pop', *finding.next]))}</code>" if finding.next else ""
+
+
+def orbit_section(orbit: tuple[str, bytes] | None) -> str:
+    if orbit is None:
+        return ""
+    path, data = orbit
+    about = "A turn about what the cameras look at, as far round as photographs were taken; where they look at no one "
+    about += "thing, as on a walk or in a room, a path through them."
+    if len(data) > _LARGEST_FILM:
+        return f"<h2>The orbit</h2><p>{about} {_link(path, path)}, {len(data) / 1e6:.0f} MB.</p>"
+    uri = f"data:video/webm;base64,{base64.b64encode(data).decode('ascii')}"
+    return (
+        f"<h2>The orbit</h2><p>{about}</p>"
+        f'<video class="orbit" controls loop muted playsinline aria-label="orbit" src="{uri}"></video>'
+    )
+
+
+def open_section(links: Sequence[tuple[str, str, int]]) -> str:
+    if not links:
+        return ""
+    rows = "".join(
+        f"<tr><td>{escape(name)}</td><td>{_link(path, path)}</td><td class=n>{_size(size)}</td></tr>"
+        for name, path, size in links
+    )
+    return f'<h2>Beside this page</h2><div class="scroll"><table><tbody>{rows}</tbody></table></div>'
+
+
+def command_section(commands: Sequence[tuple[str, str]]) -> str:
+    if not commands:
+        return ""
+    lines = "".join(
+        f'<pre class="command">{escape(line)}</pre><p class="caption">in {escape(folder)}</p>'
+        for line, folder in commands
+    )
+    later = " The first began the run, the others resumed it." if len(commands) > 1 else ""
+    return f"<h2>The command</h2><p>What made this result.{later}</p>{lines}"
+
+
+def _link(path: str, words: str) -> str:
+    return f'<a href="{escape(quote(path, errors="surrogateescape"))}">{escape(words)}</a>'
+
+
+def _size(size: int) -> str:
+    return f"{size / 1e6:.2f} MB" if size >= 1e5 else f"{size / 1e3:.1f} kB"
+
+
+# a page that is larger than this is linked, not put into the report
+_LARGEST: Final = 16 * 2**20
+
+
+def viewer_script() -> str:
+    return asset("html", "viewer.js")
+
+
+def is_framed(page: str | None) -> bool:
+    """Tell whether the report shows that page in a frame: where it is not too large, and has this version's script.
+
+    A page that another version or another program has written is opened by itself: the report lets no script run but
+    those of this package.
     """
-    folder = Path(result_dir)
-    # a name that is no text is shown with escapes
-    html = page(read_result(folder)).encode("utf-8", "backslashreplace")
-    target = folder / "report.html"
-    write_atomically(target, lambda file: file.write(html))
-    return target
+    return page is not None and len(page) <= _LARGEST and f"<script>{viewer_script()}</script></body>" in page
+
+
+def viewer_section(page: str | None) -> str:
+    """Show the page that shows the splat, in a frame of its own; nothing where there is none."""
+    if page is None:
+        return ""
+    about = "Drag, pinch or use the arrows; it starts at a training camera. The same page lies beside this report as "
+    about += '<a href="viewer.html">viewer.html</a>.'
+    if not is_framed(page):
+        return f'<h2>The splat</h2><p>{len(page) / 1e6:.0f} MB, in <a href="viewer.html">viewer.html</a>.</p>'
+    return (
+        f"<h2>The splat</h2><p>{about}</p>"
+        '<iframe class="viewer" title="the splat" loading="lazy" allow="fullscreen" '
+        f'srcdoc="{escape(page)}"></iframe>'
+    )
+
+
+def sizes_section(table: Sequence[Sequence[str]]) -> str:
+    """Tell what the splat weighs in every format, and what it then is worth, from heads and rows."""
+    if not table:
+        return ""
+    heads, *rows = table
+    head = "".join(f"<th{'' if k == 0 else ' class=n'}>{name}</th>" for k, name in enumerate(heads))
+    body = "".join(
+        "<tr>"
+        + "".join(f"<td{'' if k == 0 else ' class=n'}>{escape(cell)}</td>" for k, cell in enumerate(row))
+        + "</tr>"
+        for row in rows
+    )
+    return (
+        "<h2>Files</h2><p>The splat in every format that <code>pop export --to FORMAT</code> writes, and the PSNR of "
+        "some held-out views when it is read back from there.</p>"
+        f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    )
+
+
+def views_section(views: Sequence[ReportView], n_held_out: int | None) -> str:
+    """Show held-out views, the worst first, of all that were measured."""
+    if not views:
+        return ""
+    errors = [images.error_magnitude(view.render, view.photo) for view in views]
+    top = images.error_scale(errors)
+    near, far = images.depth_range([view.depth for view in views if view.depth is not None])
+    rows = [_view(view, error, top, near, far) for view, error in zip(views, errors, strict=True)]
+    some = f" Pictures of {len(views)} of {n_held_out}." if n_held_out is not None and n_held_out > len(views) else ""
+    legend = _bar("error", images.colorbar_css(), "0", f"{255 * top:.0f} of 255 and more")
+    if any(view.depth is not None for view in views):
+        legend += _bar(
+            "depth",
+            images.colorbar_css(images.DEPTH_COLORS),
+            f"{near:.3g}",
+            f"{far:.3g} units of the capture, logarithmic",
+        )
+    return (
+        "<h2>Held-out views, the worst first</h2><p>Photographs that training never saw: drag the line between "
+        "photograph and render. Error is the mean over the channels of |render − photo|; depth is the mean of what a "
+        f"pixel blends, grey where nothing is; one scale for all views.{some}</p>"
+        f'<div class="bars">{legend}</div><div class="views">{"".join(rows)}</div>'
+    )
+
+
+def _view(view: ReportView, error: np.ndarray, top: float, near: float, far: float) -> str:
+    name = escape(view.name)
+    numbers = [] if view.psnr is None else [f"PSNR {view.psnr:.2f} dB"]
+    numbers += [] if view.ssim is None else [f"SSIM {view.ssim:.4f}"]
+    head = f"<b>{name}</b>" + "".join(f'<span class="num">{text}</span>' for text in numbers)
+    height, width = view.photo.shape[:2]
+    beside = [_figure("error", name, images.error_picture(error, top))]
+    if view.depth is not None:
+        beside.append(_figure("depth", name, images.depth_picture(view.depth, near, far)))
+    slider = (
+        f'<figure class="slider" style="aspect-ratio:{width}/{height}">'
+        f'<img alt="photo of {name}" src="{images.data_uri(images.fit(view.photo))}">'
+        f'<img class="over" alt="render of {name}" src="{images.data_uri(images.fit(view.render))}">'
+        '<span class="left">photograph</span><span class="right">render</span><i></i>'
+        f'<input type="range" min="0" max="100" step="0.5" value="50" aria-label="photograph against render, {name}">'
+        "</figure>"
+    )
+    kind = "tall" if height > width else "wide"
+    return f'<div class="view"><p>{head}</p><div class="looks {kind}">{slider}{"".join(beside)}</div></div>'
+
+
+def _figure(what: str, name: str, picture: np.ndarray) -> str:
+    uri = images.data_uri(images.fit(picture))
+    return (
+        f'<figure><img loading="lazy" alt="{what} of {name}" src="{uri}">'
+        f'<figcaption class="caption">{what}</figcaption></figure>'
+    )
+
+
+def _bar(what: str, colors: str, low: str, high: str) -> str:
+    return f'<div class="bar"><span>{what}</span>{low}<i style="background:{colors}"></i>{high}</div>'

@@ -1,4 +1,7 @@
-"""Read a result folder into what the report shows. Only files in the folder are read; what is absent is left out."""
+"""Read result folders into what a report shows, and into a row of a table of several results.
+
+Only files in the folder are read; what is absent is left out.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +15,17 @@ from typing import Any, Final
 import numpy as np
 
 from pop_fast.errors import PopError
+from pop_fast.io.atomic import write_atomically
 from pop_fast.io.read_back import check_record, parse_json, read_arrays, read_json
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import read_record
-from pop_fast.train.presets import METHODS, Given, words_of
+from pop_fast.train.presets import ALIASES, METHODS, Given, words_of
 from pop_fast.train.results import read_commands, read_config, shell_line
-from pop_fast.view.report.checks import Checks, read_checks
-from pop_fast.view.report.compare import threads_of
-from pop_fast.view.report.curves import Window
+from pop_fast.view.document import Window
+from pop_fast.view.report.checks import read_checks
 from pop_fast.view.report.model import Finding, Histogram, ReportData, ReportView, Tile, verdict
-from pop_fast.view.report.sections import checked_encodings, encoding_heads, encoding_rows
+from pop_fast.view.report.page import page
+from pop_fast.view.report.source import threads_of
 
 # float32 numbers of a Gaussian: as gsplat's checkpoints hold it, and as Inria's PLY does (with three zero normals)
 BYTES_CKPT: Final = 59 * 4
@@ -41,11 +45,7 @@ _SMOOTH: Final = 0.03  # width of the running means, as a share of the records
 
 
 def read_result(folder: Path) -> ReportData:
-    """Read all that the report shows of a result folder.
-
-    Raises:
-        PopError: the folder is not a result of `pop train`, or one of its files cannot be read.
-    """
+    """Read all that the report shows of a result folder."""
     config = read_config(folder)
     records = read_records(folder)
     stats = read_last_stats(folder)
@@ -54,10 +54,16 @@ def read_result(folder: Path) -> ReportData:
     views = _views(folder)
     dominant = _dominant(folder)
     changes = [record for record in records if "cloned" in record or "reset" in record]
-    curves, checks = _curves(records, folder), _checks(folder)
+    curves, checks = _curves(records, folder), None
+    if measured := _numbered(folder / "report_data", r"checks_step(\d+)\.json"):
+        checks = read_checks(measured[-1][1])
+    viewer = folder / "viewer.html"
+    fix = "train again with --resume, which measures them"
+    entries = checked_encodings(stats.get("encodings") or [], str(folder), fix)
+    held_out = f"{stats['views']} held-out views" if "views" in stats else ""
     return ReportData(
         title=f"{Path(config.data).resolve().name} · {method.split(' (')[0]}",
-        subtitle=" · ".join(filter(None, [method, _schedule_note(config), _views_note(stats), _machine(stats)])),
+        subtitle=" · ".join(filter(None, [method, _schedule_note(config), held_out, _machine(stats)])),
         headline=headline(stats),
         curves=curves,
         max_steps=config.max_steps,
@@ -69,8 +75,8 @@ def read_result(folder: Path) -> ReportData:
         n_held_out=stats.get("views"),
         config=_settings(config, folder),
         changes=[{key: change.get(key) for key in _CHANGE_COLUMNS} for change in changes],
-        files=_files(stats, str(folder)),
-        viewer=_viewer(folder),
+        files=[encoding_heads(entries), *encoding_rows(entries)] if entries else [],
+        viewer=_read(viewer).decode("utf-8", "replace") if viewer.is_file() else None,
         verdict=[typed(found, config, folder) for found in verdict(stats, checks, curves.get("psnr_val"))],
         checked=checks is not None,
         orbit=_orbit(folder),
@@ -113,21 +119,6 @@ _STEP_COUNTS: Final = frozenset({"max_steps", "eval_steps", "save_steps", "check
 
 
 _CHANGE_COLUMNS: Final = ("step", "cloned", "split", "pruned", "reset", "num_gaussians")
-
-
-def _files(stats: Mapping[str, Any], where: str) -> list[tuple[str, ...]]:
-    entries = checked_encodings(stats.get("encodings") or [], where, "train again with --resume, which measures them")
-    return [encoding_heads(entries), *encoding_rows(entries)] if entries else []
-
-
-def _viewer(folder: Path) -> str | None:
-    path = folder / "viewer.html"
-    return _read(path).decode("utf-8", "replace") if path.is_file() else None
-
-
-def _checks(folder: Path) -> Checks | None:
-    numbered = _numbered(folder / "report_data", r"checks_step(\d+)\.json")
-    return read_checks(numbered[-1][1]) if numbered else None
 
 
 def _orbit(folder: Path) -> tuple[str, bytes] | None:
@@ -189,26 +180,17 @@ def read_last_stats(folder: Path) -> dict[str, Any]:
 
 
 def read_stats(path: Path) -> dict[str, Any]:
-    """Read one file of statistics.
-
-    Raises:
-        PopError: it is damaged; names the entry.
-    """
+    """Read one file of statistics."""
     fix = "write it again with 'pop eval'"
     return check_record(read_json(path, fix), str(path), fix)
 
 
 def read_view(path: Path) -> dict[str, np.ndarray]:
-    """Read what a run has kept of a held-out view: its name, render, photo, psnr and ssim.
-
-    Raises:
-        PopError: the file is damaged; names the array.
-    """
+    """Read what a run has kept of a held-out view: its name, render, photo, psnr and ssim."""
     return read_arrays(path, _VIEW, _AGAIN)
 
 
 def headline(stats: Mapping[str, Any]) -> list[Tile]:
-    """Choose the numbers at the top of the page."""
     tiles: list[Tile] = []
     for key, label, form, unit in (("psnr", "PSNR", "{:.2f}", "dB"), ("ssim", "SSIM", "{:.4f}", "")):
         if stats.get(key) is not None:
@@ -254,10 +236,6 @@ def _schedule_note(config: TrainConfig) -> str:
     if given is None or given.scaler == 1.0:
         return steps
     return f"{steps} (preset {given.preset}, the paper's schedule times {given.scaler:g})"
-
-
-def _views_note(stats: Mapping[str, Any]) -> str:
-    return f"{stats['views']} held-out views" if "views" in stats else ""
 
 
 def _curves(records: Sequence[Mapping[str, Any]], folder: Path) -> dict[str, tuple[list[float], list[float]]]:
@@ -326,19 +304,14 @@ def _histograms(folder: Path, max_steps: int) -> Iterator[Histogram]:
 
 def _views(folder: Path) -> list[ReportView]:
     """Read the held-out views, the worst first."""
-    depths = dict(_depths(folder))
+    kept = (read_arrays(path, _DEPTH, _AGAIN) for path in _last_view_files(folder, "depth"))
+    depths = {str(found["name"]): found["depth"] for found in kept}
     views = []
     for path in _last_view_files(folder):
         a = read_view(path)
         name = str(a["name"])
         views.append(ReportView(name, a["render"], a["photo"], float(a["psnr"]), float(a["ssim"]), depths.get(name)))
     return sorted(views, key=lambda view: (view.psnr is None, view.psnr))
-
-
-def _depths(folder: Path) -> Iterator[tuple[str, np.ndarray]]:
-    for path in _last_view_files(folder, "depth"):
-        a = read_arrays(path, _DEPTH, _AGAIN)
-        yield str(a["name"]), a["depth"]
 
 
 def _dominant(folder: Path) -> tuple[str, np.ndarray, np.ndarray] | None:
@@ -374,3 +347,127 @@ def _settings(config: TrainConfig, folder: Path) -> dict[str, Any]:
         "scale_lambda_pop": given.scale_lambda_pop,
         **({"chosen by the run": "; ".join(record.chosen)} if record is not None and record.chosen else {}),
     } | config.flat()
+
+
+COLUMNS: Final = (
+    "capture",
+    "method",
+    "λ",
+    "steps",
+    "PSNR",
+    "SSIM",
+    "Gaussians",
+    "with opacity ≥ 1/255",
+    "per pixel: blended / traversed",
+    "opacity > 0.9 / < 0.1",
+    "seconds",
+    "machine",
+)
+_TEXT: Final = frozenset({"capture", "method", "machine"})
+
+
+def row(stats: Mapping[str, Any]) -> list[str]:
+    """Write one run's statistics (stats/val_step*.json) as the cells of a row; what is absent becomes a dash."""
+
+    def cell(form: str, *keys: str) -> str:
+        values = [stats.get(key) for key in keys]
+        return "–" if any(value is None for value in values) else form.format(*values)
+
+    steps = stats.get("step")
+    taken, planned = (steps or 0) + 1, stats.get("max_steps")
+    unfinished = f" of {planned:,}, unfinished" if isinstance(planned, int) and taken < planned else ""
+    method = str(stats.get("method", "–"))
+    machine = [str(stats.get("machine", "–")), *([stats["backend"]] if stats.get("backend") else [])]
+    machine += [threads_of(stats)] if "threads" in stats else []
+    return [
+        str(stats.get("capture", "–")),
+        METHODS[name].title.split(" (")[0] if (name := ALIASES.get(method, method)) in METHODS else method,
+        "–" if not stats.get("lambda_pop") else f"{stats['lambda_pop']:g}",
+        "–" if steps is None else f"{taken:,}{unfinished}",
+        cell("{:.2f}", "psnr"),
+        cell("{:.4f}", "ssim"),
+        cell("{:,}", "num_GS"),
+        cell("{:,}", "num_GS_above_floor"),
+        cell("{:.1f} / {:.1f}", "n_blended", "n_traversed"),
+        cell("{:.0%} / {:.0%}", "opacity_above_0.9", "opacity_below_0.1"),
+        cell("{:,.0f}", "seconds"),
+        ", ".join(machine),
+    ]
+
+
+def threads_of(stats: Mapping[str, Any]) -> str:
+    return f"{stats['threads']} thread{'' if stats['threads'] == 1 else 's'}"
+
+
+def markdown(rows: Sequence[Sequence[str]]) -> str:
+    """Lay rows out as a Markdown table, numbers to the right."""
+    rule = ["---" if name in _TEXT else "---:" for name in COLUMNS]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (COLUMNS, rule, *rows))
+
+
+def plain(rows: Sequence[Sequence[str]]) -> str:
+    """Lay rows out in columns for a terminal."""
+    table = [COLUMNS, *rows]
+    widths = [max(len(cells[i]) for cells in table) for i in range(len(COLUMNS))]
+    lines: list[str] = []
+    for cells in table:
+        padded = (
+            cell.ljust(width) if name in _TEXT else cell.rjust(width)
+            for name, cell, width in zip(COLUMNS, cells, widths, strict=True)
+        )
+        lines.append("  ".join(padded).rstrip())
+    return "\n".join(lines)
+
+
+_KINDS: Final[Mapping[str, tuple[type, ...]]] = {
+    "format": (str,),
+    "bytes": (int,),
+    "num_gaussians": (int,),
+    "psnr": (int, float, type(None)),
+    "views": (int,),
+}
+
+
+def checked_encodings(entries: Any, where: str, fix: str) -> list[dict[str, Any]]:
+    """Check the entry `encodings` of the statistics."""
+    if not isinstance(entries, list):
+        raise PopError(f"{where}: encodings is {type(entries).__name__}; it must be a list; {fix}")
+    for index, entry in enumerate(entries):
+        wrong = [
+            name
+            for name, kinds in _KINDS.items()
+            if not isinstance(entry, dict) or name not in entry or not isinstance(entry[name], kinds)
+        ]
+        if wrong:
+            raise PopError(f"{where}: encodings[{index}].{wrong[0]} is absent or of the wrong kind; {fix}")
+    return entries
+
+
+def encoding_heads(encodings: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    """Return the heads of a table of encodings; few of many held-out views are rendered, and the last head says so."""
+    views = max((entry["views"] for entry in encodings), default=0)
+    return "format", "MB", "B/Gaussian", "of the PLY", f"PSNR of {views} held-out view{'' if views == 1 else 's'}"
+
+
+def encoding_rows(encodings: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
+    """Return a row a format: name, MB, bytes a Gaussian, share of the PLY's size, PSNR and how far from the PLY's."""
+    whole = next((entry for entry in encodings if entry["format"] == "ply"), None)
+    rows = []
+    for entry in encodings:
+        share = f"1/{whole['bytes'] / max(entry['bytes'], 1):.1f}" if whole else ""
+        psnr = "" if entry["psnr"] is None else f"{entry['psnr']:.2f} dB"
+        if entry is not whole and whole and None not in (entry["psnr"], whole["psnr"]):
+            psnr += f" ({entry['psnr'] - whole['psnr']:+.2f})"
+        each = f"{entry['bytes'] / max(entry['num_gaussians'], 1):.1f}"
+        rows.append((entry["format"], f"{entry['bytes'] / 1e6:.2f}", each, share, psnr))
+    return rows
+
+
+def write_report(result_dir: str | Path) -> Path:
+    """Write report.html into a result folder, from the files in it alone, and return its path."""
+    folder = Path(result_dir)
+    # a name that is no text is shown with escapes
+    html = page(read_result(folder)).encode("utf-8", "backslashreplace")
+    target = folder / "report.html"
+    write_atomically(target, lambda file: file.write(html))
+    return target

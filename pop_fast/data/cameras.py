@@ -1,15 +1,22 @@
-"""What readers of camera files share: numbers by field, poses of either handedness, rotations, Brown's lenses."""
+"""Cameras as files describe them: numbers by field, poses of either handedness, rotations, pinholes, Brown's lenses.
+
+Cameras without distortion need no COLMAP: a capture of pinholes loads where pycolmap is not installed.
+"""
 
 from __future__ import annotations
 
 import math
+import signal
+import sys
+import threading
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 import numpy as np
 
 from pop_fast.errors import CaptureError
-from pop_fast.io.ply_rows import FARTHEST
+from pop_fast.io.ply import FARTHEST
 
 # files hold single precision or a few digits; anything further off is another kind of matrix
 _TOLERANCE = 1e-3
@@ -18,10 +25,7 @@ _SHORTEST = 1e-6
 
 
 def nearest_rigid(matrix: np.ndarray) -> np.ndarray:
-    """Return the rigid matrix nearest to `matrix`: R = U V^T of its singular value decomposition.
-
-    Args:
-        matrix: float64 [4, 4]; rigid but for the rounding of a file.
+    """Return the rigid matrix nearest to `matrix` [4, 4], R = U V^T of its singular value decomposition. float64 [4, 4]
 
     Raises:
         ValueError: NaN, Inf or an absurd distance, a last row other than 0 0 0 1, a scale, shear or reflection. The
@@ -50,11 +54,7 @@ def nearest_rigid(matrix: np.ndarray) -> np.ndarray:
 
 
 def rigid_from_quat(quat: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """Build [R t; 0 1] from a quaternion of any norm, R that of quat / |quat|. float64 [4, 4]
-
-    Args:
-        quat: wxyz. float64 [4]
-        translation: float64 [3]
+    """Build [R t; 0 1] from a quaternion wxyz of any norm, R that of quat / |quat|. float64 [4, 4]
 
     Raises:
         ValueError: NaN or Inf, a quaternion of norm zero, or an absurd distance.
@@ -95,23 +95,16 @@ _OPENGL: Final = np.array([1.0, -1.0, -1.0])
 
 
 class Numbers:
-    """Look fields up as finite numbers, or say which is none.
+    """A function that gives fields of a file by name, and refuses those that are no finite numbers.
 
-    Args:
-        where: file and place in it, for errors.
-        fields: by name; values are numbers, or texts of numbers where `texts` allows these.
-        texts: take texts, as in XML and CSV.
+    `where` is file and place in it, for errors; values may be texts of numbers where `texts` is set, as in XML and CSV.
     """
 
     def __init__(self, where: str, fields: Mapping[str, Any], texts: bool = False) -> None:
         self.where, self.fields, self._texts = where, fields, texts
 
     def __call__(self, name: str, default: float | None = None) -> float:
-        """Return a field.
-
-        Raises:
-            CaptureError: it is absent and has no default, or is no finite number.
-        """
+        """Return a field, or its default; a CaptureError says that there is neither, or no finite number."""
         value = self.fields.get(name, default)
         refused = bool if self._texts else bool | str
         try:
@@ -130,29 +123,22 @@ def shortened(value: object) -> str:
 
 
 def check_size(where: str, width: float, height: float) -> tuple[int, int]:
-    """Return a photograph's size as whole numbers.
-
-    Raises:
-        CaptureError: it is none that a photograph has.
-    """
+    """Return a photograph's size as whole numbers; a CaptureError refuses one that no photograph has."""
     if not (1 <= width <= WIDEST and 1 <= height <= WIDEST):
         raise CaptureError(f"{where}: size is {width:g} x {height:g}; both must be at least 1 and at most {WIDEST}")
     return int(width), int(height)
 
 
 def viewmat_from_pose(where: str, pose: np.ndarray, opengl: bool) -> np.ndarray:
-    """Invert a camera-to-world matrix.
+    """Invert a rigid camera-to-world matrix [4, 4]; a CaptureError of one that is not rigid begins with `where`.
 
     Args:
-        where: file and field, for errors.
-        pose: rigid. float64 [4, 4]
+        where: file and field.
+        pose: the matrix.
         opengl: the camera's axes are OpenGL's (+y up, -z forward) in the place of OpenCV's.
 
     Returns:
         World -> camera, OpenCV. float64 [4, 4]
-
-    Raises:
-        CaptureError: the matrix is not rigid.
     """
     try:
         pose = nearest_rigid(pose)
@@ -170,9 +156,7 @@ def brown_lens(
 ) -> tuple[Literal["PINHOLE", "OPENCV", "FULL_OPENCV"], list[float]]:
     """Choose COLMAP's smallest model for Brown's distortion, and its parameters after the pinhole's four.
 
-    Args:
-        radial: k1, k2, k3.
-        tangential: p1, p2 as OpenCV has them: x gains 2 p1 x y + p2 (r^2 + 2 x^2).
+    Radial terms are k1, k2, k3; tangential ones p1, p2 as OpenCV has them: x gains 2 p1 x y + p2 (r^2 + 2 x^2).
     """
     k1, k2, k3 = radial
     if k3:
@@ -180,3 +164,72 @@ def brown_lens(
     if k1 or k2 or any(tangential):
         return "OPENCV", [k1, k2, *tangential]
     return "PINHOLE", []
+
+
+# COLMAP's name of a model: its number there, and where fx, fy, cx and cy stand among its parameters
+PINHOLES: Final = {"SIMPLE_PINHOLE": (0, (0, 0, 1, 2)), "PINHOLE": (1, (0, 1, 2, 3))}
+
+
+@dataclass(frozen=True, eq=False)
+class PinholeCamera:
+    """What is used of a `pycolmap.Camera`, under the same names: sizes, focal lengths and principal point in px."""
+
+    camera_id: int
+    model_name: str
+    width: int
+    height: int
+    params: np.ndarray  # as COLMAP orders them
+
+    def _param(self, which: int) -> float:
+        return float(self.params[PINHOLES[self.model_name][1][which]])
+
+    @property
+    def focal_length_x(self) -> float:
+        return self._param(0)
+
+    @property
+    def focal_length_y(self) -> float:
+        return self._param(1)
+
+    @property
+    def principal_point_x(self) -> float:
+        return self._param(2)
+
+    @property
+    def principal_point_y(self) -> float:
+        return self._param(3)
+
+    def mean_focal_length(self) -> float:
+        return 0.5 * (self.focal_length_x + self.focal_length_y)
+
+    def focal_length_idxs(self) -> list[int]:
+        return sorted(set(PINHOLES[self.model_name][1][:2]))
+
+    def img_from_cam(self, points: np.ndarray) -> np.ndarray:
+        """Project points in front of the camera: x = f X / Z + c. float64 [P, 3] -> float64 [P, 2]"""
+        focal = np.array([self.focal_length_x, self.focal_length_y])
+        return focal * (points[:, :2] / points[:, 2:]) + np.array([self.principal_point_x, self.principal_point_y])
+
+
+def require_colmap() -> Any:
+    """Import pycolmap, which knows the other camera models, and finds cameras; a CaptureError where it is absent."""
+    first = "pycolmap" not in sys.modules
+    try:
+        import pycolmap
+
+        if first and threading.current_thread() is threading.main_thread():
+            # its log takes SIGTERM to print where the program was
+            signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
+    except ImportError as error:
+        raise CaptureError(
+            f"pycolmap cannot be imported ({error}), which finds cameras and reads all with distortion; pip install "
+            f"pycolmap, or use photographs of known cameras of the models {', '.join(PINHOLES)}"
+        ) from error
+    return pycolmap
+
+
+def make_camera(camera_id: int, model: str, width: int, height: int, params: list[float]) -> Any:
+    """Build a camera whose fields are not judged yet: a `PinholeCamera`, or a `pycolmap.Camera` of any other model."""
+    if model in PINHOLES:
+        return PinholeCamera(camera_id, model, width, height, np.array(params, dtype=np.float64))
+    return require_colmap().Camera(camera_id=camera_id, model=model, width=width, height=height, params=params)

@@ -1,32 +1,37 @@
-"""The options that make a splat smaller on its way into a file, and how they are applied."""
+"""Options of several subcommands: which capture to look at, and what to leave out of a splat on its way into a file."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final, Literal
+
+import tyro
 
 from pop_fast.errors import PopError
-from pop_fast.io.format_registry import format_names
-from pop_fast.io.heartbeat import duration
+from pop_fast.io.formats import format_names
+from pop_fast.io.heartbeat import bars, duration
+from pop_fast.io.ply import Frame
+from pop_fast.train.config import TrainConfig
+from pop_fast.train.load_result import CaptureOptions, Splat, open_capture
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import numpy as np
     from torch import Tensor
 
     from pop_fast.data import Capture
+    from pop_fast.data.load import Photographs
     from pop_fast.density.shrink import Score
-    from pop_fast.io.frame import Frame
     from pop_fast.train.compact import Compact, Tuner
-    from pop_fast.train.config import TrainConfig
 
     FormatName = str
 else:
     # what is registered when the program starts
     FormatName = Literal[(*format_names(), "html")]
+
+
 # views that scores are summed over, at most; of a larger capture, an even selection
 _MOST_VIEWS: Final = 100
 # bytes of what `--target-mb` counts in
@@ -68,16 +73,11 @@ class LimitOptions:
 
     @property
     def any(self) -> bool:
-        """Tell whether something may be left out."""
         limits = (self.min_opacity, self.crop, self.final_prune, self.max_gaussians, self.target_mb)
         return self.without_floaters or any(limit is not None for limit in limits)
 
     def check(self) -> None:
-        """Refuse what cannot be before anything is loaded.
-
-        Raises:
-            PopError: names the option.
-        """
+        """Refuse what cannot be before anything is loaded."""
         if self.min_opacity is not None and not 0.0 <= self.min_opacity <= 1.0:
             raise PopError(f"--min-opacity {self.min_opacity:g} must be in [0, 1]")
         if self.crop is not None and not all(a <= b for a, b in zip(self.crop[:3], self.crop[3:], strict=True)):
@@ -94,46 +94,31 @@ class LimitOptions:
 
 @dataclass(frozen=True)
 class Shown:
-    """A splat in its training frame with what it can be scored by.
+    """A splat in its training frame with what it can be scored by."""
 
-    Attributes:
-        params: raw parameters.
-        sh_degree: highest active colour band.
-        config: how it is drawn.
-        world_transform: the training frame from the capture's; None where they are the same.
-        photographed: opens its capture, and gives the settings to look at it with; None where none is known.
-        checkpoint: that it was read from, if any.
-    """
-
-    params: dict[str, Tensor]
-    sh_degree: int
-    config: TrainConfig
-    world_transform: np.ndarray | None
+    params: dict[str, Tensor]  # raw parameters
+    sh_degree: int  # highest active colour band
+    config: TrainConfig  # how it is drawn
+    world_transform: np.ndarray | None  # the training frame from the capture's; None where they are the same
+    # opens its capture, and gives the settings to look at it with; None where none is known
     photographed: Callable[[], tuple[Capture, TrainConfig]] | None
-    checkpoint: Path | None = None
+    checkpoint: Path | None = None  # that it was read from, if any
 
 
 @dataclass(frozen=True)
 class Output:
-    """The file that a splat becomes.
+    """The file that a splat becomes."""
 
-    Attributes:
-        name: of its format, or "html".
-        antialiased: to be drawn with antialiasing.
-        frame: the world that the file is in, where it is known.
-        transform: what `to_capture_frame` moves the splat into that by; None where nothing moves. [4, 4]
-        page: makes a page of raw parameters, at a level of coarseness.
-    """
-
-    name: str
-    antialiased: bool = False
-    frame: Frame | None = None
+    name: str  # of its format, or "html"
+    antialiased: bool = False  # to be drawn with antialiasing
+    frame: Frame | None = None  # the world that the file is in, where it is known
+    # what `to_capture_frame` moves the splat into that by; None where nothing moves. [4, 4]
     transform: np.ndarray | None = None
+    # makes a page of raw parameters, at a level of coarseness
     page: Callable[[Mapping[str, Tensor], int], bytes] | None = None
 
     @property
     def levels(self) -> int:
-        """See `pop_fast.train.compact.Coding`."""
         from pop_fast.io.formats import levels
 
         return levels(self._format)
@@ -165,24 +150,14 @@ class Output:
 
 @dataclass
 class Limited:
-    """What limits have left.
-
-    Attributes:
-        params: raw parameters, in the training frame.
-        level: of coarseness that they are to be written at.
-        said: a line for every limit that left something out.
-    """
+    """What limits have left: raw parameters, the level of coarseness to write them at, and what was said of it."""
 
     params: dict[str, Tensor]
     level: int = 0
     said: list[str] = field(default_factory=list)
 
     def keep(self, kept: Tensor, what: str) -> None:
-        """Keep the Gaussians that are marked.
-
-        Raises:
-            PopError: none is.
-        """
+        """Keep the Gaussians that are marked; a PopError refuses to keep none."""
         before, after = len(kept), int(kept.sum())
         self.said.append(f"{what}: {after:,} of {before:,} Gaussians kept")
         if after == 0 and before > 0:
@@ -191,19 +166,7 @@ class Limited:
 
 
 def limited(shown: Shown, limits: LimitOptions, output: Output) -> Limited:
-    """Leave out what the limits say.
-
-    Args:
-        shown: the splat.
-        limits: the options.
-        output: the file that is made of it.
-
-    Returns:
-        What is left, its Gaussians in their order.
-
-    Raises:
-        PopError: a limit cannot be met, or no Gaussian is left.
-    """
+    """Leave out what the limits say of the splat that becomes a file; what is left keeps its order."""
     from pop_fast.density import shrink
 
     left = Limited(shown.params)
@@ -245,7 +208,6 @@ def _fit_unseen(left: Limited, limits: LimitOptions, output: Output) -> None:
 
 def _fit_seen(left: Limited, limits: LimitOptions, output: Output, shown: Shown, score: Score) -> None:
     """Fit a splat into its bytes by what loses least in its training views, and tune what is left on them."""
-    from pop_fast.cli.progress import bars
     from pop_fast.train import compact
 
     capture, config, learned = _photographs(shown, left, limits.crop is not None)
@@ -325,7 +287,6 @@ def _means_of_capture(params: dict[str, Tensor], shown: Shown) -> Tensor:
 
 
 def _floaters(shown: Shown, params: Mapping[str, Tensor]) -> Tensor:
-    """Tell which Gaussians are floaters."""
     if shown.photographed is None:
         raise PopError("floaters are found from the places of the photographs; give --capture DIR")
     from pop_fast.view.report.checks import are_floaters
@@ -335,7 +296,6 @@ def _floaters(shown: Shown, params: Mapping[str, Tensor]) -> Tensor:
 
 
 def _scores(shown: Shown, params: Mapping[str, Tensor], score: Score) -> Tensor:
-    """Return the scores of all Gaussians."""
     from pop_fast.density import shrink
 
     if score == "visibility":
@@ -357,3 +317,19 @@ def _scores(shown: Shown, params: Mapping[str, Tensor], score: Score) -> Tensor:
     placed = {name: value.to(device) for name, value in params.items()}
     degree = min(shown.sh_degree, degree_of(params))
     return shrink.view_scores(score, passes, placed, degree)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CaptureArguments(CaptureOptions):
+    """Which photographs and cameras to use; what is not given is as in training."""
+
+    capture: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
+    """The capture; by default the one it was trained on."""
+
+
+def open_with_bars(
+    splat: Splat, options: CaptureOptions, photographs: Photographs = "all"
+) -> tuple[Capture, TrainConfig]:
+    """Load the capture that a splat shows under progress bars; see `pop_fast.train.load_result.open_capture`."""
+    with bars() as progress:
+        return open_capture(splat, options, progress, photographs)

@@ -1,15 +1,63 @@
-"""Move a trained splat by a similarity of the world: back into its capture's own frame, or into anybody else's."""
+"""Between a capture and its Gaussians: the first ones, made of its points; trained ones, moved into its own frame."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from pop_fast.errors import PopError
+from pop_fast.data.capture import Capture
+from pop_fast.errors import CaptureError, PopError
+from pop_fast.stages.density import mean_squared_distances
 from pop_fast.stages.harmonics import sh_basis
 
-__all__ = ["apply_similarity", "rotate_sh", "to_capture_frame"]
+SH_C0 = 0.28209479177387814
+
+
+def initialize_params(
+    capture: Capture,
+    seed: int = 0,
+    init_opacity: float = 0.1,
+    init_scale: float = 1.0,
+    dtype: torch.dtype = torch.float32,
+) -> dict[str, torch.Tensor]:
+    """Make raw parameters, one isotropic Gaussian a point.
+
+    scales = log(init_scale * sqrt(mean squared distance to the three nearest other points)), quats uniform in [0, 1)^4,
+    opacities = logit(init_opacity), sh0 = (rgb - 1/2) / 0.28209479177387814, shN = 0. The mean squared distance is kept
+    at 1e-7 scene_scale^2 or more, so that points that coincide get a size.
+
+    Source: gsplat v1.5.3, examples/simple_trainer.py (which does not clamp); the clamp is 3DGS's, made free of units.
+
+    Args:
+        capture: its points and their colours.
+        seed: of the quaternions.
+        init_opacity: in (0, 1).
+        init_scale: factor on the standard deviations.
+        dtype: of the result.
+
+    Returns:
+        means [N, 3], scales [N, 3], quats [N, 4], opacities [N], sh0 [N, 1, 3], shN [N, 15, 3]: raw, on the CPU.
+    """
+    n = len(capture.points)
+    if n == 0:
+        raise CaptureError(f"{capture.name}: has no points to start from; load it again, random points are made then")
+    if not 0.0 < init_opacity < 1.0:
+        raise CaptureError(f"init_opacity is {init_opacity}; it must be between 0 and 1")
+    squared = np.maximum(mean_squared_distances(capture.points), 1e-7 * capture.scene_scale() ** 2)
+    sizes = np.log(init_scale * np.sqrt(squared))
+    generator = torch.Generator().manual_seed(seed)
+    sh0 = (capture.points_rgb.astype(np.float64) / 255.0 - 0.5) / SH_C0
+    return {
+        "means": torch.tensor(capture.points, dtype=dtype),
+        "scales": torch.tensor(sizes, dtype=dtype)[:, None].repeat(1, 3),
+        "quats": torch.rand(n, 4, generator=generator, dtype=dtype),
+        "opacities": torch.full((n,), math.log(init_opacity / (1.0 - init_opacity)), dtype=dtype),
+        "sh0": torch.tensor(sh0, dtype=dtype)[:, None, :],
+        "shN": torch.zeros(n, 15, 3, dtype=dtype),
+    }
 
 
 def to_capture_frame(params: dict[str, torch.Tensor], world_transform: np.ndarray) -> dict[str, torch.Tensor]:
@@ -46,14 +94,10 @@ def apply_similarity(params: dict[str, torch.Tensor], transform: np.ndarray) -> 
 
 
 def rotate_sh(sh: torch.Tensor, rotation: np.ndarray) -> torch.Tensor:
-    """Turn spherical harmonics: the colour seen along R d afterwards is the colour seen along d before.
+    """Turn spherical harmonics [N, 1|4|9|16, 3]: the colour along R d afterwards is the colour along d before.
 
     A band of degree l is closed under rotations, so M_l in basis_l(R d) M_l = basis_l(d) exists and is orthogonal; it
     is solved from more directions than the band has functions.
-
-    Args:
-        sh: float64 [N, 1|4|9|16, 3].
-        rotation: [3, 3].
     """
     degree = int(np.sqrt(sh.shape[1])) - 1
     directions = torch.from_numpy(_directions(32))
@@ -77,7 +121,6 @@ def _directions(count: int) -> np.ndarray:
 
 
 def _parts(transform: np.ndarray) -> tuple[float, np.ndarray]:
-    """Split a similarity into its scale and its rotation."""
     if transform.shape != (4, 4) or not np.all(np.isfinite(transform)):
         raise PopError(f"transform has shape {list(transform.shape)} or NaN; it must be a finite 4x4 similarity")
     determinant = float(np.linalg.det(transform[:3, :3]))
