@@ -53,7 +53,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from pop_fast.blocks.plan import Partition, divide, grid_of
 from pop_fast.data.capture import Capture, Listing, SparsePoints
 from pop_fast.data.load import in_picture, write_block
 from pop_fast.errors import PopError

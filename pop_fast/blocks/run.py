@@ -24,10 +24,8 @@ from torch import Tensor
 from pop_fast.blocks.jobs import Part, block_folder, core_of, result_of, round_folder
 from pop_fast.blocks.plan import FOLDER, Job, Partition, Plan, make_plan, read_plan, write_plan
 from pop_fast.blocks.rounds import own_of
-from pop_fast.blocks.run import merge
 from pop_fast.data.capture import Capture, Listing, Progress, SfmOptions
 from pop_fast.data.load import Photographs, list_capture, load_capture
-from pop_fast.data.sfm import SfmOptions
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.ply import Frame, save_ply

@@ -25,7 +25,6 @@ from pop_fast.view.document import Window
 from pop_fast.view.report.checks import read_checks
 from pop_fast.view.report.model import Finding, Histogram, ReportData, ReportView, Tile, verdict
 from pop_fast.view.report.page import page
-from pop_fast.view.report.source import threads_of
 
 # float32 numbers of a Gaussian: as gsplat's checkpoints hold it, and as Inria's PLY does (with three zero normals)
 BYTES_CKPT: Final = 59 * 4
