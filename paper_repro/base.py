@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train import TrainConfig
 
-__all__ = ["base_of", "begin_from_base", "keep_for_others", "remove_what_was_kept", "steps_for_others"]
-
 # the settings in which a row may differ from its base, and for each the setting that says after which step it acts
 _ACTS_AFTER: Final = {
     **dict.fromkeys(("method", "max_steps", "prune_shares", "rounds_start_iter", "score_divisor"), "rounds_start_iter"),

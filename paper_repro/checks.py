@@ -12,8 +12,6 @@ from typing import Final
 
 from paper_repro.paper import Metric, Paper, PaperTable
 
-__all__ = ["CKPT_TOLERANCE", "Statement", "checkpoint_mib", "checks", "places"]
-
 # MiB between a printed size and bytes times the printed count, both rounded; 3DGS on Mip-NeRF 360 has 1.59
 CKPT_TOLERANCE: Final = 1.6
 M360, TT, DB = "Mip-NeRF 360", "Tanks & Temples", "Deep Blending"

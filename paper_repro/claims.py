@@ -31,8 +31,6 @@ from paper_repro.paper import Metric, Paper, paper
 from paper_repro.results import Result
 from paper_repro.tables import setting
 
-__all__ = ["HEADLINES", "METHODS", "SWEEP", "WINDOWS", "against_sweep", "claims", "noise_of", "questions"]
-
 # the claims that the paper's summary rests on, in the order in which the outcome is told
 HEADLINES: Final = ("fast", "fewest", "above", "comparable", "reset")
 # the rows of the comparison of L1 and L2

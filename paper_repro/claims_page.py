@@ -12,9 +12,7 @@ from paper_repro.noise import ALPHA, PSNR, QUANTITIES, Noise, Spread
 from paper_repro.results import SCALES, Result
 from paper_repro.scales import scale_named
 from paper_repro.scenes import MADE
-from paper_repro.table_markdown import grid
-
-__all__ = ["deciding", "markdown", "method", "outcome", "telling"]
+from paper_repro.table_formats import grid
 
 _HEAD: Final = ("reading", "scene", "found, with its interval", "verdict", "trained with", "runs")
 

@@ -22,8 +22,6 @@ from pop_fast.errors import PopError
 if TYPE_CHECKING:
     from paper_repro.jobs import Job
 
-__all__ = ["COMMANDS", "EXIT_BAD_INPUT", "EXIT_INCOMPLETE", "EXIT_INTERRUPTED", "main"]
-
 EXIT_INCOMPLETE: Final = 1
 EXIT_BAD_INPUT: Final = 2
 EXIT_INTERRUPTED: Final = 130
@@ -335,8 +333,8 @@ def table(words: Sequence[str]) -> int:
     parser.add_argument("--out", type=Path, metavar="DIR", help=note)
     args = parser.parse_args(words)
     from paper_repro import tables
+    from paper_repro.table_formats import csv_text, markdown
     from paper_repro.table_latex import latex
-    from paper_repro.table_markdown import csv_text, markdown
 
     results, absent = read_all(args.scale, existing_folder(args.results)), _absent(args.scale, args.data)
     made = (

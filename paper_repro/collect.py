@@ -21,19 +21,6 @@ if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train import TrainConfig
 
-__all__ = [
-    "BESIDE",
-    "PROBE",
-    "collect",
-    "curve_of",
-    "digits",
-    "final_stats",
-    "first_change",
-    "read_probe",
-    "spacing",
-    "state_of_data",
-]
-
 # what `train_row` leaves in the result folder about the capture and the program, from before the first step
 BESIDE: Final = "row.json"
 # what `ProbedRun` leaves there

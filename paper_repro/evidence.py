@@ -16,25 +16,6 @@ from paper_repro.paper import Paper
 from paper_repro.results import Result
 from paper_repro.tables import setting
 
-__all__ = [
-    "DATASETS",
-    "JUDGE",
-    "STEPS",
-    "Claim",
-    "Evidence",
-    "Group",
-    "Groups",
-    "Told",
-    "Verdict",
-    "command",
-    "conditions",
-    "groups",
-    "is_shortened",
-    "paper_ratios",
-    "told",
-    "verdict_over",
-]
-
 Verdict = Literal["holds", "does not hold", "not decided"]
 # of the paper's schedule
 STEPS: Final = 30_000

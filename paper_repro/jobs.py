@@ -21,8 +21,6 @@ from pop_fast.errors import PopError
 if TYPE_CHECKING:
     from pop_fast.train import TrainConfig
 
-__all__ = ["SEED", "WORK", "Job", "NotTrainableError", "job_named", "jobs_of", "missing_method", "trainable"]
-
 # git ignores it; everything in it can be made again
 WORK: Final = Path(__file__).resolve().parent / "work"
 SEED: Final = 42

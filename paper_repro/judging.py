@@ -23,8 +23,6 @@ from paper_repro.noise import PSNR, Comparison, Group, Noise
 from paper_repro.paper import paper
 from paper_repro.scales import scale_named
 
-__all__ = ["OTHERS", "Other", "Question", "judge"]
-
 # what a question gets on one scene: comparisons; None for one that lacks a run; why one cannot be made of its runs
 Asked = Sequence[Comparison | str | None]
 # seeds of each row where nothing is known of the noise yet

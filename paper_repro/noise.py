@@ -24,24 +24,6 @@ from typing import Final, Literal, NamedTuple
 
 from paper_repro.results import Result
 
-__all__ = [
-    "ALPHA",
-    "BLENDED",
-    "COUNT",
-    "MOST_SEEDS",
-    "PSNR",
-    "QUANTITIES",
-    "SECONDS",
-    "SSIM",
-    "VISITED",
-    "Comparison",
-    "Group",
-    "Noise",
-    "Quantity",
-    "Spread",
-    "compare",
-]
-
 # the probability that any of the intervals of one claim at one scale misses, at most
 ALPHA: Final = 0.05
 # with more seeds than these a difference is smaller than what anyone would train for

@@ -11,8 +11,6 @@ from typing import Any, Final, Literal
 
 from pop_fast.errors import PopError
 
-__all__ = ["PAPER", "Metric", "NotComparable", "Paper", "PaperRow", "PaperTable", "Stated", "load", "paper"]
-
 PAPER: Final = Path(__file__).resolve().parent / "paper.toml"
 
 

@@ -16,8 +16,6 @@ from paper_repro.jobs import Job
 from paper_repro.paper import paper
 from paper_repro.scenes import DATASETS, MADE, PaperScene
 
-__all__ = ["hours", "hours_by_row", "lacking"]
-
 # of one Gaussian in training: parameters, gradients and two moments in float32; a checkpoint has no gradients
 _TRAINING, _CHECKPOINT, _PLY = 4 * 236, 3 * 236, 248
 # besides the Gaussians and photographs: the program and its libraries, and what a GPU's renderer lists and sorts

@@ -9,8 +9,6 @@ from paper_repro.jobs import Job, trainable
 from paper_repro.rows import ROWS
 from paper_repro.scenes import SCENES
 
-__all__ = ["progress", "state"]
-
 
 def state(job: Job, results: Path, work: Path) -> str:
     """Say how far a job is: "done", "step 1,500", "to do" or "not in this version"."""

@@ -13,8 +13,6 @@ from typing import Final
 from paper_repro.jobs import Job
 from pop_fast.errors import PopError
 
-__all__ = ["file_hash", "ply_of", "publish"]
-
 _SPLAT: Final = "splat.spz"
 
 

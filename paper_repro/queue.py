@@ -24,8 +24,6 @@ from paper_repro.status import everything, stale_files
 from paper_repro.train_row import BusyError
 from pop_fast.children import module_command
 
-__all__ = ["Outcome", "run_queue"]
-
 
 @dataclass
 class Outcome:

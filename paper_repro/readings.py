@@ -20,10 +20,8 @@ from paper_repro.evidence import DATASETS, Group, groups
 from paper_repro.judging import OTHERS
 from paper_repro.paper import Paper, paper
 from paper_repro.results import Result
-from paper_repro.table_markdown import grid
+from paper_repro.table_formats import grid
 from paper_repro.tables import setting
-
-__all__ = ["READINGS", "Answer", "Column", "Reading", "answers", "columns", "experiments", "markdown"]
 
 
 @dataclass(frozen=True)

@@ -19,19 +19,6 @@ from typing import Any, Final
 from paper_repro.scales import SCALES
 from pop_fast.errors import PopError
 
-__all__ = [
-    "BINS",
-    "COMMIT",
-    "LPIPS_VARIANTS",
-    "SCHEMA",
-    "UNTIMED",
-    "Result",
-    "from_line",
-    "run_id",
-    "settings_hash",
-    "to_line",
-]
-
 SCHEMA: Final = 2
 LPIPS_VARIANTS: Final = ("vgg_01", "alex_norm", "alex_01")
 BINS: Final = 50  # of the opacity histogram over [0, 1]

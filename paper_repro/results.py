@@ -20,19 +20,6 @@ from paper_repro.scales import SCALES as _SCALES
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 
-__all__ = [
-    "RESULTS",
-    "SCALES",
-    "Result",
-    "existing_folder",
-    "find",
-    "kept",
-    "path_of",
-    "read",
-    "read_all",
-    "write",
-]
-
 SCALES: Final = tuple(_SCALES)
 RESULTS: Final = Path(__file__).resolve().parent / "results"
 # what a line begins with, by which it is known without its curve

@@ -18,8 +18,6 @@ from paper_repro.scenes import DATASETS, SCENES, PaperScene
 from pop_fast.errors import PopError
 from pop_ref.registry import Registry
 
-__all__ = ["CONFIGS", "ROWS", "Row", "added_rows", "header_of", "load_row", "load_rows"]
-
 CONFIGS: Final = Path(__file__).resolve().parent / "configs"
 # in the order of the tables; what they hold is in the files
 _OWN: Final = (

@@ -9,8 +9,6 @@ from typing import Any, Final
 from paper_repro.scenes import SCENES
 from pop_fast.errors import PopError
 
-__all__ = ["SCALES", "Scale", "scale_named"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:

@@ -20,19 +20,6 @@ from typing import Any, Final
 
 from pop_fast.errors import PopError
 
-__all__ = [
-    "DATASETS",
-    "MADE",
-    "SCENES",
-    "Dataset",
-    "PaperScene",
-    "find_folder",
-    "load_scene",
-    "load_scenes",
-    "scene_named",
-    "source_of",
-]
-
 FOLDER: Final = Path(__file__).resolve().parent / "scenes"
 
 

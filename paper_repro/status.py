@@ -19,12 +19,10 @@ from paper_repro.claims_page import markdown as claims_markdown
 from paper_repro.evidence import DATASETS, JUDGE, Claim
 from paper_repro.paper import paper
 from paper_repro.results import RESULTS, SCALES, Result, read_all
-from paper_repro.table_markdown import grid
+from paper_repro.table_formats import grid
 from paper_repro.tables import SCENES_OF, beyond_rows
 from pop_fast.errors import PopError
 from pop_ref.ambiguities import AMBIGUITIES
-
-__all__ = ["HERE", "everything", "files", "stale_files", "status_table", "with_part"]
 
 HERE: Final = Path(__file__).resolve().parent
 _MADE: Final = "<!-- made by python -m paper_repro.status --write -->"

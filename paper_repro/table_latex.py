@@ -8,10 +8,8 @@ from __future__ import annotations
 from typing import Final
 
 from paper_repro.paper import Metric
-from paper_repro.table_markdown import Notes
+from paper_repro.table_formats import Notes
 from paper_repro.tables import Block, Cell, Line, Table
-
-__all__ = ["PREAMBLE", "latex"]
 
 PREAMBLE: Final = r"""\usepackage{booktabs}
 \usepackage{graphicx}

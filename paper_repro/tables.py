@@ -19,20 +19,6 @@ from paper_repro.rows import added_rows
 from paper_repro.scales import SCALES
 from pop_fast.errors import PopError
 
-__all__ = [
-    "BEYOND",
-    "REFERENCES",
-    "SCENES_OF",
-    "Block",
-    "Cell",
-    "Line",
-    "Table",
-    "beyond",
-    "beyond_rows",
-    "setting",
-    "table",
-]
-
 # what a scale is meant to train; results of further scenes are shown too
 SCENES_OF: Final = {name: tuple(scale.factors) for name, scale in SCALES.items() if name != "paper"}
 # the line that the others of its table are compared with where the data is not the paper's

@@ -27,18 +27,6 @@ if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train import TrainConfig
 
-__all__ = [
-    "PUBLISHED",
-    "BusyError",
-    "Options",
-    "capture_folder",
-    "commit",
-    "finished",
-    "load_capture_of",
-    "only_one",
-    "train_row",
-]
-
 # of a work folder: what finished rows leave to be published
 PUBLISHED: Final = "published"
 _DEMO_SEED: Final = 0

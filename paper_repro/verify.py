@@ -31,8 +31,6 @@ from pop_fast.children import python_command
 from pop_fast.errors import PopError
 from pop_fast.machine import machine_name, processor_kind
 
-__all__ = ["TOLERANCES", "Verification", "history", "other_kind", "verify"]
-
 # how far another kind of machine may come out: a share of the Gaussians, and dB and SSIM of the held-out views
 TOLERANCES: Final = {"num_gaussians": 0.05, "psnr_test": 0.3, "ssim": 0.01}
 _ROOT: Final = Path(__file__).resolve().parents[1]

@@ -10,8 +10,6 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-__all__ = ["TOLD", "start", "wait"]
-
 # of a child that ended in an exception which the command line would have shown as a traceback
 TRACEBACK = 70
 # and in one that it would have told in a line

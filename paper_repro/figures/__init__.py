@@ -12,8 +12,6 @@ from typing import Final
 
 from pop_fast.errors import PopError
 
-__all__ = ["FIGURES", "draw"]
-
 # each with its module and function, and its title
 FIGURES: Final = {
     "1": ("tradeoffs", "psnr_against_time", "PSNR against training time"),

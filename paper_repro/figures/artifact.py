@@ -17,8 +17,6 @@ from paper_repro.figures.style import GREY, INK, SMALL, TEXT
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["Panel", "correlation", "panels_of", "six_panels"]
-
 _GAP, _TITLE, _BAR, _EDGE = 0.12, 0.17, 0.24, 0.04
 _HIGHEST: Final = 1.7
 # of the values of a map, what its brightest colour stands for

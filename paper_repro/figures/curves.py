@@ -26,8 +26,6 @@ from paper_repro.results import Result
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["count_of_methods", "count_under_losses", "gaussians_per_pixel", "gradients_of_losses"]
-
 _METHODS: Final = ("3dgs", "gsplat", "pup", "mini_splatting", "taming", "speedy_splat", "pop")
 _LOSSES: Final = ("l1_div_1", "l2_without_ssim", "l2")
 _TERMS: Final = {"grad_l1": "L1", "grad_ssim": "SSIM at 0.01", "grad_l2": "L2"}

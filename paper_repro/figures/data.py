@@ -15,8 +15,6 @@ from paper_repro.results import Result
 from paper_repro.scales import scale_named
 from pop_fast.errors import PopError
 
-__all__ = ["Asked", "Chosen", "Curve", "NoDataError", "choose", "choose_one_scene", "curve_of", "has", "mean_of"]
-
 # steps and values
 Curve: TypeAlias = tuple[np.ndarray, np.ndarray]
 

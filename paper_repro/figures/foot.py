@@ -9,8 +9,6 @@ from paper_repro.figures.style import name_of
 from paper_repro.results import Result
 from paper_repro.scales import scale_named
 
-__all__ = ["foot", "foot_of", "scale_sentence"]
-
 
 def foot(asked: Asked, chosen: Chosen, *more: str, averaged: bool = True) -> str:
     """Write the note of a figure.

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
-__all__ = ["Box", "Marker", "Place", "along", "places"]
-
 # left, bottom, right, top in points
 Box = tuple[float, float, float, float]
 

@@ -14,8 +14,6 @@ from paper_repro.figures.style import GREY, color_of, count, darker
 from paper_repro.paper import paper
 from paper_repro.record import BINS
 
-__all__ = ["opacity_histogram", "share_above", "share_below"]
-
 _LOW, _HIGH = 0.1, 0.9
 # the capture of the paper's figure
 _SCENE: Final = "kitchen"

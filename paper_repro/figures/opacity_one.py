@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train import TrainConfig
 
-__all__ = ["STEPS", "WEIGHT", "OpacityOne", "Pushed", "pushed"]
-
 STEPS: Final = 1_000
 # of the mean of 1 - o; the paper does not state its own. At 0.1, half of the demo capture's Gaussians stay under 0.1
 WEIGHT: Final = 1.0

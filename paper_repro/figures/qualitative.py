@@ -23,8 +23,6 @@ from pop_fast.view.report.source import read_view
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["ComparedView", "most_different", "renders_and_photographs"]
-
 _SCENES: Final = ("truck", "train", "playroom", "bonsai")
 _ROWS: Final = ("pop", "3dgs")
 _GAP, _TITLE, _SIDE = 0.06, 0.17, 0.15

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
-__all__ = ["Drawn", "Margins", "Sheet", "save", "show"]
-
 _EDGE: Final = 0.04
 _LINE: Final = SMALL * 1.3 / 72.0
 

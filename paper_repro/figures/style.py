@@ -18,24 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
 
-__all__ = [
-    "COLUMN",
-    "GREY",
-    "INK",
-    "LOSSES",
-    "SAVED_DPI",
-    "SMALL",
-    "TEXT",
-    "End",
-    "color_of",
-    "count",
-    "label_ends",
-    "log_ticks",
-    "look",
-    "name_of",
-    "step_ticks",
-]
-
 # widths of a column and of a page's text, inches
 COLUMN: Final = 3.3
 TEXT: Final = 6.9

@@ -20,8 +20,6 @@ from paper_repro.results import Result
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["psnr_against_count", "psnr_against_time"]
-
 _METHODS: Final = (
     *("3dgs", "gsplat", "pup", "pup_star", "mini_splatting", "mini_splatting_star"),
     *("taming", "speedy_splat", "pop"),

@@ -10,8 +10,6 @@ from typing import Final
 from paper_repro.paper import Metric
 from paper_repro.tables import Block, Line, Table
 
-__all__ = ["COLUMNS", "Notes", "csv_text", "grid", "markdown"]
-
 # so many run ids fit into a line; more are listed below the block
 _IDS = 3
 _LONG: Final = "not comparable: "
