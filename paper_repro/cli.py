@@ -14,13 +14,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from paper_repro.results import RESULTS, existing_folder, read_all
-from paper_repro.scales import SCALES, scale_named
-from paper_repro.scenes import MADE, SCENES, find_folder, scene_named
+from paper_repro.scenes import MADE, SCALES, SCENES, find_folder, scale_named, scene_named
 from pop_fast.api.registry import backend_names
 from pop_fast.errors import PopError
 
 if TYPE_CHECKING:
-    from paper_repro.jobs import Job
+    from paper_repro.rows import Job
 
 EXIT_INCOMPLETE: Final = 1
 EXIT_BAD_INPUT: Final = 2
@@ -77,8 +76,7 @@ def _add_jobs(parser: argparse.ArgumentParser) -> None:
 
 def _jobs(args: argparse.Namespace) -> list[Job]:
     """List the trainings that `_add_jobs` read, the cheapest first."""
-    from paper_repro.jobs import jobs_of
-    from paper_repro.rows import ROWS
+    from paper_repro.rows import ROWS, jobs_of
 
     return jobs_of(args.scale, args.rows or ROWS, args.scenes, range(_SEED, _SEED + args.seeds))
 
@@ -169,7 +167,7 @@ def run(words: Sequence[str]) -> int:
     parser.add_argument("--again", action="store_true", help="train a finished row again, and replace its result")
     _add_training(parser)
     args = parser.parse_args(words)
-    from paper_repro.jobs import job_named
+    from paper_repro.rows import job_named
     from paper_repro.train_row import Options, finished, train_row
 
     job = job_named(args.row, args.scene, args.scale, args.seed)
@@ -223,7 +221,7 @@ def queue(words: Sequence[str]) -> int:
 
 def _ready(missing: Sequence[Job], args: argparse.Namespace) -> bool:
     """Print what the missing rows take and what is lacking for them; tell whether nothing is."""
-    from paper_repro.preflight import hours_by_row, lacking
+    from paper_repro.queue import hours_by_row, lacking
 
     print("\n".join([f"{len(missing)} trainings to go", *hours_by_row(missing)]), flush=True)
     found = lacking(missing, args.data, args.work, args.backend)
@@ -262,7 +260,7 @@ def verify(words: Sequence[str]) -> int:
     _add_work(parser, "the folder that the commit is cloned and trained in (default: %(default)s)")
     _add_backend(parser, "what takes the steps (default: what took those of the result)")
     args = parser.parse_args(words)
-    from paper_repro.jobs import job_named
+    from paper_repro.rows import job_named
     from paper_repro.train_row import Options
     from paper_repro.verify import TOLERANCES
     from paper_repro.verify import verify as verified
@@ -316,7 +314,7 @@ def status(words: Sequence[str]) -> int:
     _add_work(parser, "the checkpoints (default: %(default)s)")
     _add_jobs(parser)
     args = parser.parse_args(words)
-    from paper_repro.progress import progress
+    from paper_repro.queue import progress
 
     print("\n".join(progress(_jobs(args), existing_folder(args.results), args.work)))
     return 0
@@ -333,8 +331,7 @@ def table(words: Sequence[str]) -> int:
     parser.add_argument("--out", type=Path, metavar="DIR", help=note)
     args = parser.parse_args(words)
     from paper_repro import tables
-    from paper_repro.table_formats import csv_text, markdown
-    from paper_repro.table_latex import latex
+    from paper_repro.table_formats import csv_text, latex, markdown
 
     results, absent = read_all(args.scale, existing_folder(args.results)), _absent(args.scale, args.data)
     made = (

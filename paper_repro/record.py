@@ -16,7 +16,7 @@ from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Any, Final
 
-from paper_repro.scales import SCALES
+from paper_repro.scenes import SCALES
 from pop_fast.errors import PopError
 
 SCHEMA: Final = 2
@@ -55,7 +55,7 @@ class Result:
     """What one finished run says of itself.
 
     Attributes:
-        scale: a name of `paper_repro.scales`.
+        scale: a name of `paper_repro.scenes`.
         row: the configuration, by the name of its file in `configs`.
         scene: the capture, by its name here ("fox", "bonsai_800", "kitchen", ...).
         seed: of every random number of the run.

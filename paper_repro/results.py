@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from paper_repro.record import SCHEMA, Result, from_line, to_line
-from paper_repro.scales import SCALES as _SCALES
+from paper_repro.scenes import SCALES as _SCALES
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 

@@ -12,11 +12,10 @@ from dataclasses import dataclass, replace
 from statistics import fmean, stdev
 from typing import Final
 
-from paper_repro.checks import places
-from paper_repro.paper import Metric, NotComparable, Paper, PaperTable, paper
+from paper_repro.paper import Metric, NotComparable, Paper, PaperTable, paper, places
 from paper_repro.results import Result
 from paper_repro.rows import added_rows
-from paper_repro.scales import SCALES
+from paper_repro.scenes import SCALES
 from pop_fast.errors import PopError
 
 # what a scale is meant to train; results of further scenes are shown too

@@ -20,7 +20,7 @@ from cuda_ext.gpu_check.command import begun_report
 from cuda_ext.gpu_check.outcomes import outcomes
 from paper_repro import paper, prepared, results, rows, scenes
 from paper_repro.collect import collect
-from paper_repro.jobs import job_named
+from paper_repro.rows import job_named
 from pop_fast.blocks.merge import read_round
 from pop_fast.blocks.plan import read_job, read_plan
 from pop_fast.blocks.rounds import own_of

@@ -12,7 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from paper_repro.results import Result
-from paper_repro.scales import scale_named
+from paper_repro.scenes import scale_named
 from pop_fast.errors import PopError
 
 # steps and values

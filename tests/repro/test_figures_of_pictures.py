@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from paper_repro.figures import artifact, opacity_one, qualitative, style
+from paper_repro.figures import artifact, qualitative, style
 from paper_repro.figures.data import NoDataError
-from paper_repro.figures.sheet import save
-from paper_repro.jobs import job_named
+from paper_repro.figures.style import save
 from paper_repro.results import RESULTS
+from paper_repro.rows import job_named
 from paper_repro.train_row import Options, capture_folder, load_capture_of
 from pop_fast.errors import PopError
 from tests.repro.made import asked, lines, result, texts
@@ -107,7 +107,7 @@ def artifacts(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch, style.look():
         patch.setattr(opacity_one, "STEPS", 12)
         toy = asked("3", [base], folder, scale="toy")
-        first = opacity_one.pushed(toy)
+        first = artifact.pushed(toy)
         patch.setattr(opacity_one, "_train", lambda *_: pytest.fail("trained again"))
         made = artifact.six_panels(toy)
         return params, first, made, save(made, folder / "figure_3")
@@ -145,4 +145,4 @@ def test_a_constant_map_has_no_correlation():
 
 def test_the_artifacts_need_a_scene(tmp_path):
     with pytest.raises(PopError, match=f"{tmp_path} has none of kitchen; name another --data"):
-        opacity_one.pushed(asked("3", [], tmp_path, scale="paper"))
+        artifact.pushed(asked("3", [], tmp_path, scale="paper"))

@@ -8,11 +8,19 @@ from pathlib import Path
 import pytest
 
 from paper_repro import rows, scenes
-from paper_repro.jobs import NotTrainableError, job_named, jobs_of, missing_method
 from paper_repro.paper import paper
-from paper_repro.rows import CONFIGS, ROWS, header_of, load_row, load_rows
-from paper_repro.scales import SCALES
-from paper_repro.scenes import SCENES
+from paper_repro.rows import (
+    CONFIGS,
+    ROWS,
+    NotTrainableError,
+    header_of,
+    job_named,
+    jobs_of,
+    load_row,
+    load_rows,
+    missing_method,
+)
+from paper_repro.scenes import SCALES, SCENES
 from pop_fast.errors import PopError
 from pop_ref.constants import PROFILES
 from pop_ref.recipes import BASELINES, L1_DIVIDED, RECIPES, Recipe
