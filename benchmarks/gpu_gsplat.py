@@ -15,9 +15,8 @@ from typing import Any
 
 import torch
 from gpu_kernels import STEPS, Record, arguments, draw, forward_backward, over_scenes, photograph_of, timed
-from gpu_profile import kernel_sums
 from gpu_scenes import GpuCase
-from gpu_steps import raw_params, step_kernels, whole_step
+from gpu_steps import kernel_sums, raw_params, step_kernels, whole_step
 from torch import Tensor
 
 import cuda_ext

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from cases import GATE_CASE, Case, gaussians_of
-from timing import turns_ms
+from cases import GATE_CASE, Case, gaussians_of, turns_ms
 from torch import Tensor
 
 from pop_fast.api.registry import backend_names, get_backend

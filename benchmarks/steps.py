@@ -14,8 +14,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import torch
-from cases import Case, capture_of, gaussians_of
-from timing import median_ratio, turns
+from cases import Case, capture_of, gaussians_of, median_ratio, turns
 
 import pop_fast.train
 from pop_fast.api.registry import get_backend
