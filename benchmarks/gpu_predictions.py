@@ -98,10 +98,6 @@ BLENDS = {"blend_forward": FORWARD, "blend_backward": BACKWARD}
 SHARED = {"blend_forward": (12, 0, 12), "blend_backward": (18, 72, 60)}
 
 
-# 132 processors of 128 lanes at the clock that an H200 holds under load; the bandwidth that a copy reaches on it
-H200 = Card(4.2e12, 132 * 128 * 1.755e9, 1.755e9)
-
-
 CASE = Loads(270_000, 160_000, 2_000_000, *_BLENDED, tried=4_360_000)
 
 
@@ -259,6 +255,10 @@ class Card:
     bytes_per_s: float
     instructions_per_s: float
     clock_hz: float
+
+
+# 132 processors of 128 lanes at the clock that an H200 holds under load; the bandwidth that a copy reaches on it
+H200 = Card(4.2e12, 132 * 128 * 1.755e9, 1.755e9)
 
 
 def measured_card(device: torch.device, copied: int = 1 << 30) -> Card:
