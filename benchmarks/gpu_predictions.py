@@ -98,9 +98,6 @@ BLENDS = {"blend_forward": FORWARD, "blend_backward": BACKWARD}
 SHARED = {"blend_forward": (12, 0, 12), "blend_backward": (18, 72, 60)}
 
 
-CASE = Loads(270_000, 160_000, 2_000_000, *_BLENDED, tried=4_360_000)
-
-
 def an_iteration(kernel: dict[str, Any]) -> str:
     """Say what an iteration of a kernel's loop over visits, steps or slots issues, or what its whole body does."""
     found: list[str] = []
@@ -246,6 +243,9 @@ class Loads:
     eights: int
     batches: int
     tried: int
+
+
+CASE = Loads(270_000, 160_000, 2_000_000, *_BLENDED, tried=4_360_000)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What each part of the native step has to do at least, and the time that machines need for it, this one and larger ones.
+"""What each part of the native step has to do at least, and the time that machines need for it: this and larger ones.
 
 A floor is the larger of two times, with all threads at work all the time: of the part's vector operations, as if each
 were a fused multiply-add, of which the processor was seen to do so many a second (`peak.cpp`); and of the bytes that it

@@ -1,4 +1,4 @@
-"""What a process takes as a whole: memory at its peak, time from a command to its first step, steps among busy others."""
+"""What a process takes as a whole: memory at its peak, time from a command to its first step, steps in busy company."""
 
 from __future__ import annotations
 
