@@ -22,7 +22,7 @@ from torch import Tensor
 import cuda_ext
 from cuda_ext import load
 from cuda_ext.arrays import fill, new_state, stream_of
-from cuda_ext.training.resident import MARGIN, ResidentViews
+from cuda_ext.training.step_buffers import MARGIN, ResidentViews
 from pop_fast.cuda import rasterization
 
 LAMBDA_SSIM = 0.01

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from cuda_ext.render import lists
 from cuda_ext.training import step_program
-from cuda_ext.training.resident import ResidentViews
+from cuda_ext.training.step_buffers import ResidentViews
 from cuda_ext.training.train_step import FusedTrainer
 from pop_fast.train.schedule import steady_updates
 from pop_fast.train.steps import Phase, StepSettings

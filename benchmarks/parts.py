@@ -41,7 +41,7 @@ from cases import Case, capture_of
 from record import read_json
 from steps import run_of_case
 
-from cuda_ext.compiler import find_compiler, no_compiler
+from cuda_ext.toolkit import find_compiler, no_compiler
 from pop_fast.train.environment import reproducible
 from pop_fast.train.schedule import phase_at
 

@@ -10,7 +10,7 @@ import os
 import subprocess
 from pathlib import Path
 
-from cuda_ext.compiler import find_compiler, no_compiler
+from cuda_ext.toolkit import find_compiler, no_compiler
 
 HERE = Path(__file__).resolve().parent
 # contraction would let the compiler round differently from the kernels, which fuse only where they say so

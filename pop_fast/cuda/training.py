@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from cuda_ext.training.batch_step import BatchTrainer
-from cuda_ext.training.resident import ResidentViews
+from cuda_ext.training.step_buffers import ResidentViews
 from cuda_ext.training.train_step import FusedTrainer
 from pop_fast.train.fused_stepper import Fused, MakeFused, Rows
 from pop_fast.train.stepper import Task

@@ -136,7 +136,7 @@ def _elsewhere(name: str) -> Any:
             raise Unavailable(reason)
         return program(name, "pop_fast", "compiled", _dtype(name))
     if name.startswith("mirror"):
-        compiler = importlib.import_module("cuda_ext.compiler")
+        compiler = importlib.import_module("cuda_ext.toolkit")
         if compiler.find_compiler() is None:
             raise Unavailable(f"the host mirror needs one: {compiler.no_compiler()}")
         return importlib.import_module(f"{kit}.mirror_adapter").mirror(name)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from cuda_ext.compiler import find_compiler
+from cuda_ext.toolkit import find_compiler
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.backends import shipped
 from pop_ref.conformance.cases import CASES, cotangent_like, rounded, sensitivity, transposed

@@ -15,7 +15,6 @@ import pytest
 import torch
 
 from cuda_ext.host import emulate
-from cuda_ext.render import capacity
 from cuda_ext.training.batch_step import RETURNED, SENT, STRETCH, BatchTrainer, step_bytes, stretches
 from pop_fast.cli import main
 from pop_fast.density import POPStrategy

@@ -136,7 +136,6 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(engine, method, tmp_path, m
 
 
 def test_buffers_that_overflow_between_views_of_several_sizes_lose_nothing(engine, tmp_path, monkeypatch):
-    from cuda_ext.render import capacity
 
     capture = mixed_sizes(tiny_capture())
     whole = TrainingRun(tiny_config(tmp_path / "whole"), capture, engine=engine)

@@ -101,7 +101,6 @@ def test_more_entries_than_the_kernels_can_number_are_refused_in_one_line(gpu):
 
 
 def test_room_shrinks_after_a_phase_of_fat_splats_and_the_steps_stay_the_same(gpu, monkeypatch):
-    from cuda_ext.render import capacity
     from pop_fast.train.steps import Phase
 
     monkeypatch.setattr(capacity, "FIRST_GUESS", (0, 64))
