@@ -196,24 +196,6 @@ def _stem(path: str) -> str:
     return "-".join(Path(path).name.split("-")[:2])
 
 
-STAGES: dict[str, Callable[[StageContext], dict[str, Any]]] = {
-    "wheels": wheels_stage,
-    "build": build_stage,
-    "smoke": smoke_stage,
-    "bench": bench_stage,
-    "counters": counters_stage,
-    "gsplat": gsplat_stage,
-    "laws": laws_stage,
-    "steps": steps_stage,
-    "sanitizer": sanitizer_stage,
-    "train": train_stage,
-    "laws_of_gaussian_parallel": laws_of_gaussian_parallel_stage,
-    "reproduce": reproduce_stage,
-    "ranks": ranks_stage,
-    "blocks": blocks_stage,
-}
-
-
 REPRODUCED += ("gsplat", "3dgs", "taming", "speedy_splat", "mini_splatting", "mini_splatting_star", "pup", "pup_star")
 
 
@@ -425,3 +407,21 @@ def _pytest(
     found["tests"] = outcomes(lines)
     # without a GPU everything is skipped, which is no pass
     return found | {"status": found["status"] or int(found["tests"]["passed"] == 0)}
+
+
+STAGES: dict[str, Callable[[StageContext], dict[str, Any]]] = {
+    "wheels": wheels_stage,
+    "build": build_stage,
+    "smoke": smoke_stage,
+    "bench": bench_stage,
+    "counters": counters_stage,
+    "gsplat": gsplat_stage,
+    "laws": laws_stage,
+    "steps": steps_stage,
+    "sanitizer": sanitizer_stage,
+    "train": train_stage,
+    "laws_of_gaussian_parallel": laws_of_gaussian_parallel_stage,
+    "reproduce": reproduce_stage,
+    "ranks": ranks_stage,
+    "blocks": blocks_stage,
+}
