@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 from cuda_ext.gpu_check.command import commit_of
 from cuda_ext.gpu_check.shared import ROOT, write_json
 from paper_repro import prepared
-from paper_repro.rows import Job, load_row
+from paper_repro.jobs import Job, load_row
 from paper_repro.scenes import SCALES, SCENES, find_folder
 from paper_repro.train_row import load_capture_of
 from pop_fast.children import python_command

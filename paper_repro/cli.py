@@ -19,7 +19,7 @@ from pop_fast.api.registry import backend_names
 from pop_fast.errors import PopError
 
 if TYPE_CHECKING:
-    from paper_repro.rows import Job
+    from paper_repro.jobs import Job
 
 EXIT_INCOMPLETE: Final = 1
 EXIT_BAD_INPUT: Final = 2
@@ -76,7 +76,7 @@ def _add_jobs(parser: argparse.ArgumentParser) -> None:
 
 def _jobs(args: argparse.Namespace) -> list[Job]:
     """List the trainings that `_add_jobs` read, the cheapest first."""
-    from paper_repro.rows import ROWS, jobs_of
+    from paper_repro.jobs import ROWS, jobs_of
 
     return jobs_of(args.scale, args.rows or ROWS, args.scenes, range(_SEED, _SEED + args.seeds))
 
@@ -167,7 +167,7 @@ def run(words: Sequence[str]) -> int:
     parser.add_argument("--again", action="store_true", help="train a finished row again, and replace its result")
     _add_training(parser)
     args = parser.parse_args(words)
-    from paper_repro.rows import job_named
+    from paper_repro.jobs import job_named
     from paper_repro.train_row import Options, finished, train_row
 
     job = job_named(args.row, args.scene, args.scale, args.seed)
@@ -260,7 +260,7 @@ def verify(words: Sequence[str]) -> int:
     _add_work(parser, "the folder that the commit is cloned and trained in (default: %(default)s)")
     _add_backend(parser, "what takes the steps (default: what took those of the result)")
     args = parser.parse_args(words)
-    from paper_repro.rows import job_named
+    from paper_repro.jobs import job_named
     from paper_repro.train_row import Options
     from paper_repro.verify import TOLERANCES
     from paper_repro.verify import verify as verified

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
-from paper_repro.rows import Job
+from paper_repro.jobs import Job
 from paper_repro.scenes import DATASETS, PaperScene, find_folder, source_of
 from pop_fast.errors import CaptureError, PopError
 

@@ -22,9 +22,9 @@ from types import FrameType
 from typing import Final
 
 from paper_repro.data_check import check_scene
+from paper_repro.jobs import ROWS, Job, NotTrainableError, trainable
 from paper_repro.paper import paper
 from paper_repro.results import RESULTS
-from paper_repro.rows import ROWS, Job, NotTrainableError, trainable
 from paper_repro.scenes import DATASETS, MADE, SCENES, PaperScene
 from paper_repro.status import everything, stale_files
 from paper_repro.train_row import BusyError

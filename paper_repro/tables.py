@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 from statistics import fmean, stdev
 from typing import Final
 
+from paper_repro.jobs import added_rows
 from paper_repro.paper import Metric, NotComparable, Paper, PaperTable, paper, places
 from paper_repro.results import Result
-from paper_repro.rows import added_rows
 from paper_repro.scenes import SCALES
 from pop_fast.errors import PopError
 

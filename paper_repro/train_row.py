@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from paper_repro import prepared, results
+from paper_repro.jobs import WORK, Job
 from paper_repro.record import COMMIT
 from paper_repro.results import Result
-from paper_repro.rows import WORK, Job
 from paper_repro.scenes import MADE, PaperScene, find_folder
 from pop_fast.errors import PopError
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 from collections.abc import Mapping
 
 from paper_repro.collect import BESIDE, PROBE
-from paper_repro.rows import load_row, load_rows
+from paper_repro.jobs import load_row, load_rows
 
 # of a work folder: what finished rows leave to be published
 PUBLISHED: Final = "published"

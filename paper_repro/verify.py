@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Final
 
 from paper_repro.collect import curve_of, digits, file_hash, final_stats, ply_of
+from paper_repro.jobs import Job
 from paper_repro.record import Result
-from paper_repro.rows import Job
 from paper_repro.train_row import Options
 from pop_fast.api.registry import backend_names, get_backend
 from pop_fast.children import python_command
@@ -37,7 +37,7 @@ _ROOT: Final = Path(__file__).resolve().parents[1]
 _TRAIN: Final = """\
 import json, sys
 from pathlib import Path
-from paper_repro.rows import job_named
+from paper_repro.jobs import job_named
 from paper_repro.train_row import Options, train_row
 asked = json.loads(sys.argv[1])
 places = {name: Path(asked[name]) for name in ("data", "results", "work")}

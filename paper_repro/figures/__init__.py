@@ -56,8 +56,8 @@ def draw(
         raise PopError(f"figure is '{figure}'; it must be one of {', '.join(FIGURES)}")
     from paper_repro.figures.data import Asked
     from paper_repro.figures.style import look, save
+    from paper_repro.jobs import WORK
     from paper_repro.results import read_all
-    from paper_repro.rows import WORK
 
     module, function, _ = FIGURES[figure]
     asked = Asked(figure, scale, read_all(scale, results), WORK if work is None else work, data or Path("data"))

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 import shutil
 from pathlib import Path
 
+from paper_repro.jobs import Job, job_named
 from paper_repro.results import Result
-from paper_repro.rows import Job, job_named
 from paper_repro.scenes import MADE, SCENES, find_folder
 from paper_repro.train_row import Options, capture_folder, load_capture_of, train_row
 from pop_fast.errors import PopError

@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from paper_repro.rows import ROWS
+from paper_repro.jobs import ROWS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -23,10 +23,10 @@ from paper_repro.figures import FIGURES, curves, style
 from paper_repro.figures.data import NoDataError, choose, curve_of
 from paper_repro.figures.style import foot, save
 from paper_repro.figures.tradeoffs import Marker, along, places
+from paper_repro.jobs import load_rows
 from paper_repro.paper import paper
 from paper_repro.record import BINS
 from paper_repro.results import Result, write
-from paper_repro.rows import load_rows
 from pop_fast.errors import PopError
 from tests.repro.made import asked, curve, drawn, lines, result, texts
 

@@ -13,8 +13,8 @@ import pytest
 from paper_repro.figures import artifact, qualitative, style
 from paper_repro.figures.data import NoDataError
 from paper_repro.figures.style import save
+from paper_repro.jobs import job_named
 from paper_repro.results import RESULTS
-from paper_repro.rows import job_named
 from paper_repro.train_row import Options, capture_folder, load_capture_of
 from pop_fast.errors import PopError
 from tests.repro.made import asked, lines, result, texts

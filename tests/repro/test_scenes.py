@@ -13,7 +13,7 @@ import pytest
 
 from paper_repro import scenes
 from paper_repro.data_check import HOLD_OUT, check_capture, check_scene, table
-from paper_repro.rows import job_named
+from paper_repro.jobs import job_named
 from paper_repro.scenes import (
     DATASETS,
     MADE,

@@ -24,10 +24,10 @@ from scipy import stats
 from paper_repro.claims import claims, noise_of, questions
 from paper_repro.cli import main
 from paper_repro.evidence import COUNT, MOST_SEEDS, PSNR, SECONDS, Comparison, Noise, compare, groups
+from paper_repro.jobs import job_named
 from paper_repro.judging import judge
 from paper_repro.paper import paper
 from paper_repro.results import RESULTS, SCALES, Result, find, read_all, write
-from paper_repro.rows import job_named
 from paper_repro.train_row import commit
 from paper_repro.verify import history, other_kind
 from tests.repro.made import PLAIN, demo

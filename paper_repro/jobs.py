@@ -4,8 +4,7 @@ A row is one file of `configs`, read with errors that name file and field. It na
 options in which it differs from it, on the whole schedule of the paper. Options that belong to a dataset or a scene
 alone stand in the table `[scenes]`, by its key there or by the scene's name. At a shorter schedule, step numbers are
 scaled as the program scales the defaults of a method (`DensityControl.scaled`), so that "blur from 3,000 to 4,000"
-stays a fortieth of the schedule.
-"""
+stays a fortieth of the schedule."""
 
 from __future__ import annotations
 
