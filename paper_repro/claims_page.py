@@ -26,6 +26,21 @@ from paper_repro.table_formats import grid
 from paper_repro.tables import setting
 
 _HEAD: Final = ("reading", "scene", "found, with its interval", "verdict", "trained with", "runs")
+_COLUMNS: Final = ("scale", "scene", "rows", "column", "in the paper", "default", "other", "nearer")
+# the pairs of rows that a table of the paper sets side by side
+_PAIRS: Final = (
+    *(("pop", "l2_blur"), ("pop", "l2_pop"), ("l2_blur", "l2"), ("l2_pop", "l2")),
+    *(("pop", "reset"), ("pop", "gsplat"), ("blur_3k_4k", "pop"), ("blur_3k_11k", "pop"), ("blur_3k_15k", "pop")),
+)
+# the windows of table 4 by their length, with the steps between two densification steps of the paper's schedule
+_WINDOWS: Final = (("blur_3k_4k", 4_000), ("pop", 7_000), ("blur_3k_11k", 11_000), ("blur_3k_15k", 15_000))
+_EVERY: Final = 100
+_N: Final = "N over N"
+_DIFFERENCES: Final = (("PSNR", "psnr"), ("SSIM", "ssim"))
+_GROWTH: Final = "growth a densification step over N of the shorter"
+# the rows of E4: pruning harder at the paper's weight, in place of a tenfold weight
+_PRUNED: Final = ("final_prune", "pop_prune_002")
+_NEARER: Final = {1: "default", 0: "alike", -1: "other"}
 
 
 def telling() -> list[str]:
@@ -197,20 +212,6 @@ READINGS: Final = (
     Reading("A12", "does the POP term sum over all Gaussians or over visible ones?", "A12 visible"),
     Reading("A16", "are oversized Gaussians pruned although there is no reset?", "A16 on"),
 )
-_COLUMNS: Final = ("scale", "scene", "rows", "column", "in the paper", "default", "other", "nearer")
-# the pairs of rows that a table of the paper sets side by side
-_PAIRS: Final = (
-    *(("pop", "l2_blur"), ("pop", "l2_pop"), ("l2_blur", "l2"), ("l2_pop", "l2")),
-    *(("pop", "reset"), ("pop", "gsplat"), ("blur_3k_4k", "pop"), ("blur_3k_11k", "pop"), ("blur_3k_15k", "pop")),
-)
-# the windows of table 4 by their length, with the steps between two densification steps of the paper's schedule
-_WINDOWS: Final = (("blur_3k_4k", 4_000), ("pop", 7_000), ("blur_3k_11k", 11_000), ("blur_3k_15k", 15_000))
-_EVERY: Final = 100
-_N: Final = "N over N"
-_DIFFERENCES: Final = (("PSNR", "psnr"), ("SSIM", "ssim"))
-_GROWTH: Final = "growth a densification step over N of the shorter"
-# the rows of E4: pruning harder at the paper's weight, in place of a tenfold weight
-_PRUNED: Final = ("final_prune", "pop_prune_002")
 
 
 def answers(results: Iterable[Result]) -> tuple[Answer, ...]:
@@ -300,9 +301,6 @@ def _answer(reading: Reading, results: Sequence[Result]) -> Answer:
                 votes.append((column.rows, (ahead > 0.0) - (ahead < 0.0)))
                 lines.append((scale, scene, *_shown(column, default, other), _NEARER[votes[-1][1]]))
     return Answer(reading.id, reading.asks, _says(reading, votes), _COLUMNS, tuple(lines))
-
-
-_NEARER: Final = {1: "default", 0: "alike", -1: "other"}
 
 
 def _shown(column: Column, default: float, other: float) -> tuple[str, ...]:

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train import TrainConfig
 
-
 # what `train_row` leaves in the result folder about the capture and the program, from before the first step
 BESIDE: Final = "row.json"
 # what `ProbedRun` leaves there
@@ -58,6 +57,7 @@ _TIMING: Final = (
     "training steps and density control with its passes over the views; reading the capture, measuring held-out views "
     "and writing files are apart"
 )
+_SPLAT: Final = "splat.spz"
 
 
 def state_of_data(job: Job, config: TrainConfig, capture: Capture) -> dict[str, Any]:
@@ -287,9 +287,6 @@ def _point(found: Mapping[str, Any]) -> dict[str, Any]:
         for name, value in values.items()
         if math.isfinite(value)
     }
-
-
-_SPLAT: Final = "splat.spz"
 
 
 def publish(job: Job, work: Path, folder: Path, last: int) -> dict[str, str]:

@@ -34,6 +34,12 @@ ALPHA: Final = 0.05
 MOST_SEEDS: Final = 99
 # a noise floor with one degree of freedom has intervals of ratios that no float holds
 _LARGEST: Final = 700.0
+Verdict = Literal["holds", "does not hold", "not decided"]
+# of the paper's schedule
+STEPS: Final = 30_000
+# the scale whose runs decide what others leave open
+JUDGE: Final = "small"
+DATASETS: Final = ("Mip-NeRF 360", "Tanks & Temples", "Deep Blending")
 
 
 @dataclass(frozen=True)
@@ -56,12 +62,24 @@ def _log(value: float | None) -> float | None:
 
 
 PSNR: Final = Quantity("PSNR", lambda r: r.psnr)
+
+
 SSIM: Final = Quantity("SSIM", lambda r: r.ssim)
+
+
 COUNT: Final = Quantity("number of Gaussians", lambda r: _log(r.num_gaussians), is_log=True)
+
+
 # a time by the clock of a CPU that may do other work is no measure of a method
 SECONDS: Final = Quantity("time", lambda r: _log(r.training_seconds) if r.is_timed else None, is_log=True)
+
+
 BLENDED: Final = Quantity("Gaussians blended a pixel", lambda r: _log(r.n_blended), is_log=True)
+
+
 VISITED: Final = Quantity("Gaussians visited a pixel", lambda r: _log(r.n_traversed), is_log=True)
+
+
 QUANTITIES: Final = (PSNR, SSIM, COUNT, SECONDS, BLENDED, VISITED)
 
 
@@ -289,13 +307,6 @@ def _quantile(df: float, together: int) -> float:
 
     return float(stdtrit(df, 1.0 - ALPHA / (2.0 * max(together, 1))))
 
-
-Verdict = Literal["holds", "does not hold", "not decided"]
-# of the paper's schedule
-STEPS: Final = 30_000
-# the scale whose runs decide what others leave open
-JUDGE: Final = "small"
-DATASETS: Final = ("Mip-NeRF 360", "Tanks & Temples", "Deep Blending")
 
 Groups = Mapping[str, Mapping[str, Group]]
 

@@ -4,7 +4,8 @@ A row is one file of `configs`, read with errors that name file and field. It na
 options in which it differs from it, on the whole schedule of the paper. Options that belong to a dataset or a scene
 alone stand in the table `[scenes]`, by its key there or by the scene's name. At a shorter schedule, step numbers are
 scaled as the program scales the defaults of a method (`DensityControl.scaled`), so that "blur from 3,000 to 4,000"
-stays a fortieth of the schedule."""
+stays a fortieth of the schedule.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +25,6 @@ from pop_ref.registry import Registry
 if TYPE_CHECKING:
     from pop_fast.train import TrainConfig
 
-
 CONFIGS: Final = Path(__file__).resolve().parent / "configs"
 # in the order of the tables; what they hold is in the files
 _OWN: Final = (
@@ -41,6 +41,13 @@ ROWS: Final[Registry[Path]] = Registry(
 )
 # floats of one Gaussian in the files whose size the tables give: gsplat's checkpoint, and Inria's PLY with its normals
 _BYTES: Final = (236, 248)
+# git ignores it; everything in it can be made again
+WORK: Final = Path(__file__).resolve().parent / "work"
+SEED: Final = 42
+# how often the held-out views are measured, evenly over the schedule: curves of Gaussians per pixel are made of these
+_MEASURED: Final = 15
+# step numbers that are settings of a run and not of its strategy
+_STEPS: Final = ("max_steps", "sh_interval", "l2_stop_iter")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -178,15 +185,6 @@ def _checked(name: str, path: Path, found: Mapping[str, Any]) -> Row:
 
 def _is_texts(value: Any) -> bool:
     return isinstance(value, list) and all(isinstance(item, str) for item in value)
-
-
-# git ignores it; everything in it can be made again
-WORK: Final = Path(__file__).resolve().parent / "work"
-SEED: Final = 42
-# how often the held-out views are measured, evenly over the schedule: curves of Gaussians per pixel are made of these
-_MEASURED: Final = 15
-# step numbers that are settings of a run and not of its strategy
-_STEPS: Final = ("max_steps", "sh_interval", "l2_stop_iter")
 
 
 class NotTrainableError(PopError):

@@ -17,6 +17,9 @@ from typing import Any, Final, Literal
 from pop_fast.errors import PopError
 
 PAPER: Final = Path(__file__).resolve().parent / "paper.toml"
+# MiB between a printed size and bytes times the printed count, both rounded; 3DGS on Mip-NeRF 360 has 1.59
+CKPT_TOLERANCE: Final = 1.6
+M360, TT, DB = "Mip-NeRF 360", "Tanks & Temples", "Deep Blending"
 
 
 @dataclass(frozen=True)
@@ -246,11 +249,6 @@ def _value(value: Any) -> float | str | tuple[float, ...]:
 def _not_comparable(found: Mapping[str, Any]) -> NotComparable:
     lists: dict[str, Any] = {key: tuple(value) for key, value in found.items() if isinstance(value, list)}
     return NotComparable(id=found["id"], why=found["why"], blocked=found.get("blocked", False), **lists)
-
-
-# MiB between a printed size and bytes times the printed count, both rounded; 3DGS on Mip-NeRF 360 has 1.59
-CKPT_TOLERANCE: Final = 1.6
-M360, TT, DB = "Mip-NeRF 360", "Tanks & Temples", "Deep Blending"
 
 
 @dataclass(frozen=True)

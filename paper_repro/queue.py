@@ -30,6 +30,14 @@ from paper_repro.status import everything, stale_files
 from paper_repro.train_row import BusyError
 from pop_fast.children import module_command
 
+# of one Gaussian in training: parameters, gradients and two moments in float32; a checkpoint has no gradients
+_TRAINING, _CHECKPOINT, _PLY = 4 * 236, 3 * 236, 248
+# besides the Gaussians and photographs: the program and its libraries, and what a GPU's renderer lists and sorts
+_PROGRAM: Final = 4 * 2**30
+# of each of the twelve renders that a row keeps for its figures: render, photograph and dominant Gaussian of a pixel
+_RENDERS, _OF_PIXEL = 12, 10
+_GIB: Final = 2**30
+
 
 @dataclass
 class Outcome:
@@ -200,15 +208,6 @@ def _merged(states: Sequence[str]) -> str:
     if done == 0 or not rest:
         return ", ".join(dict.fromkeys(states)) + (f" x {done}" if done > 1 else "")
     return f"{done} done, {', '.join(dict.fromkeys(rest))}"
-
-
-# of one Gaussian in training: parameters, gradients and two moments in float32; a checkpoint has no gradients
-_TRAINING, _CHECKPOINT, _PLY = 4 * 236, 3 * 236, 248
-# besides the Gaussians and photographs: the program and its libraries, and what a GPU's renderer lists and sorts
-_PROGRAM: Final = 4 * 2**30
-# of each of the twelve renders that a row keeps for its figures: render, photograph and dominant Gaussian of a pixel
-_RENDERS, _OF_PIXEL = 12, 10
-_GIB: Final = 2**30
 
 
 def hours(job: Job) -> float | None:

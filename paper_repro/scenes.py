@@ -22,6 +22,22 @@ from typing import Any, Final
 from pop_fast.errors import PopError
 
 FOLDER: Final = Path(__file__).resolve().parent / "scenes"
+_M360_PARENTS: Final = ("mipnerf360", "mip-nerf-360", "m360", "360_v2", "360_extra_scenes", "360", "")
+# of a scene's file: what each field must be
+_KINDS: Final = {
+    **dict.fromkeys(("dataset", "folder", "images", "source", "note"), (str, "a text")),
+    **dict.fromkeys(("order", "shrunk", "n_images"), (int, "a whole number of at least 1")),
+    **dict.fromkeys(("verified", "centred"), (bool, "true or false")),
+}
+# those that the program makes itself
+MADE: Final = ("demo", "still_life")
+# theta_blur comes to 10.7 pixels in the paper's smallest images, and to less in images smaller than those
+_FLOOR: Final = {"strategy.blur_min_pixels": 10.0}
+# Mini-Splatting's 3.5 million points are one to three of a hundred pixels of the paper's views; so many are these
+_POINTS: Final = {
+    scale: {"mini-splatting": {"strategy.reinit_points": count}}
+    for scale, count in (("toy", 3_000), ("shown", 50_000), ("small", 200_000), ("full", 1_000_000))
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +95,6 @@ class PaperScene:
         return "paper" in self.factors
 
 
-_M360_PARENTS: Final = ("mipnerf360", "mip-nerf-360", "m360", "360_v2", "360_extra_scenes", "360", "")
 DATASETS: Final = {
     "mipnerf360": Dataset(
         name="Mip-NeRF 360",
@@ -97,12 +112,6 @@ DATASETS: Final = {
         source="https://repo-sam.inria.fr/fungraph/3d-gaussian-splatting/datasets/input/tandt_db.zip",
     ),
     "further": Dataset(name="further scenes", parents=("",), source=""),
-}
-# of a scene's file: what each field must be
-_KINDS: Final = {
-    **dict.fromkeys(("dataset", "folder", "images", "source", "note"), (str, "a text")),
-    **dict.fromkeys(("order", "shrunk", "n_images"), (int, "a whole number of at least 1")),
-    **dict.fromkeys(("verified", "centred"), (bool, "true or false")),
 }
 
 
@@ -156,8 +165,6 @@ def _is_count(value: Any) -> bool:
 
 
 SCENES: Final = load_scenes()
-# those that the program makes itself
-MADE: Final = ("demo", "still_life")
 
 
 def scene_named(name: str) -> PaperScene:
@@ -226,15 +233,6 @@ def _factors(scale: str) -> dict[str, int]:
     return {scene.name: scene.factors[scale] for scene in SCENES.values() if scale in scene.factors}
 
 
-# theta_blur comes to 10.7 pixels in the paper's smallest images, and to less in images smaller than those
-_FLOOR: Final = {"strategy.blur_min_pixels": 10.0}
-
-# Mini-Splatting's 3.5 million points are one to three of a hundred pixels of the paper's views; so many are these
-_POINTS: Final = {
-    scale: {"mini-splatting": {"strategy.reinit_points": count}}
-    for scale, count in (("toy", 3_000), ("shown", 50_000), ("small", 200_000), ("full", 1_000_000))
-}
-
 _ALL: Final = (
     Scale(
         name="toy",
@@ -284,7 +282,11 @@ _ALL: Final = (
         checkpoint_every=1_000,
     ),
 )
+
+
 SCALES: Final = {scale.name: scale for scale in _ALL}
+
+
 for _scene in SCENES.values():
     for _name in _scene.factors:
         if _name not in SCALES:

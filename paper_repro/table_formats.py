@@ -21,6 +21,16 @@ COLUMNS: Final = (
     *("table", "scale", "block", "row", "name", "metric", "value", "spread", "seeds"),
     *("ours", "paper", "difference", "missing", "runs"),
 )
+PREAMBLE: Final = r"""\usepackage{booktabs}
+\usepackage{graphicx}
+\usepackage[table]{xcolor}
+\definecolor{bestred}{RGB}{255,120,120}
+\definecolor{secondorange}{RGB}{255,190,100}
+\definecolor{thirdyellow}{RGB}{255,240,100}
+"""
+_COLOURS: Final = ("", "bestred", "secondorange", "thirdyellow")
+_ARROWS: Final = {"least": r"$\downarrow$", "most": r"$\uparrow$"}
+_ESCAPES: Final = str.maketrans({**{sign: f"\\{sign}" for sign in "&%_#$"}, "±": r"$\pm$", "*": r"$^\ast$"})
 
 
 class Notes:
@@ -138,18 +148,6 @@ def csv_text(table: Table) -> str:
                     ]
                 )
     return out.getvalue()
-
-
-PREAMBLE: Final = r"""\usepackage{booktabs}
-\usepackage{graphicx}
-\usepackage[table]{xcolor}
-\definecolor{bestred}{RGB}{255,120,120}
-\definecolor{secondorange}{RGB}{255,190,100}
-\definecolor{thirdyellow}{RGB}{255,240,100}
-"""
-_COLOURS: Final = ("", "bestred", "secondorange", "thirdyellow")
-_ARROWS: Final = {"least": r"$\downarrow$", "most": r"$\uparrow$"}
-_ESCAPES: Final = str.maketrans({**{sign: f"\\{sign}" for sign in "&%_#$"}, "±": r"$\pm$", "*": r"$^\ast$"})
 
 
 def latex(table: Table) -> str:

@@ -41,6 +41,15 @@ PUBLISHED: Final = "published"
 _DEMO_SEED: Final = 0
 # of a result folder: what takes space and a finished row does not need
 _CHECKPOINTS, _PLY = "ckpts", "ply"
+# the settings in which a row may differ from its base, and for each the setting that says after which step it acts
+_ACTS_AFTER: Final = {
+    **dict.fromkeys(("method", "max_steps", "prune_shares", "rounds_start_iter", "score_divisor"), "rounds_start_iter"),
+    "sampling_factor": "sample_iter",
+}
+# what a result is collected from, besides what the checkpoint holds
+_RECORDS: Final = ("cfg.json", "metrics.jsonl", BESIDE, PROBE, "stats/*", "report_data/opacity_*")
+# of the result folder of a base: its checkpoints that rows begin from, until none needs them any more
+_KEPT: Final = "base"
 
 
 class BusyError(PopError):
@@ -284,17 +293,6 @@ def _remove_bulk(job: Job, options: Options) -> None:
     if not options.keep_ply:
         shutil.rmtree(work / _PLY, ignore_errors=True)
     remove_what_was_kept(job, *places)
-
-
-# the settings in which a row may differ from its base, and for each the setting that says after which step it acts
-_ACTS_AFTER: Final = {
-    **dict.fromkeys(("method", "max_steps", "prune_shares", "rounds_start_iter", "score_divisor"), "rounds_start_iter"),
-    "sampling_factor": "sample_iter",
-}
-# what a result is collected from, besides what the checkpoint holds
-_RECORDS: Final = ("cfg.json", "metrics.jsonl", BESIDE, PROBE, "stats/*", "report_data/opacity_*")
-# of the result folder of a base: its checkpoints that rows begin from, until none needs them any more
-_KEPT: Final = "base"
 
 
 def base_of(job: Job) -> Job | None:

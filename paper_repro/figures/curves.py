@@ -37,6 +37,12 @@ _TERMS: Final = {"grad_l1": "L1", "grad_ssim": "SSIM at 0.01", "grad_l2": "L2"}
 _OF_PROBE: Final = ("probe_traversed", "probe_blended")
 _HELD_OUT: Final = ("n_traversed", "n_blended")
 _BELOW: Final = "training step"
+_LOW, _HIGH = 0.1, 0.9
+# the capture of the paper's figure
+_SCENE: Final = "kitchen"
+# the shares that the paper states, by their ids in paper.toml
+_STATED: Final = {"below": "kitchen_frac_opacity_lt_0.1", "above": "kitchen_frac_opacity_gt_0.9"}
+_LOW_COLOR, _HIGH_COLOR, _PLAIN = color_of("gsplat"), color_of("pop"), "#b9b9b9"
 
 
 def gradients_of_losses(asked: Asked) -> Drawn:
@@ -160,14 +166,6 @@ def _table(chosen: Chosen, curves: Mapping[tuple[str, str], Curve]) -> tuple[Seq
         scenes = " ".join(chosen.scenes)
         rows += [(row, key, int(step), float(value), scenes, runs) for step, value in zip(steps, values, strict=True)]
     return ("row", "quantity", "step", "value", "scenes", "runs"), rows
-
-
-_LOW, _HIGH = 0.1, 0.9
-# the capture of the paper's figure
-_SCENE: Final = "kitchen"
-# the shares that the paper states, by their ids in paper.toml
-_STATED: Final = {"below": "kitchen_frac_opacity_lt_0.1", "above": "kitchen_frac_opacity_gt_0.9"}
-_LOW_COLOR, _HIGH_COLOR, _PLAIN = color_of("gsplat"), color_of("pop"), "#b9b9b9"
 
 
 def opacity_histogram(asked: Asked) -> Drawn:

@@ -48,7 +48,6 @@ SMALL: Final = 5.6
 _SIZE: Final = 7.0
 # of the PNG
 SAVED_DPI: Final = 300
-
 _BLACK, _ORANGE, _SKY, _GREEN = "#404040", "#E69F00", "#56B4E9", "#009E73"
 _BLUE, _VERMILION, _PURPLE = "#0072B2", "#D55E00", "#CC79A7"
 # a method keeps its colour in every figure
@@ -70,6 +69,8 @@ _METHODS: Final = {
 }
 # as in the paper: L1 red, L2 green, SSIM orange
 LOSSES: Final = {"grad_l1": _VERMILION, "grad_l2": _GREEN, "grad_ssim": _ORANGE}
+_EDGE: Final = 0.04
+_LINE: Final = SMALL * 1.3 / 72.0
 
 
 def look() -> AbstractContextManager[None]:
@@ -256,10 +257,6 @@ def darker(color: str) -> str:
     red, green, blue = to_rgb(color)
     factor = min(1.0, 0.42 / (0.2126 * red + 0.7152 * green + 0.0722 * blue))
     return to_hex((red * factor, green * factor, blue * factor))
-
-
-_EDGE: Final = 0.04
-_LINE: Final = SMALL * 1.3 / 72.0
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,14 @@ _PANEL: Final = 1.85
 _LARGEST: Final = 330.0
 # and of the smallest in which its middle is marked
 _WITH_MIDDLE: Final = 16.0
+# left, bottom, right, top in points
+Box = tuple[float, float, float, float]
+# directions from the marker, the best first
+_SIDES: Final = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1))
+# between marker and name; one that stands farther off is joined to its marker by a line
+_GAPS: Final = (2.0, 9.0, 20.0)
+# what it costs in square points covered: a point of the line that joins a name, and to seem to be another marker's name
+_JOINED, _MISTAKEN = 4.0, 120.0
 
 
 @dataclass(frozen=True)
@@ -262,17 +270,6 @@ def _table(chosen: Chosen) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
         seconds, psnr, n = _means(chosen, row)
         rows.append((row, "mean", "", "", seconds, psnr, n, ""))
     return ("row", "scene", "seed", "run", "seconds", "psnr", "num_gaussians", "machine"), rows
-
-
-# left, bottom, right, top in points
-Box = tuple[float, float, float, float]
-
-# directions from the marker, the best first
-_SIDES: Final = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1))
-# between marker and name; one that stands farther off is joined to its marker by a line
-_GAPS: Final = (2.0, 9.0, 20.0)
-# what it costs in square points covered: a point of the line that joins a name, and to seem to be another marker's name
-_JOINED, _MISTAKEN = 4.0, 120.0
 
 
 @dataclass(frozen=True)
