@@ -16,8 +16,7 @@ from typing import Any
 
 import torch
 from cases import MEMORY_CASE, Case, gaussians_of, turns
-from raster import SCENE
-from steps import Maker, engines, run_of_case, take_turn
+from steps import SCENE, Maker, engines, run_of_case, take_turn
 
 from pop_fast.api.registry import get_backend
 from pop_fast.children import python_command

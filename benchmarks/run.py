@@ -26,9 +26,21 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from cases import RASTER_CASES, STEP_CASES, capture_of
 from parts import LARGEST, bytes_per_s, floors, simulate, vector_ops_per_s
 from processes import measure, time_beside, time_startup
-from raster import backends, blend_of, gate, time_raster
 from record import commit, machine, read_json, write_json
-from steps import capture_runs, engines, first_view, run_of, run_of_case, stepping, time_capture, time_case
+from steps import (
+    backends,
+    blend_of,
+    capture_runs,
+    engines,
+    first_view,
+    gate,
+    run_of,
+    run_of_case,
+    stepping,
+    time_capture,
+    time_case,
+    time_raster,
+)
 
 from pop_fast.train.environment import keep_freed_memory, reproducible
 

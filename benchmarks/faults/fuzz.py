@@ -34,8 +34,8 @@ from pop_fast.cli.errors import describe, message
 from pop_fast.errors import PopError
 
 from .corpus import HERE, pack
-from .forks import start, wait
 from .readers import READERS, Reader
+from .runs import start, wait
 
 # of one input: seconds, bytes over what importing takes, letters of a refusal
 SECONDS, MEMORY, LONGEST = 60, 2**30, 1_300
