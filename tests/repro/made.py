@@ -145,7 +145,7 @@ def asked(figure: str, results: list[Result], folder: Path = Path("nowhere"), sc
 
 def drawn(figure: str, results: list[Result], **more) -> Drawn:
     """Draw one figure of results that are nowhere on the disk."""
-    module = {"tradeoffs": tradeoffs, "opacities": opacities, "curves": curves}[FIGURES[figure][0]]
+    module = {"tradeoffs": tradeoffs, "curves": curves}[FIGURES[figure][0]]
     with style.look():
         return getattr(module, FIGURES[figure][1])(asked(figure, results, **more))
 
