@@ -1,8 +1,12 @@
-"""The scenes that are timed: made from a seed, with the numbers that decide their cost written with the times."""
+"""The scenes that are timed, made from a seed, and times of calls that take turns, so that noise is alike for each."""
 
 from __future__ import annotations
 
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,8 +39,14 @@ RASTER_CASES = (
     Case("270x480-40k", 40_000, 270, 480),
     Case("640x480-100k", 100_000, 640, 480),
 )
+
+
 MEMORY_CASE = Case("1600x1000-300k", 300_000, 1600, 1000)
+
+
 STEP_CASES = (*RASTER_CASES, MEMORY_CASE)
+
+
 GATE_CASE = Case("gate", 40, 37, 29, 6.0)
 
 
@@ -79,3 +89,44 @@ def capture_of(case: Case, views: int = 6, seed: int = 0) -> Capture:
         made.append(View(f"{i:03d}.png", smooth[0].permute(1, 2, 0).to(torch.uint8).numpy(), viewmat, K))
     colours = rng.integers(0, 256, (case.n, 3)).astype(np.uint8)
     return Capture(case.name, tuple(made), scene["means"].numpy(), colours, "made from a seed")
+
+
+def turns(runs: Mapping[str, Callable[[], Any]], repeats: int, warm_up: int = 3) -> dict[str, list[float]]:
+    """Run each call once a turn, in changing order, and time it.
+
+    Args:
+        runs: calls by name.
+        repeats: turns that count.
+        warm_up: turns before that.
+
+    Returns:
+        The seconds of each, turn by turn.
+    """
+    names = list(runs)
+    taken: dict[str, list[float]] = {name: [] for name in names}
+    for turn in range(warm_up + repeats):
+        for name in names if turn % 2 else reversed(names):
+            start = time.perf_counter()
+            runs[name]()
+            seconds = time.perf_counter() - start
+            if turn >= warm_up:
+                taken[name].append(seconds)
+    return taken
+
+
+def turns_ms(runs: Mapping[str, Callable[[], Any]], repeats: int, warm_up: int = 3) -> dict[str, float]:
+    """Time calls in turns as `turns` does; the first is what the others are compared with.
+
+    Returns:
+        The median of each, ms, and as "b / a" the median of the ratios within a turn.
+    """
+    names, taken = list(runs), turns(runs, repeats, warm_up)
+    found = {name: 1e3 * statistics.median(times) for name, times in taken.items()}
+    for name in names[1:]:
+        found[f"{name} / {names[0]}"] = median_ratio(taken[name], taken[names[0]])
+    return found
+
+
+def median_ratio(mine: Sequence[float], its: Sequence[float]) -> float:
+    """Return the median of the ratios within a turn."""
+    return statistics.median(a / b for a, b in zip(mine, its, strict=True))

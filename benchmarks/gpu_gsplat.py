@@ -15,15 +15,14 @@ from typing import Any
 
 import torch
 from gpu_kernels import STEPS, Record, arguments, draw, forward_backward, over_scenes, photograph_of, timed
-from gpu_profile import kernel_sums
 from gpu_scenes import GpuCase
-from gpu_steps import raw_params, step_kernels, whole_step
+from gpu_steps import kernel_sums, raw_params, step_kernels, whole_step
 from torch import Tensor
 
 import cuda_ext
 from cuda_ext import load
 from cuda_ext.arrays import fill, new_state, stream_of
-from cuda_ext.training.resident import MARGIN, ResidentViews
+from cuda_ext.training.step_buffers import MARGIN, ResidentViews
 from pop_fast.cuda import rasterization
 
 LAMBDA_SSIM = 0.01

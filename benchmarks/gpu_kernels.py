@@ -6,7 +6,7 @@ Correctness first: every case begins with the gradients of the two backward fami
 not, `failed` says so. Every part of a case is written when it is there, and one that raises takes
 nothing from the others. Times are medians of CUDA events after warm-up, in milliseconds; with each stands the sum of
 the kernels' own times by the profiler, and with every kernel what it has to do at least and its floor on this card
-(`gpu_floors`). `gpu_gsplat.py` adds gsplat's times.
+(`gpu_predictions`). `gpu_gsplat.py` adds gsplat's times.
 """
 
 from __future__ import annotations
@@ -22,10 +22,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from gpu_floors import Card, floors, measured_card
-from gpu_profile import kernel_sums
+from gpu_predictions import Card, floors, measured_card
 from gpu_scenes import CASES, FULL_SIZE, TINY, GpuCase, scenes
-from gpu_steps import kernel_times, step_kernels, whole_step
+from gpu_steps import kernel_sums, kernel_times, step_kernels, whole_step
 from torch import Tensor
 
 import cuda_ext

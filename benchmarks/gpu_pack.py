@@ -27,10 +27,8 @@ from scipy.spatial.transform import Rotation
 from cuda_ext.gpu_check.command import commit_of
 from cuda_ext.gpu_check.shared import ROOT, write_json
 from paper_repro import prepared
-from paper_repro.jobs import Job
-from paper_repro.rows import load_row
-from paper_repro.scales import SCALES
-from paper_repro.scenes import SCENES, find_folder
+from paper_repro.jobs import Job, load_row
+from paper_repro.scenes import SCALES, SCENES, find_folder
 from paper_repro.train_row import load_capture_of
 from pop_fast.children import python_command
 from pop_fast.data import Capture, View, load_capture

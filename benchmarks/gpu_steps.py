@@ -1,23 +1,25 @@
-"""The fused training step on the GPU, whole and kernel by kernel."""
+"""The fused training step on the GPU, whole and kernel by kernel, by events and by the profiler.
+
+Wall times hold value checks, waits of the host and Python's own time; the profiler's sums compare kernels.
+"""
 
 from __future__ import annotations
 
 import statistics
-from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import torch
-from gpu_floors import Loads
-from gpu_profile import kernel_sums
+from gpu_predictions import Loads
 from gpu_visits import count_tried, count_visits
 from torch import Tensor
 
 from cuda_ext.render import lists
 from cuda_ext.training import step_program
-from cuda_ext.training.resident import ResidentViews
+from cuda_ext.training.step_buffers import ResidentViews
 from cuda_ext.training.train_step import FusedTrainer
 from pop_fast.train.schedule import steady_updates
 from pop_fast.train.steps import Phase, StepSettings
@@ -29,6 +31,9 @@ KERNELS = (
     *("blend_forward", "photometric", "blend_backward", "count_important", "update", "end_step"),
 )
 HEAD_START = 5_000_000  # cycles the GPU waits before a step, longer than Python needs to launch one
+LARGEST: Final = 12  # kernels that are listed by name
+# waits that the benchmark itself puts before a step
+_OURS = ("spin_kernel", "sleep")
 
 
 def raw_params(scene: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -149,3 +154,40 @@ def kernel_times(
     counted = make_trainer(scene, photograph, 1, replay=False, counts=True, **settings)
     counted.run(1, POP)
     return times, step_loads(counted)
+
+
+def kernel_sums(run: Callable[[], Any], calls: int = 10) -> dict[str, Any]:
+    """Run a few times under the profiler.
+
+    Returns:
+        `kernels_ms`: the sum of a call's kernels, copies and fills; `launches` of a call; `largest`: ms of a call by
+        kernel's name, the largest first. Where the profiler saw nothing, or cannot work here, `skipped` alone.
+    """
+    run()
+    torch.cuda.synchronize()
+    try:
+        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CUDA]) as profile:
+            for _ in range(calls):
+                run()
+            torch.cuda.synchronize()
+        events = list(profile.events() or [])
+    # wall times are not lost to a profiler that is not allowed on a machine
+    except (RuntimeError, AssertionError) as error:
+        return {"skipped": f"the profiler cannot work here: {error}"}
+    return summed(events, calls)
+
+
+def summed(events: Iterable[Any], calls: int) -> dict[str, Any]:
+    """Add up the profiler's events of the GPU; a region's name spans kernels that are counted already."""
+    times: Counter[str] = Counter()
+    launches = 0
+    for event in events:
+        on_gpu = event.device_type == torch.autograd.DeviceType.CUDA
+        if not on_gpu or getattr(event, "is_user_annotation", False) or any(name in event.name for name in _OURS):
+            continue
+        times[event.name] += event.time_range.elapsed_us() / 1e3 / calls
+        launches += 1
+    if not launches:
+        return {"skipped": "the profiler saw no kernels"}
+    largest = {name[:80]: ms for name, ms in times.most_common(LARGEST)}
+    return {"kernels_ms": sum(times.values()), "launches": launches / calls, "largest": largest}

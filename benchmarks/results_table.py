@@ -1,4 +1,4 @@
-"""The tables of training results, from the statistics of training runs.
+"""The tables of training results, from the statistics of training runs, and those of docs/reliability.md.
 
 benchmarks/results/training.jsonl has one line a run: what the run wrote into stats/val_step*.json, after its name here.
 
@@ -8,13 +8,14 @@ benchmarks/results/training.jsonl has one line a run: what the run wrote into st
 
 `python docs/tables.py --write` puts them into README.md and docs/results.md. Runs of one capture, method and weight of
 the POP term that differ in their seed share a row: means, and in brackets the smallest and largest PSNR and SSIM.
+What `benchmarks.faults` and `benchmarks.load` have written makes the tables of docs/reliability.md.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,8 @@ RESULTS = Path(__file__).resolve().parent / "results"
 RUNS = RESULTS / "training.jsonl"
 # of runs under the older reading of growth by blur, which stand in no table
 ANY_VIEW = "any_view/"
-
 Stats = dict[str, Any]
+_KINDS = ("read", "refused", "told", "escaped", "crashed", "hung")
 
 
 def table(runs: Path = RUNS) -> str:
@@ -118,6 +119,72 @@ def add(statistics: Path, name: str, runs: Path = RUNS) -> None:
     kept.append({"run": name, **json.loads(statistics.read_text(encoding="utf-8"))})
     kept.sort(key=lambda stats: (stats["run"].startswith(ANY_VIEW), stats["run"]))
     runs.write_text("".join(json.dumps(stats, separators=(",", ":")) + "\n" for stats in kept), encoding="utf-8")
+
+
+def fuzzed() -> str:
+    """Make the table of damaged files: what came of them, by reader."""
+    found = _read("faults.json")["fuzz"]["readers"]
+    total = {kind: sum(row[kind] for row in found.values()) for kind in _KINDS}
+    rows = [[name, *_outcomes(row)] for name, row in found.items()] + [["**all**", *_outcomes(total)]]
+    head = ["reader", "inputs", "read", "refused in a line", "system", "failures", "crash", "hang"]
+    return _table(head, ["---", *["---:"] * 7], rows)
+
+
+def _outcomes(row: dict[str, int]) -> list[str]:
+    # a reader that was tried again alone has its seed there too
+    counts = [row[kind] for kind in _KINDS]
+    return [f"{count:,}" for count in (sum(counts), *counts)]
+
+
+def disturbed() -> str:
+    """Make the table of runs that were killed or refused their writes, of flipped bits and of sanitizers."""
+    found = _read("faults.json")
+    rows = []
+    for kind, kills in found["kills"].items():
+        what = f"SIGKILL at random moments of `pop train`, then `--resume`: {kind}"
+        tried = f"{kills['kills']:,} kills in {kills['runs']:,} runs"
+        rows.append([what, tried, "another ending" if kills["failures"] else "the same bits", _failed(kills)])
+    for part, what in (("crashes", "the process ends before"), ("writes", "the system refuses")):
+        for job, of in found[part].items():
+            came = ", ".join(f"{of[key]} {key}" for key in ("ended", "told", "continued") if of.get(key))
+            place = f"{what} a change of the disk: {job}"
+            rows.append([place, f"{of['tried']} of {of['points']} places", came, _failed(of)])
+    for flips in found["flips"].values():
+        came = f"{flips['refused']:,} refused, {flips['the same']:,} read as before"
+        rows.append(["a flipped bit of a checkpoint", f"{flips['flips']:,}", came, _failed(flips)])
+    return _table(["what happens", "tried", "what came", "failures"], ["---", "---", "---", "---:"], rows)
+
+
+def sanitized() -> str:
+    """Make the table of sanitizers: what was run under which, and of every unit how many of its lines ran."""
+    found = _read("faults.json")["sanitizers"]
+    rows = [
+        [name, of["about"], ", ".join(of.get("told", [])) or f"not tried: {of['skipped']}", _failed(of)]
+        for name, of in found["checks"].items()
+    ]
+    rows += [[f"`{unit}`", "", f"{run} of {of} lines ran", ""] for unit, (run, of) in found["lines"].items()]
+    return _table(["what", "under", "tried", "failures"], ["---", "---", "---", "---:"], rows)
+
+
+def _failed(result: dict[str, Any]) -> str:
+    return str(len(result["failures"]))
+
+
+def loads() -> str:
+    """Make the table of large captures and splats: the memory that they took, and the bound that was stated."""
+    rows = []
+    for name, found in _read("load.json")["cases"].items():
+        size = f"{found['width']} x {found['height']}"
+        rows.append([name, size, f"{found['peak_gib']:.2f} GiB", f"{found['bound_gib']:.2f} GiB", found["backend"]])
+    return _table(["load", "photograph or render, px", "peak", "bound", "backend"], ["---"] * 5, rows)
+
+
+def _read(name: str) -> dict[str, Any]:
+    return dict(json.loads((RESULTS / name).read_text(encoding="utf-8")))
+
+
+def _table(head: Sequence[str], rule: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, rule, *rows))
 
 
 def main(words: list[str]) -> int:

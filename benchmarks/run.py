@@ -23,16 +23,24 @@ from typing import Any
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
-from busy import time_beside
 from cases import RASTER_CASES, STEP_CASES, capture_of
-from cores import simulate
-from memory import measure
-from parts import floors
-from peak import LARGEST, bytes_per_s, vector_ops_per_s
-from raster import backends, blend_of, gate, time_raster
+from parts import LARGEST, bytes_per_s, floors, simulate, vector_ops_per_s
+from processes import measure, time_beside, time_startup
 from record import commit, machine, read_json, write_json
-from startup import time_startup
-from steps import capture_runs, engines, first_view, run_of, run_of_case, stepping, time_capture, time_case
+from steps import (
+    backends,
+    blend_of,
+    capture_runs,
+    engines,
+    first_view,
+    gate,
+    run_of,
+    run_of_case,
+    stepping,
+    time_capture,
+    time_case,
+    time_raster,
+)
 
 from pop_fast.train.environment import keep_freed_memory, reproducible
 

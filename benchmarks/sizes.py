@@ -1,9 +1,15 @@
-"""What a splat measures in each file format, whole and pruned: bytes against held-out PSNR.
+"""What a splat measures in each file format: bytes against held-out PSNR, whole, pruned and within a budget.
 
     python benchmarks/sizes.py out/fox out/bonsai --json benchmarks/results/sizes.json
+    python benchmarks/sizes.py out/fox out/bonsai --budgets --json benchmarks/results/budgets.json
 
 Every file is written by `pop export` and measured by `pop eval`, as a user would. A result of the same capture that the
-JSON already holds is replaced, others are kept. `docs/formats.py` makes the table of docs/FORMATS.md from it.
+JSON already holds is replaced, others are kept. `docs/formats.py` makes the tables of docs/FORMATS.md from it.
+
+A budget is a tenth and a twentieth of the PLY's bytes. For every format and budget: fewer Gaussians alone, those of the
+highest sensitivity, found by the search that export used before it had budgets; `--target-mb --fine-tune-steps 0`,
+which spends harmonics and rounding too; and `--target-mb`, which also trains what is left. The whole splat is measured
+as it is and after as many steps as the last kind takes, because its training may not have been at its end.
 """
 
 from __future__ import annotations
@@ -13,22 +19,36 @@ import json
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
-if __package__ in (None, ""):
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import torch
 
 from benchmarks.record import machine, read_json, write_json
 from pop_fast.children import module_command
-from pop_fast.io.formats import FORMATS
+from pop_fast.cli.options import LimitOptions
+from pop_fast.data import to_capture_frame
+from pop_fast.density import shrink
+from pop_fast.density.passes import Passes
+from pop_fast.io.formats import FORMATS, encoded, save_as
+from pop_fast.train.compact import TRIAL, Tuner
+from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
+from pop_fast.train.views import ViewTensors, evenly
+
+if __package__ in (None, ""):
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 PLY_BYTES: Final = 248
 # of all blending weights, what --final-prune takes away
 SHARES: Final = (0.0, 0.002, 0.003)
 _NAMES: Final = tuple(name for name in FORMATS if name not in ("gltf", "gltf-spz"))
+# of the bytes of the whole splat's PLY
+BUDGETS: Final = (10, 20)
+# training views that Gaussians are scored over, at most, as by `pop export`
+_SCORED: Final = 100
 
 
 def pop(*arguments: str) -> None:
@@ -71,21 +91,89 @@ def rows(result: Path, shares: tuple[float, ...] = SHARES) -> Iterator[dict[str,
                 }
 
 
+def in_whole(result: Path, whole: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """Measure a result in every format and with every share pruned, and give what is known of it."""
+    yield {"gaussians": whole["num_GS"], "psnr": whole["psnr"], "rows": list(rows(result))}
+
+
+if __package__ in (None, ""):
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+
+def rows_of_budgets(result: Path, names: list[str], steps: int) -> Iterator[dict[str, Any]]:
+    """Export and measure a result in every format and budget.
+
+    Yields:
+        format, share, bytes, and of each kind ("fewer", "spent", "tuned") bytes, gaussians, psnr.
+    """
+    run, splat = resolved(result), load_splat(result)
+    capture, config = open_capture(splat, CaptureOptions())
+    views = [ViewTensors.of(view) for view in evenly(capture.train_views(config.test_every), _SCORED)]
+    scores = shrink.view_scores("sensitivity", Passes.of(config.backend, views, config), splat.params, splat.sh_degree)
+    own = to_capture_frame(splat.params, capture.world_transform)
+    given = ["--capture", run["data"], "--own-frame", "--factor", str(run["factor"])]
+    for name in names:
+        for share in BUDGETS:
+            most = PLY_BYTES * len(scores) // share
+            row: dict[str, Any] = {"format": name, "share": share, "bytes": most}
+            with TemporaryDirectory() as scratch:
+                file = Path(scratch) / f"fewer{FORMATS[name].suffix}"
+                kept = shrink.best_within(
+                    scores, most, lambda kept, name=name: len(encoded(name, {k: v[kept] for k, v in own.items()}))
+                )
+                save_as(file, name, {key: value[kept] for key, value in own.items()}, splat.config.antialiased)
+                row["fewer"] = _file(file, given)
+                for kind, count in (("spent", 0), ("tuned", steps)):
+                    file, began = Path(scratch) / f"{kind}{FORMATS[name].suffix}", time.perf_counter()
+                    words = ["--target-mb", f"{most / 1e6:.6f}", "--fine-tune-steps", str(count)]
+                    pop("export", str(result), "--to", name, "--out", str(file), *words)
+                    row[kind] = {"seconds": round(time.perf_counter() - began, 1), **_file(file, given)}
+            yield row
+
+
+def _file(file: Path, given: list[str]) -> dict[str, Any]:
+    stats = measured(file, file.parent, *given)
+    return {"bytes": file.stat().st_size, "gaussians": stats["num_GS"], "psnr": stats["psnr"]}
+
+
+def whole_tuned(result: Path, steps: int) -> float:
+    """Return the held-out PSNR of the whole splat after the steps of a trial and of fine-tuning."""
+    splat = load_splat(result)
+    capture, config = open_capture(splat, CaptureOptions())
+    tuner = Tuner(splat.params, splat.sh_degree, config, capture, {}, steps, lambda *_: None)
+    params = tuner.tuned(tuner.tuned(tuner.whole, round(TRIAL * steps)), steps)
+    return tuner.psnr(params, tuner.held_out)
+
+
+def within_budgets(result: Path, whole: dict[str, Any], names: list[str]) -> Iterator[dict[str, Any]]:
+    """Measure a result in every format and budget, and give what is known of it after each."""
+    steps = LimitOptions().fine_tune_steps
+    entry = {"gaussians": whole["num_GS"], "psnr": whole["psnr"], "psnr_tuned": whole_tuned(result, steps)}
+    entry |= {"factor": resolved(result)["factor"], "rows": []}
+    for row in rows_of_budgets(result, names, steps):
+        entry["rows"].append(row)
+        yield entry
+
+
 def main() -> int:
     """Measure results and write the JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("results", type=Path, nargs="+", help="result folders of pop train")
+    parser.add_argument("--budgets", action="store_true", help="within a tenth and a twentieth of the PLY's bytes")
+    parser.add_argument("--formats", nargs="+", default=["spz", "sog"], help="that files within budgets are written in")
     parser.add_argument("--json", type=Path, required=True, help="where to write")
     args = parser.parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    record = read_json(args.json)
-    captures = dict(record.get("captures", {}))
+    torch.set_num_threads(1)
+    captures = dict(read_json(args.json).get("captures", {}))
+    steps = {"steps": LimitOptions().fine_tune_steps} if args.budgets else {}
     for result in args.results:
         with TemporaryDirectory() as scratch:
             whole = measured(result, Path(scratch))
-        entry = {"gaussians": whole["num_GS"], "psnr": whole["psnr"], "rows": list(rows(result))}
-        captures[Path(resolved(result)["data"]).name] = entry
-        write_json(args.json, {"machine": machine(), "ply_bytes": PLY_BYTES, "captures": captures})
+        found = within_budgets(result, whole, args.formats) if args.budgets else in_whole(result, whole)
+        for entry in found:
+            captures[Path(resolved(result)["data"]).name] = entry
+            write_json(args.json, {"machine": machine(), "ply_bytes": PLY_BYTES, **steps, "captures": captures})
     return 0
 
 

@@ -1,9 +1,10 @@
-"""Where the CUDA compiler is: the toolkit on this machine, or NVIDIA's pip wheels in this environment."""
+"""Where compilers are: nvcc, of the toolkit on this machine or of NVIDIA's pip wheels, and a C++ compiler."""
 
 from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sysconfig
@@ -12,7 +13,6 @@ from pathlib import Path
 NVCC_FLAGS = ("-std=c++17", "-O3", "--expt-relaxed-constexpr", "-lineinfo")
 # Turing is the oldest that CUDA 13 compiles for; older cards need a 12.x toolkit
 OLDEST = 75
-TESTED_ARCHS = ("sm_75", "sm_80", "sm_90")
 
 
 def _candidates() -> list[Path]:
@@ -58,3 +58,21 @@ def link_flags(nvcc: str) -> list[str]:
     root = Path(nvcc).resolve().parent.parent
     here, usual = root / "lib" / "libcudart_static.a", root / "lib64" / "libcudart_static.a"
     return [f"-L{here.parent}"] if here.exists() and not usual.exists() else []
+
+
+def find_compiler() -> list[str] | None:
+    """Return the command of a C++17 compiler: what CXX says where it is set, else g++, clang++ or c++; None without."""
+    given = shlex.split(os.environ.get("CXX", ""))
+    for command in [given] if given else [["g++"], ["clang++"], ["c++"]]:
+        found = shutil.which(command[0])
+        if found:
+            return [found, *command[1:]]
+    return None
+
+
+def no_compiler() -> str:
+    """Return one sentence on why `find_compiler` found none and what to do."""
+    given = os.environ.get("CXX", "").strip()
+    if given:
+        return f"CXX is {given!r}, which is not on this machine; set it to a C++ compiler's path, or unset it"
+    return "no C++ compiler was found; install g++ or clang++, or set CXX to one's path"

@@ -154,7 +154,7 @@ def _budgets(record: dict[str, Any]) -> str:
 `--preset quick` as above, which ends before the splat is as good as it gets: what is tuned can be better than the
 whole.
 "Fewer Gaussians alone" is what `--target-mb` did before, "harmonics and digits too" is `--fine-tune-steps 0`, the last
-column the default of {record["steps"]} steps (`benchmarks/budgets.py`).
+column the default of {record["steps"]} steps (`benchmarks/sizes.py --budgets`).
 
 {_table(head, rows)}
 

@@ -7,31 +7,212 @@ python docs/tables.py --check    exit with 1 when a page holds something else
 
 from __future__ import annotations
 
+import ast
 import json
 import re
 import runpy
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
-import kit_tables
-from kit_tables import MUTANT_LIST, table
-from stages import ROOT, STAGES, files, functions, laws
 
 from paper_repro.claims_page import outcome as outcome_of
 from paper_repro.methods import load_pinned
 from paper_repro.status import everything, status_table
 from pop_fast.train.presets import METHODS, options_for
+from pop_ref.conformance.capabilities import STAGES as KIT_STAGES
+from pop_ref.conformance.law_coverage import LIMITS, reason
+from pop_ref.conformance.mutants import BLACK_BOXES, FAMILIES, MUTANTS, PROGRAM
+from pop_ref.conformance.mutants.trial import every_law
+from pop_ref.conformance.scorecard import outcomes
+from pop_ref.conformance.teeth import UNITS
 from pop_ref.constants import GSPLAT_1_5, GSPLAT_1_6, INRIA, PAPER, SPEEDY_SPLAT
 from pop_ref.notation import SYMBOLS
 from pop_ref.recipes import BASELINES, L1_DIVIDED, RECIPES
 
+ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
 PAGES = (README, *sorted(path for path in (ROOT / "docs").glob("*.md") if path.name != "MUTANTS.md"))
-CPU_TIMES = ROOT / "benchmarks" / "results" / "cpu.json"
+RESULTS = ROOT / "benchmarks" / "results"
+CPU_TIMES = RESULTS / "cpu.json"
+MUTANT_LIST = ROOT / "docs" / "MUTANTS.md"
+CARDS = RESULTS / "scorecards"
+TEETH = RESULTS / "teeth.json"
+LAW_COVERAGE = RESULTS / "law_coverage.json"
+KILLS = RESULTS / "kills.json"
+VECTOR_KILLS = RESULTS / "vector_kills.json"
+# the judged, in the order of their columns, and the card that each stands on
+JUDGED = {
+    "pop_fast float64": ("pop_fast.json", "fast64"),
+    "pop_fast float32": ("pop_fast.json", "fast32"),
+    "compiled float64": ("compiled.json", "compiled64"),
+    "compiled float32": ("compiled.json", "compiled32"),
+    "host mirror float64": ("host_mirror.json", "mirror64"),
+    "host mirror float32": ("host_mirror.json", "mirror32"),
+    "gsplat torch float64": ("gsplat.json", "gsplat-torch64"),
+    "gsplat torch float32": ("gsplat.json", "gsplat-torch32"),
+}
+
+OURS = {title: judged for title, judged in JUDGED.items() if not title.startswith("gsplat")}
+
+MUTANT_HEAD = """# Mutants
+
+Made by `python docs/tables.py --write`; a test holds it to the code.
+
+{n} copies of the oracle and {programs} of the program that trains, each with one line broken as somebody once broke it.
+A kit that lets one live is not worth its time, so for each a law is named that breaks on it within the `ci` profile;
+`tests/meta/test_mutants.py` tries them all. `python -m pop_ref.conformance.mutants` puts them on trial again, `--every`
+lists all laws that notice.
+
+"""
+
+BOX_HEAD = """
+
+## Behind gsplat's signature
+
+{n} rasterizers that draw one small view rightly and break one argument around it, or two together, judged as any
+`--rasterizer` is: by what they return alone.
+
+"""
+RECIPE_NOTES = {
+    "POP": "the whole method",
+    "L2": "the module ablation's first row: no blur rule, no POP term, no reset",
+    "Reset": "opacity reset in place of the POP term",
+    "3DGS": "Inria's code, with its rasterizer's constants",
+    "3DGS 2023": "the same before its opacities moved half as fast; the next four are built on it or on 3DGS",
+    "gsplat": "gsplat's default strategy",
+    "PUP-3DGS": "two rounds of pruning by Fisher blocks and refining, after a whole training",
+    "Mini-Splatting": "blur split, depth re-initialization, sampling and pruning by importance",
+    "Taming-3DGS": "growth to a budget, by sampling from a score",
+    "Speedy-Splat": "exact tile lists, soft and hard pruning by sensitivity",
+}
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A row of the Rosetta table: the modules that hold a step have the same names in each room."""
+
+    title: str
+    paper: str
+    modules: tuple[str, ...]
+    also_fast: tuple[str, ...] = ()  # files of pop_fast under other names, where torch or gsplat's interface sets them
+    also_cuda: tuple[str, ...] = ()  # files of cuda_ext/csrc that hold several stages
+
+
+_SCORES = ("scores.cuh", "scores.cu")
+
+STAGES = (
+    Stage("raw parameters to scales, opacities, unit quaternions", "3.1", ("activations",), ("stages/covariance.py",)),
+    Stage("covariances from rotations and scales", "3.1", ("covariance",)),
+    Stage("spherical harmonics to colour", "3.1", ("harmonics",)),
+    Stage("world to camera, near plane", "3.1", ("camera",), ("stages/projection.py",)),
+    Stage("projection of means and covariances (EWA)", "3.1", ("projection",)),
+    Stage("low-pass, conics, extents, off-screen cull", "3.1", ("footprint",), ("stages/projection.py",)),
+    Stage("tile lists in depth order", "3.1", ("tiles",), ("compiled/compositing.py",)),
+    Stage("falloff and alpha of one splat at one pixel", "eqs. 1, 11", ("alpha",), ("stages/blend/tile_groups.py",)),
+    Stage("blending with early ray termination", "eq. 1", ("compositing", "pixel"), ("compiled/compositing.py",)),
+    Stage("dominant Gaussians", "eq. 5", ("dominance",), ("stages/compositing.py",)),
+    Stage("a whole view", "eq. 1", ("render", "splatting", "depth"), ("api/rasterize.py", "compiled/splatting.py")),
+    Stage(
+        "L1, L2, SSIM and both objectives",
+        "eqs. 2, 4, 9",
+        ("losses", "ssim", "loss_magnitudes"),
+        ("compiled/losses.py",),
+    ),
+    Stage("importance mask and POP loss", "eqs. 7, 8", ("polarization",)),
+    Stage("terms for few photographs: sparse depth, mean opacity, mean scale", "–", ("regularizers",)),
+    Stage("density control", "eqs. 3, 6", ("density", "density_config", "density_rows")),
+    Stage("Adam and its schedules", "4.1", ("optimizer",), ("train/model.py", "train/schedule.py")),
+    Stage("exposure of photographs, random backgrounds", "–", ("appearance",), ("train/appearance.py",)),
+    Stage("corrections of cameras", "–", ("refinement",), ("stages/appearance.py",)),
+    Stage("one training step", "eq. 9", ("training", "recipes"), ("train/torch_stepper.py",)),
+    Stage(
+        "sums of weights, pixels and distances over a view",
+        "4.2",
+        ("contributions",),
+        ("compiled/scores.py",),
+        _SCORES,
+    ),
+    Stage(
+        "Speedy-Splat's score",
+        "4.2",
+        ("sensitivity",),
+        ("stages/contributions.py", "compiled/scores.py"),
+        _SCORES,
+    ),
+    Stage(
+        "PUP 3D-GS's score",
+        "4.2",
+        ("fisher",),
+        ("stages/contributions.py", "compiled/scores.py"),
+        _SCORES,
+    ),
+    Stage(
+        "Mini-Splatting's points and importance", "4.2", ("chord", "mini_splatting"), ("compiled/scores.py",), _SCORES
+    ),
+    Stage("Taming-3DGS's budget and score", "4.2", ("taming",)),
+    Stage("selection by score, by mass, by draw", "4.2", ("selection",)),
+    Stage("exact tile lists (SnugBox, AccuTile)", "4.2", ("tight_tiles",), ("stages/tiles.py",)),
+    Stage(
+        "distance of every decision from flipping", "–", ("margins", "extent_margins", "pixel_margins", "magnitudes")
+    ),
+)
+
+# modules of pop_ref that are data or types, not stages
+NOT_STAGES = frozenset(
+    {"__init__", "_shapes", "ambiguities", "constants", "notation", "records", "registry", "settings"}
+    # whole trainings of the methods, which the laws of strategies and of steps are held to, and what they train
+    | {"methods", "scripted", "short_training"}
+)
+# stages whose laws stand in a file of another name: whole views, and what is tested elsewhere
+LAWS_ELSEWHERE = {
+    "render": "pop_ref/conformance/laws/test_whole.py",
+    "depth": "pop_ref/conformance/laws/test_signature_arguments.py",
+    "training": "tests/golden",
+    "appearance": "tests/oracle/test_appearance.py",
+    "refinement": "tests/oracle/test_appearance.py",
+    "regularizers": "tests/oracle/test_losses.py",
+    "margins": "tests/oracle/test_margins.py",
+}
+
+
+def functions(path: Path) -> dict[str, list[str]]:
+    """Give the public functions of a source file, in order, each with its parameters' names."""
+    if not path.is_file():
+        return {}
+    found = (n for n in ast.parse(path.read_text(encoding="utf-8")).body if isinstance(n, ast.FunctionDef))
+    return {f.name: [a.arg for a in (*f.args.args, *f.args.kwonlyargs)] for f in found if f.name[0] != "_"}
+
+
+def files(room: str, stage: Stage) -> Iterator[Path]:
+    """Give the files of a stage in one room, where they exist."""
+    suffixes = (".cuh", ".cu") if room == "cuda_ext/csrc" else (".py",)
+    folder = ROOT / ("pop_fast/stages" if room == "pop_fast" else room)
+    for module in stage.modules:
+        for suffix in suffixes:
+            path = folder / f"{module}{suffix}"
+            if path.is_file():
+                yield path
+    if room == "pop_fast":
+        yield from (ROOT / room / name for name in stage.also_fast)
+    if room == "cuda_ext/csrc":
+        yield from (ROOT / room / name for name in stage.also_cuda)
+
+
+def laws(stage: Stage) -> Iterator[Path]:
+    """Give the law files of a stage, those of its modules, or the place named in `LAWS_ELSEWHERE`."""
+    for module in stage.modules:
+        if module in LAWS_ELSEWHERE:
+            yield ROOT / LAWS_ELSEWHERE[module]
+        folder = ROOT / "pop_ref" / "conformance" / "laws"
+        yield from sorted(folder.glob(f"test_{module}.py"))
+        yield from sorted(folder.glob(f"test_{module}_*.py"))
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Make a Markdown table."""
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows))
 
 
 def rosetta() -> str:
@@ -79,20 +260,6 @@ def recipes() -> str:
     return table(["row of the paper", "command", ""], rows)
 
 
-RECIPE_NOTES = {
-    "POP": "the whole method",
-    "L2": "the module ablation's first row: no blur rule, no POP term, no reset",
-    "Reset": "opacity reset in place of the POP term",
-    "3DGS": "Inria's code, with its rasterizer's constants",
-    "3DGS 2023": "the same before its opacities moved half as fast; the next four are built on it or on 3DGS",
-    "gsplat": "gsplat's default strategy",
-    "PUP-3DGS": "two rounds of pruning by Fisher blocks and refining, after a whole training",
-    "Mini-Splatting": "blur split, depth re-initialization, sampling and pruning by importance",
-    "Taming-3DGS": "growth to a budget, by sampling from a score",
-    "Speedy-Splat": "exact tile lists, soft and hard pruning by sensitivity",
-}
-
-
 def methods() -> str:
     """Make a table a method: every setting that decides a training, its value, and where its source says so."""
     parts = []
@@ -124,39 +291,24 @@ def outcome() -> str:
     return outcome_of(everything())
 
 
-def results() -> str:
-    """Make the table of training runs, as benchmarks/results_table.py does."""
-    return str(runpy.run_path(str(ROOT / "benchmarks" / "results_table.py"))["table"]())
-
-
-def summary() -> str:
-    """Make README's short table of training runs, as benchmarks/results_table.py does."""
-    return str(runpy.run_path(str(ROOT / "benchmarks" / "results_table.py"))["summary"]())
-
-
-def differences() -> str:
-    """Make the table of POP less gsplat's strategy, as benchmarks/results_table.py does."""
-    return str(runpy.run_path(str(ROOT / "benchmarks" / "results_table.py"))["differences"]())
+def _of_runs(name: str) -> Callable[[], str]:
+    """Make a table of training runs, of damaged input or of large loads, as benchmarks/results_table.py does."""
+    return lambda: str(runpy.run_path(str(ROOT / "benchmarks" / "results_table.py"))[name]())
 
 
 def few_photographs() -> str:
     """Make the table of captures with few photographs left, as benchmarks/few_photographs.py does."""
     script = runpy.run_path(str(ROOT / "benchmarks" / "few_photographs.py"))
-    known = json.loads((ROOT / "benchmarks" / "results" / "few_photographs.json").read_text(encoding="utf-8"))
+    known = json.loads((RESULTS / "few_photographs.json").read_text(encoding="utf-8"))
     return str(script["table_of"](known, ("--depth-lambda 0.1", "--depth-lambda 0.01", "--method gsplat")))
 
 
 def estimates() -> str:
     """Make the table of what runs without a preset foretold and took, as benchmarks/estimates.py does."""
-    known = json.loads((ROOT / "benchmarks" / "results" / "estimates.json").read_text(encoding="utf-8"))
+    known = json.loads((RESULTS / "estimates.json").read_text(encoding="utf-8"))
     machine = known["machine"]
     made = str(runpy.run_path(str(ROOT / "benchmarks" / "estimates.py"))["table_of"](known))
     return f"{made}\n\n{machine['cpu']}, one thread, commit {machine['commit']}."
-
-
-def _of_faults(name: str) -> Callable[[], str]:
-    """Make a table as benchmarks/fault_tables.py does."""
-    return lambda: str(runpy.run_path(str(ROOT / "benchmarks" / "fault_tables.py"))[name]())
 
 
 def blocks() -> str:
@@ -191,30 +343,175 @@ def _speed_row(what: str, ms: dict[str, float]) -> list[str]:
     return [what, f"{ms['fast']:.0f} ms", f"{ms['compiled']:.0f} ms", f"{ms['compiled / fast']:.2f}"]
 
 
+def kit() -> str:
+    """Say how much the kit holds."""
+    where = f"[{MUTANT_LIST.name}]({MUTANT_LIST.relative_to(ROOT).as_posix()})"
+    return (
+        f"{len(every_law())} laws in {len(KIT_STAGES)} stages; {len(MUTANTS)} mutants of the oracle and {len(PROGRAM)} "
+        f"of the program that trains, and {len(BLACK_BOXES)} rasterizers that break arguments, every one of them "
+        f"killed by a named law within the `ci` profile: {where}."
+    )
+
+
+def scorecards() -> str:
+    """Make the table of what the kit found: rows are stages, cells say laws passed, failed and skipped."""
+    columns = [card(file)["summary"][backend] for file, backend in JUDGED.values()]
+    rows = [[stage, *(_counts(column[stage]) for column in columns)] for stage in KIT_STAGES]
+    total = [{key: sum(column[s][key] for s in KIT_STAGES) for key in column[KIT_STAGES[0]]} for column in columns]
+    head = ["stage", *JUDGED]
+    return table(head, [*rows, ["**all**", *(f"**{_counts(count)}**" for count in total)]])
+
+
+def _counts(count: dict[str, int]) -> str:
+    if not count["passed"] + count["failed"]:
+        return f"– ({count['skipped']})"
+    broken = f", {count['failed']} broken" if count["failed"] else ""
+    return f"{count['passed']}{broken}" + (f" ({count['skipped']})" if count["skipped"] else "")
+
+
+def card(file: str) -> dict[str, Any]:
+    """Read a scorecard."""
+    return dict(json.loads((CARDS / file).read_text(encoding="utf-8")))
+
+
+def broken_laws() -> str:
+    """List the laws that a judged backend breaks."""
+    lines = []
+    for title, (file, backend) in JUDGED.items():
+        for of_stage in card(file)["laws"][backend].values():
+            names = [law for law, came in outcomes(of_stage).items() if came.startswith("failed")]
+            lines += [f"- {title}: {law.replace('_', ' ')}" for law in names]
+    return "\n".join(lines) or "None is broken."
+
+
+def surfaces() -> str:
+    """Make the table of how much of each judged backend the laws reach, and of what they cost."""
+    rows = []
+    for title, (file, backend) in JUDGED.items():
+        told = card(file)
+        surface, counts, cpu = told["surface"][backend], told["summary"][backend].values(), told["made"]["cpu seconds"]
+        tried, every = sum(c["passed"] + c["failed"] for c in counts), sum(sum(c.values()) for c in counts)
+        groups = [surface[group] for group in ("whole views", "arguments", "stage functions")]
+        reached = [f"{len(g['offered'])} of {len(g['offered']) + len(g['not'])}" for g in groups]
+        rows.append([title, f"{tried} of {every}", str(cpu[backend]), surface["profile"], *reached])
+    head = ["", "laws tried", "CPU seconds", "constants", "of whole views", "of gsplat's arguments", "stage functions"]
+    return table(head, rows)
+
+
+def power() -> str:
+    """Make the table of what the kit kills, and of sound backends that it refuses."""
+    of_laws, vectors = (json.loads(path.read_text(encoding="utf-8")) for path in (KILLS, VECTOR_KILLS))
+    rows = []
+    for family in FAMILIES:
+        count = len(of_laws[family])
+        killed = sum(None not in of.values() for of in of_laws[family].values())
+        noticed = sum(first is not None for first in vectors[family].values())
+        rows.append([family, str(count), f"{killed} of {count}", f"{noticed} of {len(vectors[family])}"])
+    failed = {title: sum(c["failed"] for c in card(file)["summary"][b].values()) for title, (file, b) in OURS.items()}
+    refused = sum(1 for count in failed.values() if count)
+    of_vectors = [first for first in vectors["sound"].values() if first is not None]
+    sound = f"{refused} of {len(failed)} refused", f"{len(of_vectors)} of {len(vectors['sound'])} refused"
+    rows.append(["sound backends of this project", "", *sound])
+    return table(
+        ["broken on purpose", "mutants", "killed in every precision", "noticed by the portable vectors alone"], rows
+    )
+
+
+def reached() -> str:
+    """Make the tables of what laws reach: ranges of arguments, and lines of the oracle that none runs."""
+    logged = json.loads(LAW_COVERAGE.read_text(encoding="utf-8"))
+    ranges = [[name, f"{low:.3g}", f"{high:.3g}", LIMITS[name]] for name, (low, high) in logged["ranges"].items()]
+    choices = [[name, ", ".join(f"`{value}`" for value in values)] for name, values in logged["choices"].items()]
+    lines, refusals, others = 0, 0, dict[tuple[str, str], int]()
+    for file, found in logged["modules"].items():
+        lines += found["lines"]
+        for function, _ in found["unreached"]:
+            why = reason(file, function)
+            refusals += why is None
+            if why is not None:
+                others[file, why] = others.get((file, why), 0) + 1
+    rows = [[f"`{file}`", str(count), why] for (file, why), count in others.items()]
+    rows.append(["all", str(refusals), "arguments are refused: tests of the oracle give wrong ones, laws give none"])
+    run = lines - refusals - sum(others.values())
+    said = f"Of {lines:,} lines in the oracle's functions the laws run {run:,}. The others:"
+    return "\n\n".join((
+        table(["argument", "least", "largest", "why no further"], ranges),
+        table(["argument", "values"], choices),
+        said,
+        table(["module", "lines not reached", "why"], rows),
+    ))  # fmt: skip
+
+
+def teeth() -> str:
+    """Make the table of the smallest errors that the kit notices, and of what sound backends need of its tolerances."""
+    kept = json.loads(TEETH.read_text(encoding="utf-8"))
+    single, double = kept["float32"], kept["float64"]
+
+    def needed(of: dict[str, dict[str, float]], name: str) -> str:
+        share = of["sound"].get(name, of["sound"]["image"])
+        return f"{100.0 * share:.2g} %"
+
+    rows = [
+        [
+            f"`{name}`" if name.startswith("v_") else f"{name}, {UNITS.get(name, 'share of itself')}",
+            *(f"{of['teeth'][name]:.1e}" for of in (single, double)),
+            *(needed(of, name) for of in (single, double)),
+        ]
+        for name in single["teeth"]
+    ]
+    head = ["error in", "float32 notices", "float64 notices", "sound float32 needs", "sound float64 needs"]
+    return table(head, rows)
+
+
+def mutants() -> str:
+    """Make the list of mutants: what was broken in which file, and the law that notices."""
+    every = every_law()
+    rows = [
+        [
+            m.name.replace("_", " "),
+            m.story.replace("|", "\\|"),
+            f"`{m.package}/{m.file}`",
+            every[m.law].stage,
+            m.law.partition(":")[2].replace("_", " "),
+        ]
+        for m in (*MUTANTS, *PROGRAM)
+    ]
+    head = MUTANT_HEAD.format(n=len(MUTANTS), programs=len(PROGRAM))
+    boxes = [[b.name.replace("_", " "), b.story, b.law.partition(":")[2].replace("_", " ")] for b in BLACK_BOXES]
+    return "".join(
+        (
+            head,
+            table(["mutant", "what happened", "file", "stage", "killed by"], rows),
+            BOX_HEAD.format(n=len(BLACK_BOXES)),
+            table(["black box", "what it does", "killed by"], boxes),
+        )
+    )
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "rosetta": rosetta,
     "conventions": conventions,
     "profiles": profiles,
     "speed": speed,
-    "summary": summary,
-    "results": results,
-    "differences": differences,
+    "summary": _of_runs("summary"),
+    "results": _of_runs("table"),
+    "differences": _of_runs("differences"),
     "few_photographs": few_photographs,
     "estimates": estimates,
-    **{name: _of_faults(name) for name in ("fuzzed", "disturbed", "sanitized", "loads")},
+    **{name: _of_runs(name) for name in ("fuzzed", "disturbed", "sanitized", "loads")},
     "blocks": blocks,
     "recipes": recipes,
     "methods": methods,
     "reproduction": reproduction,
     "settled": outcome,
     "outcome": outcome,
-    "kit": kit_tables.kit,
-    "teeth": kit_tables.teeth,
-    "scorecards": kit_tables.scorecards,
-    "surfaces": kit_tables.surfaces,
-    "power": kit_tables.power,
-    "reached": kit_tables.reached,
-    "broken": kit_tables.broken_laws,
+    "kit": kit,
+    "teeth": teeth,
+    "scorecards": scorecards,
+    "surfaces": surfaces,
+    "power": power,
+    "reached": reached,
+    "broken": broken_laws,
 }
 
 
@@ -255,10 +552,10 @@ def main(words: list[str]) -> int:
     if "--write" in words:
         for page in PAGES:
             page.write_text(with_tables(page), encoding="utf-8")
-        MUTANT_LIST.write_text(f"{kit_tables.mutants()}\n", encoding="utf-8")
+        MUTANT_LIST.write_text(f"{mutants()}\n", encoding="utf-8")
         return 0
     stale = [page.name for page in PAGES if with_tables(page) != page.read_text(encoding="utf-8")]
-    stale += [MUTANT_LIST.name] if MUTANT_LIST.read_text(encoding="utf-8") != f"{kit_tables.mutants()}\n" else []
+    stale += [MUTANT_LIST.name] if MUTANT_LIST.read_text(encoding="utf-8") != f"{mutants()}\n" else []
     for name in stale:
         print(f"{name}: a table is not what sources and runs say; run 'python docs/tables.py --write'")
     return 1 if stale else 0

@@ -1,7 +1,7 @@
 """The paper's claims, each as comparisons that the runs of one scale bear out or do not.
 
 Bounds are the paper's own numbers wherever it has any; on other photographs they are a yardstick only. How a comparison
-is decided is in `paper_repro.noise`, how scenes and readings are put together in `paper_repro.judging`.
+is decided is in `paper_repro.evidence`, how scenes and readings are put together in `paper_repro.judging`.
 """
 
 from __future__ import annotations
@@ -11,27 +11,28 @@ from itertools import pairwise
 from math import exp, log
 from typing import Final, Literal
 
-from paper_repro.evidence import DATASETS, Claim, groups, paper_ratios
-from paper_repro.judging import Question, judge
-from paper_repro.noise import (
+from paper_repro.evidence import (
     BLENDED,
     COUNT,
+    DATASETS,
     PSNR,
     SECONDS,
     SSIM,
     VISITED,
+    Claim,
     Comparison,
     Group,
     Noise,
     Quantity,
     compare,
+    groups,
+    paper_ratios,
     with_error,
 )
+from paper_repro.judging import Question, judge
 from paper_repro.paper import Metric, Paper, paper
 from paper_repro.results import Result
 from paper_repro.tables import setting
-
-__all__ = ["HEADLINES", "METHODS", "SWEEP", "WINDOWS", "against_sweep", "claims", "noise_of", "questions"]
 
 # the claims that the paper's summary rests on, in the order in which the outcome is told
 HEADLINES: Final = ("fast", "fewest", "above", "comparable", "reset")

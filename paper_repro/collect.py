@@ -1,4 +1,9 @@
-"""What a finished training says, gathered from its result folder into one `Result`."""
+"""What a finished training says, gathered from its result folder into one `Result`, and what it leaves to be published.
+
+To be published are its splat and two renders of held-out views, in `<folder>/<scale>/<row>/<scene>_<seed>/`. The result
+has the SHA-256 of each, by which anybody who gets the folder from elsewhere can tell whether a picture or a splat is
+the result's.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from paper_repro.jobs import Job
-from paper_repro.published import file_hash, ply_of
 from paper_repro.record import BINS, LPIPS_VARIANTS, UNTIMED, Result, run_id, settings_hash
 from pop_fast.errors import PopError
 from pop_fast.io.read_back import read_arrays, read_json
@@ -20,19 +24,6 @@ from pop_fast.train.results import ResultFolder, read_config
 if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train import TrainConfig
-
-__all__ = [
-    "BESIDE",
-    "PROBE",
-    "collect",
-    "curve_of",
-    "digits",
-    "final_stats",
-    "first_change",
-    "read_probe",
-    "spacing",
-    "state_of_data",
-]
 
 # what `train_row` leaves in the result folder about the capture and the program, from before the first step
 BESIDE: Final = "row.json"
@@ -66,6 +57,7 @@ _TIMING: Final = (
     "training steps and density control with its passes over the views; reading the capture, measuring held-out views "
     "and writing files are apart"
 )
+_SPLAT: Final = "splat.spz"
 
 
 def state_of_data(job: Job, config: TrainConfig, capture: Capture) -> dict[str, Any]:
@@ -102,7 +94,7 @@ def collect(job: Job, folder: Path, files: Mapping[str, str]) -> Result:
     Args:
         job: what was trained.
         folder: its result folder.
-        files: what `paper_repro.published` has made of it, by name, with hashes.
+        files: what `paper_repro.collect` has made of it, by name, with hashes.
 
     Raises:
         PopError: something of a finished training is absent or damaged; names the file or the folder.
@@ -295,3 +287,50 @@ def _point(found: Mapping[str, Any]) -> dict[str, Any]:
         for name, value in values.items()
         if math.isfinite(value)
     }
+
+
+def publish(job: Job, work: Path, folder: Path, last: int) -> dict[str, str]:
+    """Write the splat as SPZ, and the first and the last render of a held-out view that the training kept as PNG.
+
+    Args:
+        job: what was trained.
+        work: its result folder.
+        folder: of everything that is to be published.
+        last: its last step, counted from 0.
+
+    Returns:
+        The names of the files and the SHA-256 of each.
+
+    Raises:
+        PopError: the training is not finished, or a file cannot be written; names it.
+    """
+    from pop_fast.io.formats.files import load_splat_file, save_as
+    from pop_fast.io.images import write_png
+    from pop_fast.view.report.source import read_view
+
+    place, stored = job.work(folder), load_splat_file(ply_of(work, last))
+    save_as(place / _SPLAT, "spz", stored.params, stored.antialiased, stored.frame)
+    names = [_SPLAT]
+    kept = sorted((work / "report_data").glob(f"val_step{last}_*.npz"))
+    for path in dict.fromkeys([*kept[:1], *kept[-1:]]):
+        names.append(f"held_out_{path.stem.rpartition('_')[2]}.png")
+        write_png(place / names[-1], read_view(path)["render"])
+    return {name: file_hash(place / name) for name in names}
+
+
+def ply_of(work: Path, last: int) -> Path:
+    """Return the file of the Gaussians that a finished training ended with.
+
+    Raises:
+        PopError: it is absent.
+    """
+    path = work / "ply" / f"point_cloud_{last}.ply"
+    if not path.is_file():
+        raise PopError(f"{path}: is absent, so the training is not finished; run the row again")
+    return path
+
+
+def file_hash(path: Path) -> str:
+    """Return the SHA-256 of a file's content in hex digits."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train import TrainConfig
 
-__all__ = ["HOLD_OUT", "Found", "check_capture", "check_scene", "table"]
-
 # every n-th photograph by name is measured and not trained on
 HOLD_OUT: Final = 8
 # a photograph that is shrunk by a whole number is cut or rounded to whole pixels

@@ -1,46 +1,312 @@
-"""What the claims share: the runs of a scene, its verdict, under which conditions, and the runs that would decide it.
+"""What claims rest on: the runs of a scene, how much seeds alone change them, and the verdicts that follow.
 
-A claim asks one or more comparisons of every scene. It holds on a scene when all of them hold beyond the noise of the
-seeds, and does not when one of them fails beyond it; anything else is not decided. Over the scenes it does not hold
-when it does not on one of them.
+The variance of a quantity at a scale is pooled over all groups i (a row on a scene) that have several seeds j:
+
+    s^2 = sum_ij (y_ij - mean_i)^2 / v,    v = sum_i (n_i - 1) degrees of freedom
+
+A combination L = sum_i c_i mean_i of group means then has the interval L -+ t s sqrt(sum_i c_i^2 / n_i), in which n_i
+may be 1, and t is the quantile 1 - alpha / (2 k) of Student's t with v degrees of freedom; k is the number of
+comparisons that are made together. A claim holds on a scene when all its comparisons hold beyond that noise, and does
+not when one of them fails beyond it; anything else is not decided. Over the scenes it does not hold when it does not on
+one of them.
+
+Source: contrasts of means in a one-way analysis of variance, NIST/SEMATECH e-Handbook of Statistical Methods, 7.4.3.6;
+the division by k is Bonferroni's, 7.4.7.3 there.
+Takes for granted: one variance for all groups of a scale, seeds that are independent, and nearly normal means. Counts,
+times and entries a pixel are compared by their logarithms, because they vary in proportion to their size.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from math import exp, inf, log, sqrt
+from statistics import fmean
+from typing import Final, Literal, NamedTuple
 
-from paper_repro.noise import Group
 from paper_repro.paper import Paper
 from paper_repro.results import Result
 from paper_repro.tables import setting
 
-__all__ = [
-    "DATASETS",
-    "JUDGE",
-    "STEPS",
-    "Claim",
-    "Evidence",
-    "Group",
-    "Groups",
-    "Told",
-    "Verdict",
-    "command",
-    "conditions",
-    "groups",
-    "is_shortened",
-    "paper_ratios",
-    "told",
-    "verdict_over",
-]
-
+# the probability that any of the intervals of one claim at one scale misses, at most
+ALPHA: Final = 0.05
+# with more seeds than these a difference is smaller than what anyone would train for
+MOST_SEEDS: Final = 99
+# a noise floor with one degree of freedom has intervals of ratios that no float holds
+_LARGEST: Final = 700.0
 Verdict = Literal["holds", "does not hold", "not decided"]
 # of the paper's schedule
 STEPS: Final = 30_000
 # the scale whose runs decide what others leave open
 JUDGE: Final = "small"
 DATASETS: Final = ("Mip-NeRF 360", "Tanks & Temples", "Deep Blending")
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Something that is compared between runs.
+
+    Attributes:
+        name: for people.
+        get: reads it off a run, on the scale on which it is compared; None where the run has none.
+        is_log: whether that is a natural logarithm.
+    """
+
+    name: str
+    get: Callable[[Result], float | None]
+    is_log: bool = False
+
+
+def _log(value: float | None) -> float | None:
+    return log(value) if value is not None and value > 0.0 else None
+
+
+PSNR: Final = Quantity("PSNR", lambda r: r.psnr)
+
+
+SSIM: Final = Quantity("SSIM", lambda r: r.ssim)
+
+
+COUNT: Final = Quantity("number of Gaussians", lambda r: _log(r.num_gaussians), is_log=True)
+
+
+# a time by the clock of a CPU that may do other work is no measure of a method
+SECONDS: Final = Quantity("time", lambda r: _log(r.training_seconds) if r.is_timed else None, is_log=True)
+
+
+BLENDED: Final = Quantity("Gaussians blended a pixel", lambda r: _log(r.n_blended), is_log=True)
+
+
+VISITED: Final = Quantity("Gaussians visited a pixel", lambda r: _log(r.n_traversed), is_log=True)
+
+
+QUANTITIES: Final = (PSNR, SSIM, COUNT, SECONDS, BLENDED, VISITED)
+
+
+@dataclass(frozen=True)
+class Group:
+    """The runs of one row on one scene, over their seeds."""
+
+    runs: tuple[Result, ...]
+
+    def values(self, quantity: Quantity) -> list[float]:
+        """Read a quantity off the runs that have it."""
+        return [value for r in self.runs if (value := quantity.get(r)) is not None]
+
+    @property
+    def n(self) -> float:
+        """Gaussians: the geometric mean over the seeds, as they are compared by logarithms."""
+        values = self.values(COUNT)
+        return exp(fmean(values)) if len(values) == len(self.runs) else 0.0
+
+    @property
+    def psnr(self) -> float:
+        """PSNR, dB."""
+        return fmean(r.psnr for r in self.runs)
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Ids of the runs."""
+        return tuple(r.run for r in self.runs)
+
+
+class Spread(NamedTuple):
+    """The standard deviation over seeds, pooled.
+
+    Attributes:
+        s: the standard deviation.
+        df: its degrees of freedom.
+        groups: how many pairs of row and scene have several seeds.
+        least: the smallest standard deviation of one of them.
+        largest: the largest.
+    """
+
+    s: float
+    df: int
+    groups: int
+    least: float
+    largest: float
+
+
+class Noise:
+    """The pooled spreads of one scale."""
+
+    def __init__(self, groups: Iterable[Group]) -> None:
+        """Pool over groups; those with one run, which has no spread, do not count."""
+        self._groups = tuple(group for group in groups if len(group.runs) > 1)
+        self._known: dict[str, Spread | None] = {}
+
+    def of(self, quantity: Quantity) -> Spread | None:
+        """Give the spread of a quantity, or None where no group has two values of it."""
+        if quantity.name not in self._known:
+            self._known[quantity.name] = self._pooled(quantity)
+        return self._known[quantity.name]
+
+    def _pooled(self, quantity: Quantity) -> Spread | None:
+        squares, df, own = 0.0, 0, []
+        for group in self._groups:
+            # times of two machines differ by more than their seeds
+            apart = _by_machine(group.runs) if quantity is SECONDS else [group.runs]
+            for values in (Group(tuple(runs)).values(quantity) for runs in apart):
+                if len(values) > 1:
+                    mean = fmean(values)
+                    mine = sum((value - mean) ** 2 for value in values)
+                    squares, df = squares + mine, df + len(values) - 1
+                    own.append(sqrt(mine / (len(values) - 1)))
+        return Spread(sqrt(squares / df), df, len(own), min(own), max(own)) if own else None
+
+
+def _by_machine(runs: Iterable[Result]) -> list[list[Result]]:
+    found: dict[str, list[Result]] = {}
+    for run in runs:
+        found.setdefault(run.trained_on, []).append(run)
+    return list(found.values())
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A combination of group means, and what is asked of it.
+
+    Attributes:
+        says: what is compared.
+        value: the combination; a natural logarithm where `shown_as` is "share" or "factor".
+        asked: "at least" or "at most" the bound, or "nothing" where the number is only told.
+        bound: on the scale of `value`.
+        variance: of one run of each group, sum_i c_i^2 s^2; None without a noise floor.
+        error: standard error of `value` with the seeds that are there; None without a noise floor.
+        df: degrees of freedom of the noise floor.
+        seeds: how many runs each group has, the smallest first.
+        shown_as: how the value is written.
+    """
+
+    says: str
+    value: float
+    asked: Literal["at least", "at most", "nothing"]
+    bound: float
+    variance: float | None
+    error: float | None
+    df: int
+    seeds: tuple[int, ...]
+    shown_as: Literal["dB", "share", "factor", "plain"]
+
+    @property
+    def margin(self) -> float:
+        """By how much the value has what is asked of it; negative where it has not."""
+        return {"at least": 1.0, "at most": -1.0, "nothing": 0.0}[self.asked] * (self.value - self.bound)
+
+    def half_width(self, together: int) -> float:
+        """Give half of the interval's width where so many comparisons are made together; infinite without noise."""
+        if self.error is None:
+            return inf
+        return _quantile(self.df, together) * self.error
+
+    def holds(self, together: int) -> bool | None:
+        """Say whether what is asked is so; None where the interval has the bound inside, or nothing is asked."""
+        off, half = self.margin, self.half_width(together)
+        return None if off == 0.0 or abs(off) < half else off > 0.0
+
+    def seeds_needed(self, together: int) -> int:
+        """Say how many seeds of each group would decide it, if the difference that is measured is the true one."""
+        if self.variance is None:
+            return max(3, self.seeds[-1])
+        for n in range(max(self.seeds[0], 1) + 1, MOST_SEEDS):
+            df = self.df + sum(max(n - have, 0) for have in self.seeds)
+            half = _quantile(df, together) * sqrt(self.variance / n)
+            if half <= abs(self.value - self.bound):
+                return n
+        return MOST_SEEDS
+
+    def text(self, together: int) -> str:
+        """Write the value with its interval."""
+        half = self.half_width(together)
+        return f"{self.says} {self._value(half)}"
+
+    def _value(self, half: float) -> str:
+        told = half < inf
+        if self.shown_as in ("share", "factor"):
+            ends = (self.value - half, min(self.value + half, _LARGEST))
+            interval = f"({self._ratio(ends[0])} to {self._ratio(ends[1])})" if told else "(no interval)"
+            return f"{self._ratio(self.value)} {interval}"
+        form, unit = ("+.2f", " dB") if self.shown_as == "dB" else ("+.4g", "")
+        return f"{self.value:{form}}" + (f" ± {half:.2g}{unit}" if told else f"{unit} (no interval)")
+
+    def _ratio(self, value: float) -> str:
+        return f"{exp(value):.1%}" if self.shown_as == "share" else f"x {exp(value):.2f}"
+
+
+def compare(
+    says: str,
+    groups: Mapping[str, Group],
+    noise: Noise,
+    quantity: Quantity,
+    weights: Mapping[str, float],
+    asked: Literal["at least", "at most", "nothing"] = "nothing",
+    bound: float = 0.0,
+    shown_as: Literal["dB", "share", "factor", "plain"] | None = None,
+) -> Comparison | None:
+    """Compare the means of groups.
+
+    Args:
+        says: what is compared.
+        groups: by row.
+        noise: of the scale.
+        quantity: of which the means are.
+        weights: of each row's mean in the combination.
+        asked: what is asked of the combination.
+        bound: on the scale of the quantity.
+        shown_as: how it is written; None takes dB, or a share for what is compared by logarithms.
+
+    Returns:
+        The comparison, or None where a row has no run, or a run lacks the quantity.
+    """
+    used = [groups[row] for row in weights if row in groups]
+    values = [group.values(quantity) for group in used]
+    if len(used) < len(weights) or any(len(v) < len(g.runs) for v, g in zip(values, used, strict=True)):
+        return None
+    coefficients = list(weights.values())
+    value = sum(c * fmean(v) for c, v in zip(coefficients, values, strict=True))
+    return with_error(says, value, [(quantity, c, len(v)) for c, v in zip(coefficients, values, strict=True)], noise,
+                      asked, bound, shown_as or ("share" if quantity.is_log else "dB"))  # fmt: skip
+
+
+def with_error(
+    says: str,
+    value: float,
+    parts: Sequence[tuple[Quantity, float, int]],
+    noise: Noise,
+    asked: Literal["at least", "at most", "nothing"],
+    bound: float,
+    shown_as: Literal["dB", "share", "factor", "plain"],
+) -> Comparison:
+    """Give a value its error from the slopes by which it depends on group means.
+
+    Args:
+        says: what is compared.
+        value: a function of group means.
+        parts: of each mean, its quantity, the slope of the value along it, and the number of its runs.
+        noise: of the scale.
+        asked: what is asked of the value.
+        bound: for the value.
+        shown_as: how it is written.
+    """
+    spreads = [noise.of(quantity) for quantity, _, _ in parts]
+    seeds = tuple(sorted(n for _, _, n in parts))
+    known = [spread for spread in spreads if spread is not None]
+    if len(known) < len(spreads):
+        return Comparison(says, value, asked, bound, None, None, 0, seeds, shown_as)
+    each = [(slope * spread.s) ** 2 for (_, slope, _), spread in zip(parts, known, strict=True)]
+    error = sqrt(sum(v / n for v, (_, _, n) in zip(each, parts, strict=True)))
+    df = min(spread.df for spread in known)
+    return Comparison(says, value, asked, bound, sum(each), error, df, seeds, shown_as)
+
+
+def _quantile(df: float, together: int) -> float:
+    """Give Student's t that so many comparisons, made together, stay under with a probability of 1 - `ALPHA`."""
+    # the rows and their queue are listed with NumPy alone
+    from scipy.special import stdtrit
+
+    return float(stdtrit(df, 1.0 - ALPHA / (2.0 * max(together, 1))))
+
 
 Groups = Mapping[str, Mapping[str, Group]]
 

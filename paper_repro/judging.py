@@ -9,9 +9,13 @@ from typing import Final
 from paper_repro.evidence import (
     DATASETS,
     JUDGE,
+    PSNR,
     Claim,
+    Comparison,
     Evidence,
+    Group,
     Groups,
+    Noise,
     Told,
     Verdict,
     command,
@@ -19,11 +23,8 @@ from paper_repro.evidence import (
     is_shortened,
     told,
 )
-from paper_repro.noise import PSNR, Comparison, Group, Noise
 from paper_repro.paper import paper
-from paper_repro.scales import scale_named
-
-__all__ = ["OTHERS", "Other", "Question", "judge"]
+from paper_repro.scenes import scale_named
 
 # what a question gets on one scene: comparisons; None for one that lacks a run; why one cannot be made of its runs
 Asked = Sequence[Comparison | str | None]

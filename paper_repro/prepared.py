@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from pop_fast.data import Capture, View
     from pop_fast.train import TrainConfig
 
-__all__ = ["path_of", "read", "write"]
-
 _FIX: Final = "pack it again with benchmarks/gpu_pack.py --prepared"
 _FORMS: Final = {
     # what is no number, as JSON in UTF-8: numpy's own texts may hold what is none

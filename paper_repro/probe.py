@@ -29,8 +29,6 @@ from pop_fast.train.training_run import TrainingRun
 from pop_fast.train.views import ViewTensors, render_view
 from pop_ref.settings import Recipe
 
-__all__ = ["VIEWS", "ProbedRun", "gradient_sizes"]
-
 # training views, evenly over their names: one alone would say what it alone is like
 VIEWS: Final = 3
 

@@ -16,21 +16,8 @@ from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Any, Final
 
-from paper_repro.scales import SCALES
+from paper_repro.scenes import SCALES
 from pop_fast.errors import PopError
-
-__all__ = [
-    "BINS",
-    "COMMIT",
-    "LPIPS_VARIANTS",
-    "SCHEMA",
-    "UNTIMED",
-    "Result",
-    "from_line",
-    "run_id",
-    "settings_hash",
-    "to_line",
-]
 
 SCHEMA: Final = 2
 LPIPS_VARIANTS: Final = ("vgg_01", "alex_norm", "alex_01")
@@ -68,7 +55,7 @@ class Result:
     """What one finished run says of itself.
 
     Attributes:
-        scale: a name of `paper_repro.scales`.
+        scale: a name of `paper_repro.scenes`.
         row: the configuration, by the name of its file in `configs`.
         scene: the capture, by its name here ("fox", "bonsai_800", "kitchen", ...).
         seed: of every random number of the run.

@@ -16,22 +16,9 @@ from pathlib import Path
 from typing import Final
 
 from paper_repro.record import SCHEMA, Result, from_line, to_line
-from paper_repro.scales import SCALES as _SCALES
+from paper_repro.scenes import SCALES as _SCALES
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
-
-__all__ = [
-    "RESULTS",
-    "SCALES",
-    "Result",
-    "existing_folder",
-    "find",
-    "kept",
-    "path_of",
-    "read",
-    "read_all",
-    "write",
-]
 
 SCALES: Final = tuple(_SCALES)
 RESULTS: Final = Path(__file__).resolve().parent / "results"

@@ -12,19 +12,17 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
-from paper_repro import readings
+from paper_repro import claims_page
 from paper_repro.claims import claims
 from paper_repro.claims_page import deciding, method, outcome, telling
 from paper_repro.claims_page import markdown as claims_markdown
 from paper_repro.evidence import DATASETS, JUDGE, Claim
 from paper_repro.paper import paper
 from paper_repro.results import RESULTS, SCALES, Result, read_all
-from paper_repro.table_markdown import grid
+from paper_repro.table_formats import grid
 from paper_repro.tables import SCENES_OF, beyond_rows
 from pop_fast.errors import PopError
 from pop_ref.ambiguities import AMBIGUITIES
-
-__all__ = ["HERE", "everything", "files", "stale_files", "status_table", "with_part"]
 
 HERE: Final = Path(__file__).resolve().parent
 _MADE: Final = "<!-- made by python -m paper_repro.status --write -->"
@@ -66,8 +64,8 @@ def files(results: Iterable[Result], folder: Path = HERE) -> dict[Path, str]:
     found = list(results)
     protocol = _read(folder / "protocol.md")
     protocol = with_part(protocol, "ambiguities", _ambiguities())
-    answered = (*readings.answers(found), *readings.experiments(found))
-    protocol = with_part(protocol, "readings", readings.markdown(answered))
+    answered = (*claims_page.answers(found), *claims_page.experiments(found))
+    protocol = with_part(protocol, "readings", claims_page.answers_markdown(answered))
     table = status_table(found)
     made = {
         folder / "README.md": with_part(_read(folder / "README.md"), "status", table),

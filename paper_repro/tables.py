@@ -12,26 +12,11 @@ from dataclasses import dataclass, replace
 from statistics import fmean, stdev
 from typing import Final
 
-from paper_repro.checks import places
-from paper_repro.paper import Metric, NotComparable, Paper, PaperTable, paper
+from paper_repro.jobs import added_rows
+from paper_repro.paper import Metric, NotComparable, Paper, PaperTable, paper, places
 from paper_repro.results import Result
-from paper_repro.rows import added_rows
-from paper_repro.scales import SCALES
+from paper_repro.scenes import SCALES
 from pop_fast.errors import PopError
-
-__all__ = [
-    "BEYOND",
-    "REFERENCES",
-    "SCENES_OF",
-    "Block",
-    "Cell",
-    "Line",
-    "Table",
-    "beyond",
-    "beyond_rows",
-    "setting",
-    "table",
-]
 
 # what a scale is meant to train; results of further scenes are shown too
 SCENES_OF: Final = {name: tuple(scale.factors) for name, scale in SCALES.items() if name != "paper"}

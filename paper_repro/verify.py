@@ -21,17 +21,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from paper_repro.collect import curve_of, digits, final_stats
+from paper_repro.collect import curve_of, digits, file_hash, final_stats, ply_of
 from paper_repro.jobs import Job
-from paper_repro.published import file_hash, ply_of
 from paper_repro.record import Result
 from paper_repro.train_row import Options
 from pop_fast.api.backend import backend_names, get_backend
 from pop_fast.children import python_command
 from pop_fast.errors import PopError
 from pop_fast.machine import machine_name, processor_kind
-
-__all__ = ["TOLERANCES", "Verification", "history", "other_kind", "verify"]
 
 # how far another kind of machine may come out: a share of the Gaussians, and dB and SSIM of the held-out views
 TOLERANCES: Final = {"num_gaussians": 0.05, "psnr_test": 0.3, "ssim": 0.01}

@@ -21,8 +21,7 @@ from pop_fast.io.ply import save_ply
 from pop_fast.train import checkpoint as ckpt
 
 from .corpus import HERE
-from .forks import TOLD, start, wait
-from .runs import KINDS, STEPS, UndisturbedRun, ended, run_parts, same
+from .runs import KINDS, STEPS, TOLD, UndisturbedRun, ended, run_parts, same, start, wait
 
 # what changes a disk; a process may end, and the system may refuse, right before each of them
 _CHANGES = ((os, "replace"), (os, "fsync"), (Path, "mkdir"), (Path, "unlink"), (Path, "rmdir"), (shutil, "rmtree"))

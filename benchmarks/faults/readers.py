@@ -18,7 +18,7 @@ import torch
 
 from cuda_ext.gpu_check.command import begun_report
 from cuda_ext.gpu_check.outcomes import outcomes
-from paper_repro import paper, prepared, results, rows, scenes
+from paper_repro import jobs, paper, prepared, results, scenes
 from paper_repro.collect import collect
 from paper_repro.jobs import job_named
 from pop_fast.blocks.plan import read_job, read_plan
@@ -162,7 +162,7 @@ def _submission(folder: Path) -> Any:
 
 
 def _row(path: Path) -> Any:
-    return rows.load_row(path.stem, path.parent), rows.header_of(path.stem, path.parent)
+    return jobs.load_row(path.stem, path.parent), jobs.header_of(path.stem, path.parent)
 
 
 def _collected(folder: Path) -> Any:

@@ -1,7 +1,8 @@
 """Runs as users start them, killed at random moments: they go on to the same bits.
 
-Every run is `pop train`, called in a child that has imported everything already: by the native step, on two ranks that
-find each other as torchrun lets them, and in two blocks. A part of a run in blocks, and a rank, is a child as well.
+Every run is `pop train`, called in a child that has imported everything already, so that it may die in every way and
+starts at once: by the native step, on two ranks that find each other as torchrun lets them, and in two blocks. A part
+of a run in blocks, and a rank, is a child as well.
 """
 
 from __future__ import annotations
@@ -9,11 +10,14 @@ from __future__ import annotations
 import io
 import os
 import random
+import resource
 import shutil
 import signal
 import socket
+import sys
 import tempfile
 import time
+import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
@@ -30,7 +34,6 @@ from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.results import ResultFolder
 
 from .corpus import HERE
-from .forks import start, wait
 
 STEPS, EVERY = 16, 4
 # growth, pruning, checkpoints, measurements and files in between; the report's extra renders are left out
@@ -45,6 +48,10 @@ _WORDS: Final = (
 MOST_KILLS: Final = 6
 # of a process whose fellow has ended, as torchrun does
 _GRACE, _PATIENCE = 0.2, 5.0
+# of a child that ended in an exception which the command line would have shown as a traceback
+TRACEBACK = 70
+# and in one that it would have told in a line
+TOLD = 2
 
 
 @dataclass(frozen=True)
@@ -258,3 +265,50 @@ def _killed(of: UndisturbedRun, name: str, threads: int, rng: random.Random, lon
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
     return ended(writer, others) != 0
+
+
+def start(work: Callable[[], int | None], said: Path, memory: int | None = None) -> int:
+    """Begin some work in a child.
+
+    Args:
+        work: done there; what it returns is the child's exit status, and None is 0.
+        said: where what it prints goes.
+        memory: bytes of address space that it may take over what this process has.
+
+    Returns:
+        The child's process id.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    pid = os.fork()
+    if pid:
+        return pid
+    status = TRACEBACK
+    try:
+        out = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        os.dup2(out, 1)
+        os.dup2(out, 2)
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        if memory is not None:
+            have = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+            resource.setrlimit(resource.RLIMIT_AS, (have + memory, have + memory))
+        status = work() or 0
+    except BaseException as error:
+        from pop_fast.cli import describe
+
+        line = describe(error)
+        if line is not None and "\n" not in line and len(line) < 1000:
+            status = TOLD
+            print(line, flush=True)
+        else:
+            traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+
+
+def wait(pid: int) -> int:
+    """Wait for a child; a signal that ended it is a negative status."""
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import cuda_ext
-from cuda_ext.compiler import find_compiler
 from cuda_ext.host import emulate
+from cuda_ext.toolkit import find_compiler
 from pop_fast.children import module_command
 from pop_fast.compiled.build import CUDA, HERE, SHARED, SOURCES, UNITS
 

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import cuda_ext
-from cuda_ext.compiler import find_compiler
+from cuda_ext.toolkit import find_compiler
 
 if TYPE_CHECKING:
     import pytest
@@ -164,7 +164,7 @@ def nodes(library: Path) -> dict[str, int]:
 
 
 class NoWaiting:
-    """In the place of `cuda_ext.training.graphs.Watch`: there is nothing to wait for."""
+    """In the place of `cuda_ext.training.train_step.Watch`: there is nothing to wait for."""
 
     def __init__(self, state: Any, depth: int) -> None:
         self._state, self._depth, self._posted = state, depth, []

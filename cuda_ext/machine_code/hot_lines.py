@@ -21,8 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from cuda_ext.machine_code.check_ptxas import CSRC, compile_and_read, is_own
-from cuda_ext.machine_code.count_sass import NO_NVCC, NO_NVDISASM, disassemble, find_nvdisasm
-from cuda_ext.machine_code.sass import Code, Instruction
+from cuda_ext.machine_code.count_sass import NO_NVCC, NO_NVDISASM, Code, Instruction, disassemble, find_nvdisasm
 from cuda_ext.toolkit import find_nvcc
 
 SAMPLES, EXECUTED = "# Samples", "Instructions Executed"

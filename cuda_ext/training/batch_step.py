@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import torch
 from torch import Tensor
@@ -36,11 +36,21 @@ from cuda_ext.arrays import (
     pointer,
     stream_of,
 )
-from cuda_ext.render.capacity import Capacity, Size
-from cuda_ext.train_settings import KernelStatistics, Phase, Ranks, StepSettings
-from cuda_ext.training.resident import ResidentViews
-from cuda_ext.training.step_buffers import FrameBuffers, RowBuffers, Rows, Shared, SplatBuffers
+from cuda_ext.render.lists import Capacity, Size
+from cuda_ext.training.step_buffers import (
+    FrameBuffers,
+    KernelStatistics,
+    ResidentViews,
+    RowBuffers,
+    Rows,
+    Shared,
+    SplatBuffers,
+)
 from cuda_ext.training.step_program import DrawProgram, gaussians, pop_term, regularizers, schedule, update, view_of
+
+if TYPE_CHECKING:
+    from pop_fast.train.ranks import Ranks
+    from pop_fast.train.steps import Phase, StepSettings
 
 # rows that a stretch is made of: a warp's, whose pieces of 16 bytes lie alike wherever it begins
 STRETCH: Final = 32

@@ -1,6 +1,6 @@
 """The paper's nine figures from the results: each as SVG, as PNG, and the numbers behind it as CSV.
 
-Fonts, colours and sizes are in `style`, what a figure says below itself in `foot`, what it takes of the results in
+Fonts, colours, sizes and what a figure says below itself are in `style`, what it takes of the results is in
 `data`. Nothing is drawn of what was not run: a figure names the rows that it lacks, and one without any is refused.
 """
 
@@ -12,12 +12,10 @@ from typing import Final
 
 from pop_fast.errors import PopError
 
-__all__ = ["FIGURES", "draw"]
-
 # each with its module and function, and its title
 FIGURES: Final = {
     "1": ("tradeoffs", "psnr_against_time", "PSNR against training time"),
-    "2": ("opacities", "opacity_histogram", "Opacities of 3DGS"),
+    "2": ("curves", "opacity_histogram", "Opacities of 3DGS"),
     "3": ("artifact", "six_panels", "What becomes of 3DGS when every opacity is pushed to 1"),
     "4a": ("curves", "gradients_of_losses", "Gradients of the losses"),
     "4b": ("curves", "gaussians_per_pixel", "Gaussians per pixel"),
@@ -57,8 +55,7 @@ def draw(
     if figure not in FIGURES:
         raise PopError(f"figure is '{figure}'; it must be one of {', '.join(FIGURES)}")
     from paper_repro.figures.data import Asked
-    from paper_repro.figures.sheet import save
-    from paper_repro.figures.style import look
+    from paper_repro.figures.style import look, save
     from paper_repro.jobs import WORK
     from paper_repro.results import read_all
 

@@ -1,4 +1,4 @@
-"""Figures 4a, 4b, 6a and 7: what changes during the training."""
+"""Figures 2, 4a, 4b, 6a and 7: what changes during the training, and the opacities at its end."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from paper_repro.figures.data import Asked, Chosen, Curve, choose, choose_one_scene, curve_of, has
-from paper_repro.figures.foot import foot
-from paper_repro.figures.sheet import Drawn, Margins, Sheet
 from paper_repro.figures.style import (
     LOSSES,
+    Drawn,
     End,
+    Margins,
+    Sheet,
     color_of,
     count,
+    foot,
     label_ends,
     log_ticks,
     name_of,
@@ -25,8 +27,8 @@ from paper_repro.results import Result
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-__all__ = ["count_of_methods", "count_under_losses", "gaussians_per_pixel", "gradients_of_losses"]
+from paper_repro.figures.style import GREY, darker
+from paper_repro.record import BINS
 
 _METHODS: Final = ("3dgs", "gsplat", "pup", "mini_splatting", "taming", "speedy_splat", "pop")
 _LOSSES: Final = ("l1_div_1", "l2_without_ssim", "l2")
@@ -35,6 +37,12 @@ _TERMS: Final = {"grad_l1": "L1", "grad_ssim": "SSIM at 0.01", "grad_l2": "L2"}
 _OF_PROBE: Final = ("probe_traversed", "probe_blended")
 _HELD_OUT: Final = ("n_traversed", "n_blended")
 _BELOW: Final = "training step"
+_LOW, _HIGH = 0.1, 0.9
+# the capture of the paper's figure
+_SCENE: Final = "kitchen"
+# the shares that the paper states, by their ids in paper.toml
+_STATED: Final = {"below": "kitchen_frac_opacity_lt_0.1", "above": "kitchen_frac_opacity_gt_0.9"}
+_LOW_COLOR, _HIGH_COLOR, _PLAIN = color_of("gsplat"), color_of("pop"), "#b9b9b9"
 
 
 def gradients_of_losses(asked: Asked) -> Drawn:
@@ -158,3 +166,74 @@ def _table(chosen: Chosen, curves: Mapping[tuple[str, str], Curve]) -> tuple[Seq
         scenes = " ".join(chosen.scenes)
         rows += [(row, key, int(step), float(value), scenes, runs) for step, value in zip(steps, values, strict=True)]
     return ("row", "quantity", "step", "value", "scenes", "runs"), rows
+
+
+def opacity_histogram(asked: Asked) -> Drawn:
+    """Figure 2: the shares under 0.1 and over 0.9, and the two that the paper states where the capture is the same."""
+    chosen = choose_one_scene(asked, ["3dgs"], _SCENE)
+    runs = chosen.of("3dgs")
+    # every seed counts the same, whatever its number of Gaussians
+    shares = np.mean([np.array(r.opacity_histogram) / max(r.num_gaussians, 1) for r in runs], axis=0)
+    below, above = share_below(shares, _LOW), share_above(shares, _HIGH)
+    n = np.mean([r.num_gaussians for r in runs])
+    same = chosen.scenes == (_SCENE,)
+    other = "" if same else f" The paper's figure is of another capture, {_SCENE}."
+    note = foot(asked, chosen, f"{count(float(n))} Gaussians in {BINS} bins.{other}")
+    sheet = Sheet(note, 1.85)
+    axes = sheet.panel(Margins(right=0.1, top=0.12))
+    edges = np.linspace(0.0, 1.0, BINS + 1)
+    colors = [_LOW_COLOR if e < _LOW - 1e-9 else _HIGH_COLOR if e >= _HIGH - 1e-9 else _PLAIN for e in edges[:-1]]
+    axes.bar(edges[:-1], 100.0 * shares, width=1.0 / BINS, align="edge", color=colors, edgecolor="white", linewidth=0.3)
+    axes.set_xlim(0.0, 1.0)
+    axes.set_ylim(0.0, 112.0 * float(shares.max()))
+    axes.set_xticks([0.0, _LOW, 0.5, _HIGH, 1.0], ["0", "0.1", "0.5", "0.9", "1"])
+    axes.set_xlabel("opacity")
+    axes.set_ylabel("share of Gaussians (%)")
+    axes.locator_params(axis="y", nbins=5)
+    for share, color, x, align, side, stated in (
+        (below, _LOW_COLOR, _LOW, "left", "under 0.1", "below"),
+        (above, _HIGH_COLOR, _HIGH, "right", "over 0.9", "above"),
+    ):
+        axes.axvline(x, color=color, linewidth=0.6, linestyle=(0, (3, 2)))
+        inward = 1.0 if align == "left" else -1.0
+        for line, size, paint in (
+            (f"{100.0 * share:.1f} % {side}", 8.0, darker(color)),
+            *([(f"paper: {100.0 * paper().number(_STATED[stated]):.1f} %", 6.6, GREY)] if same else []),
+        ):
+            axes.annotate(
+                line,
+                (x, 1.0),
+                xycoords=("data", "axes fraction"),
+                xytext=(inward * 4.0, -4.0 if paint != GREY else -15.0),
+                textcoords="offset points",
+                ha=align,
+                va="top",
+                size=size,
+                color=paint,
+            )
+    rows: list[Sequence[object]] = [
+        ("bin", float(low), float(high), float(share))
+        for low, high, share in zip(edges, edges[1:], shares, strict=False)
+    ]
+    rows += [("ours under 0.1", 0.0, _LOW, below), ("ours over 0.9", _HIGH, 1.0, above)]
+    if same:
+        rows += [("paper under 0.1", 0.0, _LOW, paper().number(_STATED["below"]))]
+        rows += [("paper over 0.9", _HIGH, 1.0, paper().number(_STATED["above"]))]
+    return Drawn(sheet.figure, ("what", "from", "to", "share"), rows)
+
+
+def share_below(shares: np.ndarray, edge: float) -> float:
+    """Sum the bins under an edge between two of them."""
+    return float(shares[: _bins_to(edge)].sum())
+
+
+def share_above(shares: np.ndarray, edge: float) -> float:
+    """Sum the bins over an edge between two of them."""
+    return float(shares[_bins_to(edge) :].sum())
+
+
+def _bins_to(edge: float) -> int:
+    n = round(edge * BINS)
+    if abs(n - edge * BINS) > 1e-9:
+        raise ValueError(f"edge is {edge}; it must lie between two of {BINS} bins")
+    return n

@@ -12,10 +12,8 @@ from typing import TypeAlias
 import numpy as np
 
 from paper_repro.results import Result
-from paper_repro.scales import scale_named
+from paper_repro.scenes import scale_named
 from pop_fast.errors import PopError
-
-__all__ = ["Asked", "Chosen", "Curve", "NoDataError", "choose", "choose_one_scene", "curve_of", "has", "mean_of"]
 
 # steps and values
 Curve: TypeAlias = tuple[np.ndarray, np.ndarray]

@@ -14,16 +14,12 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from paper_repro.figures.data import Asked, Chosen, NoDataError
-from paper_repro.figures.foot import foot
-from paper_repro.figures.sheet import Drawn, Sheet, show
-from paper_repro.figures.style import INK, TEXT, color_of, name_of
+from paper_repro.figures.style import INK, TEXT, Drawn, Sheet, color_of, foot, name_of, show
 from paper_repro.results import Result
 from pop_fast.view.report.source import read_view
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-__all__ = ["ComparedView", "most_different", "renders_and_photographs"]
 
 _SCENES: Final = ("truck", "train", "playroom", "bonsai")
 _ROWS: Final = ("pop", "3dgs")

@@ -1,7 +1,8 @@
-"""How every figure looks: fonts, widths, one colour a method that can be told apart without colour vision, labels.
+"""How every figure looks: fonts, widths, colours, labels, its sheet, and what stands below it.
 
 A figure is made for a column of 3.3 inches and has its final size, so that a point in it is a point in print. Colours
-are those of Okabe and Ito; curves are named where they end and not in a legend.
+are those of Okabe and Ito; curves are named where they end and not in a legend. Below a figure stand its captures,
+steps, seeds and scale, and whether that is the protocol of the paper.
 """
 
 from __future__ import annotations
@@ -12,29 +13,30 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from paper_repro.rows import ROWS
+from paper_repro.jobs import ROWS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
+import csv
+import io
+import re
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 
-__all__ = [
-    "COLUMN",
-    "GREY",
-    "INK",
-    "LOSSES",
-    "SAVED_DPI",
-    "SMALL",
-    "TEXT",
-    "End",
-    "color_of",
-    "count",
-    "label_ends",
-    "log_ticks",
-    "look",
-    "name_of",
-    "step_ticks",
-]
+from pop_fast.io.atomic import write_atomically
+
+if TYPE_CHECKING:
+    import numpy as np
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
+from collections.abc import Iterable
+
+from paper_repro.figures.data import Asked, Chosen
+from paper_repro.results import Result
+from paper_repro.scenes import scale_named
 
 # widths of a column and of a page's text, inches
 COLUMN: Final = 3.3
@@ -46,7 +48,6 @@ SMALL: Final = 5.6
 _SIZE: Final = 7.0
 # of the PNG
 SAVED_DPI: Final = 300
-
 _BLACK, _ORANGE, _SKY, _GREEN = "#404040", "#E69F00", "#56B4E9", "#009E73"
 _BLUE, _VERMILION, _PURPLE = "#0072B2", "#D55E00", "#CC79A7"
 # a method keeps its colour in every figure
@@ -68,6 +69,8 @@ _METHODS: Final = {
 }
 # as in the paper: L1 red, L2 green, SSIM orange
 LOSSES: Final = {"grad_l1": _VERMILION, "grad_l2": _GREEN, "grad_ssim": _ORANGE}
+_EDGE: Final = 0.04
+_LINE: Final = SMALL * 1.3 / 72.0
 
 
 def look() -> AbstractContextManager[None]:
@@ -254,3 +257,179 @@ def darker(color: str) -> str:
     red, green, blue = to_rgb(color)
     factor = min(1.0, 0.42 / (0.2126 * red + 0.7152 * green + 0.0722 * blue))
     return to_hex((red * factor, green * factor, blue * factor))
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure and the numbers behind it.
+
+    Attributes:
+        figure: the picture.
+        columns: of the table.
+        rows: its lines; numbers are written unrounded.
+    """
+
+    figure: Figure
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+
+
+@dataclass(frozen=True)
+class Margins:
+    """Room around the axes for ticks and labels, inches."""
+
+    left: float = 0.44
+    right: float = 0.08
+    top: float = 0.08
+    bottom: float = 0.33
+
+
+class Sheet:
+    """A figure of a given width, with panels in inches and a note below them.
+
+    Args:
+        note: what stands below.
+        height: of everything above the note, inches.
+        width: of the figure, inches.
+    """
+
+    def __init__(self, note: str, height: float, width: float = COLUMN) -> None:
+        from matplotlib.figure import Figure
+
+        self.width, self.height = width, height
+        lines = _wrapped(note, width - 2.0 * _EDGE)
+        self._below = len(lines) * _LINE + _EDGE * 2.0
+        self.figure: Figure = Figure(figsize=(width, height + self._below))
+        self.figure.text(
+            _EDGE / width,
+            (self._below - _EDGE) / (height + self._below),
+            "\n".join(lines),
+            size=SMALL,
+            color=GREY,
+            va="top",
+            linespacing=1.25,
+        )
+
+    def axes(self, left: float, bottom: float, width: float, height: float, **more: Any) -> Axes:
+        """Add axes; all in inches, from the lower left corner of what is above the note."""
+        whole = self.height + self._below
+        place = (left / self.width, (bottom + self._below) / whole, width / self.width, height / whole)
+        return self.figure.add_axes(place, **more)
+
+    def panel(self, margins: Margins | None = None) -> Axes:
+        """Add axes that fill what is above the note, but for the margins."""
+        m = Margins() if margins is None else margins
+        return self.axes(m.left, m.bottom, self.width - m.left - m.right, self.height - m.bottom - m.top)
+
+
+def show(axes: Axes, picture: np.ndarray, **more: Any) -> AxesImage:
+    """Show a picture over the whole of its axes, every pixel as it is where there is room, else averaged."""
+    from matplotlib.transforms import Bbox
+
+    place: Bbox = axes.get_window_extent()
+    scale = SAVED_DPI / axes.figure.dpi
+    fits = picture.shape[1] <= place.width * scale and picture.shape[0] <= place.height * scale
+    axes.set_axis_off()
+    return axes.imshow(picture, interpolation="none" if fits else "antialiased", aspect="auto", **more)
+
+
+def save(drawn: Drawn, stem: Path) -> list[Path]:
+    """Write stem.svg, stem.png and stem.csv.
+
+    Raises:
+        PopError: a file cannot be written.
+    """
+    formats: tuple[Literal["svg", "png"], ...] = ("svg", "png")
+    paths = [stem.with_name(f"{stem.name}.{suffix}") for suffix in (*formats, "csv")]
+    for suffix, path in zip(formats, paths, strict=False):
+        if suffix == "svg":
+            write_atomically(path, partial(_write_svg, drawn.figure))
+        else:
+            more: dict[str, Any] = {"metadata": {"Software": None}, "pil_kwargs": {"optimize": True}}
+            write_atomically(path, partial(drawn.figure.savefig, format=suffix, **more))
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(drawn.columns)
+    writer.writerows([_cell(value) for value in row] for row in drawn.rows)
+    write_atomically(paths[-1], lambda file: file.write(text.getvalue().encode("utf-8")))
+    return paths
+
+
+def _write_svg(figure: Any, file: BinaryIO) -> None:
+    """Write a figure as SVG with one line a path, where matplotlib writes one line a point."""
+    drawn = io.StringIO()
+    # no date: the same numbers are the same bytes
+    figure.savefig(drawn, format="svg", metadata={"Date": None})
+    file.write(_compact(drawn.getvalue()).encode("utf-8"))
+
+
+def _compact(text: str) -> str:
+    """Join the lines inside a tag, and leave out what indents tags and what ends groups on lines of their own."""
+    joined = re.sub(r"\s*\n(?!\s*<)", " ", text)
+    return re.sub(r"\n\s*(</|<use|<path|<g>)", r"\1", re.sub(r"\n\s+<", "\n<", joined))
+
+
+def _cell(value: Any) -> Any:
+    # a NumPy number says its type in its repr
+    return repr(float(value)) if isinstance(value, float) else value
+
+
+def _wrapped(text: str, width: float) -> list[str]:
+    """Break a text into lines of at most a width, inches."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import TextToPath
+
+    font, measure = FontProperties(size=SMALL), TextToPath()
+    lines: list[str] = []
+    # not at the spaces that must not break
+    for word in text.split(" "):
+        longer = f"{lines[-1]} {word}" if lines else word
+        if lines and measure.get_text_width_height_descent(longer, font, ismath=False)[0] <= width * 72.0:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    return lines
+
+
+def foot(asked: Asked, chosen: Chosen, *more: str, averaged: bool = True) -> str:
+    """Write the note of a figure.
+
+    Args:
+        asked: what is drawn.
+        chosen: of which results.
+        more: sentences of the figure's own, in front of the others.
+        averaged: whether it shows means over the captures.
+    """
+    sentences = [*more, *foot_of(asked.scale, chosen.all, averaged)]
+    if chosen.left_out:
+        sentences.append(f"Not every row was run on {_listed(chosen.left_out)}.")
+    if chosen.missing:
+        sentences.append(f"Not run: {_listed(map(name_of, chosen.missing))}.")
+    return " ".join(sentences)
+
+
+def foot_of(scale: str, results: Sequence[Result], averaged: bool = True) -> list[str]:
+    """Say captures, steps and seeds of results, and the scale."""
+    sizes = {
+        r.scene: f"{r.scene} ({r.protocol['width']}\N{NO-BREAK SPACE}×\N{NO-BREAK SPACE}{r.protocol['height']})"
+        for r in results
+    }
+    steps = sorted({int(r.schedule["max_steps"]) for r in results})
+    seeds = sorted({r.seed for r in results})
+    of_them = "Capture" if len(sizes) == 1 else "Mean over" if averaged else "Captures"
+    captures = f"{of_them} {_listed(sizes.values())}"
+    length = " to ".join(f"{n:,}" for n in dict.fromkeys((steps[0], steps[-1])))
+    seeded = f"seed {seeds[0]}" if len(seeds) == 1 else f"mean over seeds {_listed(map(str, seeds))}"
+    return [f"{captures}; {length} steps; {seeded}.", scale_sentence(scale)]
+
+
+def scale_sentence(scale: str) -> str:
+    """Say whether a scale is the paper's protocol."""
+    if scale == "paper":
+        return "Scale paper: the published protocol."
+    return f"Scale {scale}, not the paper's protocol: {scale_named(scale).about}."
+
+
+def _listed(names: Iterable[str]) -> str:
+    found = list(names)
+    return found[0] if len(found) == 1 else f"{', '.join(found[:-1])} and {found[-1]}"

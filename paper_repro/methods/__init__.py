@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-__all__ = ["NONE", "Pinned", "load_pinned", "pinned_methods"]
-
 FOLDER: Final = Path(__file__).resolve().parent
 # TOML has no null
 NONE: Final = "none"

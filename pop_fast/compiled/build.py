@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Final
 
 import cuda_ext
-from cuda_ext.compiler import find_compiler, no_compiler
+from cuda_ext.toolkit import find_compiler, no_compiler
 
 HERE: Final = Path(__file__).resolve().parent
 UNITS: Final = tuple(

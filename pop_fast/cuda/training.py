@@ -8,7 +8,7 @@ from functools import partial
 import torch
 
 from cuda_ext.training.batch_step import BatchTrainer
-from cuda_ext.training.resident import ResidentViews
+from cuda_ext.training.step_buffers import ResidentViews
 from cuda_ext.training.train_step import FusedTrainer
 from pop_fast.train.stepper import Fused, MakeFused, Rows, Task
 from pop_fast.train.steps import StepSettings

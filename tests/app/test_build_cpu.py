@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from cuda_ext.compiler import find_compiler
+from cuda_ext.toolkit import find_compiler
 from pop_fast import compiled
 from pop_fast.api.backend import get_backend
 from pop_fast.cli.doctor import backends

@@ -157,13 +157,13 @@ def test_peaks_that_a_step_surpasses_are_no_peaks(script: Any, monkeypatch: pyte
     # the projection of this case alone would then need 3.68 ms
     monkeypatch.setattr(parts, "vector_ops_per_s", lambda threads: 5e5 * threads)
     monkeypatch.setattr(parts, "bytes_per_s", lambda moved, threads: 1e12)
-    too_little = r"project took 1.50 ms, and operations alone need .*: peak.py measures too little"
+    too_little = r"project took 1.50 ms, and operations alone need .*: peak.cpp measures too little"
     with pytest.raises(SystemExit, match=too_little):
         parts.floors(case("64x32-100"))
 
 
 def test_steps_on_more_cores_are_simulated_from_what_their_parts_take(script: Any) -> None:
-    cores = script("cores")
+    cores = script("parts")
     timed = [cores.Timed(0.001, [0.004, 0.004, 0.004, 0.012])]
     assert cores.last_one_done(timed[0].parts, 1) == pytest.approx(0.024)
     # by two threads: 4 + 4 ms and 4 ms, and the second one takes the last part too
@@ -182,7 +182,7 @@ def test_steps_on_more_cores_are_simulated_from_what_their_parts_take(script: An
 
 @pytest.mark.skipif(bool(compiled.why_not()), reason=compiled.why_not() or "")
 def test_a_traced_step_is_the_step_and_its_parts_are_those_that_are_booked(script: Any, tmp_path: Path) -> None:
-    cores, cases = script("cores"), script("cases")
+    cores, cases = script("parts"), script("cases")
     tiny = cases.Case("64x32-300", 300, 64, 32)
     runs = [script("steps").run_of_case(tiny, str(tmp_path / name), "native") for name in ("run", "traced")]
     for training in runs:
@@ -208,7 +208,7 @@ def test_a_traced_step_is_the_step_and_its_parts_are_those_that_are_booked(scrip
 
 
 def test_the_peaks_of_this_machine_are_measured(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    peak = script("peak")
+    peak = script("parts")
     if peak.find_compiler() is None:
         pytest.skip(peak.no_compiler())
     monkeypatch.setattr(peak, "ROUNDS", 1000)
@@ -225,7 +225,7 @@ def counting() -> int:
 
 
 def test_busy_processes_end_with_their_block(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    busy = script("busy")
+    busy = script("processes")
     monkeypatch.setattr(busy.time, "sleep", lambda _: None)
 
     def interrupted() -> None:
@@ -239,7 +239,7 @@ def test_busy_processes_end_with_their_block(script: Any, monkeypatch: pytest.Mo
 
 
 def test_busy_processes_end_with_who_started_them(script: Any) -> None:
-    loop = script("busy").LOOP
+    loop = script("processes").LOOP
     alone = subprocess.Popen([sys.executable, "-S", "-c", loop, "0"])
     try:
         assert alone.wait(timeout=60) == 0
@@ -248,13 +248,13 @@ def test_busy_processes_end_with_who_started_them(script: Any) -> None:
 
 
 def test_a_fair_share_is_that_of_all_who_want_a_core(script: Any) -> None:
-    busy = script("busy")
+    busy = script("processes")
     assert busy.fair_factor(2, 2) == 5.0
     assert busy.fair_factor(1, 16) == 1.0
 
 
 def test_turns_change_order_and_keep_what_counts(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    timing, log = script("timing"), []
+    timing, log = script("cases"), []
     clock = iter(range(1000))
     monkeypatch.setattr(time, "perf_counter", lambda: float(next(clock)))
     found = timing.turns({"a": lambda: log.append("a"), "b": lambda: log.append("b")}, repeats=2, warm_up=1)

@@ -17,13 +17,10 @@ import pytest
 from cuda_ext.gpu_check import command as gpu_check
 from cuda_ext.gpu_check import shared as gpu_check_tools
 from cuda_ext.gpu_check import stages as gpu_check_stages
-from cuda_ext.gpu_check import tests as gpu_check_tests
-from cuda_ext.gpu_check import training as gpu_check_training
 from cuda_ext.gpu_check.command import commit_of, main
 from cuda_ext.gpu_check.outcomes import outcomes
 from cuda_ext.gpu_check.shared import MARGIN, Budget, Command, Share, StageContext, first_line, run, write_json
-from cuda_ext.gpu_check.stages import JOBS, SHARES, STAGES, wheels_stage
-from cuda_ext.gpu_check.training import train_one
+from cuda_ext.gpu_check.stages import JOBS, SHARES, STAGES, train_one, wheels_stage
 from paper_repro.record import from_line
 from pop_fast.cli import main as pop
 from pop_fast.data import load_capture
@@ -206,16 +203,16 @@ def test_a_training_that_cannot_be_says_why_and_the_next_is_begun(tmp_path):
     notes: list[dict[str, object]] = []
     missing = (tmp_path / "a", tmp_path / "b")
     shared = check(tmp_path, captures=missing, note=lambda told: notes.append(json.loads(json.dumps(told))))
-    found = gpu_check_training.train_stage(shared)
+    found = gpu_check_stages.train_stage(shared)
     assert found["status"] != 0
     assert [list(note["runs"]) for note in notes] == [["a"], ["a", "b"]]  # type: ignore[call-overload]
     assert all("pop: error: " in one["output"] for one in found["runs"].values())
-    assert "no captures" in gpu_check_training.train_stage(check(tmp_path))["skipped"]
+    assert "no captures" in gpu_check_stages.train_stage(check(tmp_path))["skipped"]
 
 
 def test_a_training_without_the_package_of_the_command_line_is_skipped(tmp_path, monkeypatch):
-    monkeypatch.setattr(gpu_check_training.importlib.util, "find_spec", lambda name: None)
-    found = gpu_check_training.train_stage(check(tmp_path, captures=(tmp_path,)))
+    monkeypatch.setattr(gpu_check_stages.importlib.util, "find_spec", lambda name: None)
+    found = gpu_check_stages.train_stage(check(tmp_path, captures=(tmp_path,)))
     assert (found["status"], "needs tyro" in found["skipped"]) == (0, True)
 
 
@@ -275,22 +272,22 @@ def test_a_damaged_line_of_outcomes_is_counted_and_left_out(tmp_path, damage):
 def test_outcomes_are_those_of_the_tests(tmp_path, monkeypatch):
     """Every test is written down when it ends, a file that cannot be imported too; nothing but skips is no pass."""
     (tmp_path / "tests" / "cuda" / "gpu").mkdir(parents=True)
-    monkeypatch.setattr(gpu_check_tests, "ROOT", tmp_path)
+    monkeypatch.setattr(gpu_check_stages, "ROOT", tmp_path)
     text = "import pytest\ndef test_a(): pass\ndef test_b(): assert 1 == 2\n@pytest.mark.skip(reason='no GPU')\n"
     (tmp_path / "tests" / "cuda" / "gpu" / "test_x.py").write_text(text + "def test_c(): pass\n")
     (tmp_path / "tests" / "cuda" / "gpu" / "test_y.py").write_text("import nothing_of_that_name\n")
     root = str(gpu_check_tools.ROOT)
     monkeypatch.setenv("PYTHONPATH", root)
-    found = gpu_check_tests._pytest(check(tmp_path), "laws", ("test_x.py",))
+    found = gpu_check_stages._pytest(check(tmp_path), "laws", ("test_x.py",))
     assert found["status"] == 1
     told = found["tests"]
     assert [told[name] for name in ("passed", "failed", "skipped")] == [1, 1, 1]
     assert told["failures"][0]["test"].endswith("::test_b")
     assert "assert 1 == 2" in told["failures"][0]["words"]
     assert "no GPU" in str(told["skipped_for"])
-    found = gpu_check_tests._pytest(check(tmp_path), "laws", ("test_x.py",), "-k", "test_c")
+    found = gpu_check_stages._pytest(check(tmp_path), "laws", ("test_x.py",), "-k", "test_c")
     assert (found["status"], found["tests"]["passed"]) == (1, 0)
-    found = gpu_check_tests._pytest(check(tmp_path), "laws", ("test_y.py",))
+    found = gpu_check_stages._pytest(check(tmp_path), "laws", ("test_y.py",))
     assert "nothing_of_that_name" in found["tests"]["failures"][0]["words"]
     assert outcomes(tmp_path / "absent.jsonl")["passed"] == 0
 
@@ -318,8 +315,8 @@ def test_the_whole_call_ends_before_its_limit(stages, tmp_path):
 
 def test_every_test_that_needs_a_gpu_is_run_by_a_stage() -> None:
     there = {file.name for file in (gpu_check_tools.ROOT / "tests" / "cuda" / "gpu").glob("test_*.py")}
-    assert {*gpu_check_tests.LAWS, *gpu_check_tests.STEPS, "test_smoke.py"} == there
-    assert {test.partition("::")[0] for test in gpu_check_tests.SMOKE} <= there
+    assert {*gpu_check_stages.LAWS, *gpu_check_stages.STEPS, "test_smoke.py"} == there
+    assert {test.partition("::")[0] for test in gpu_check_stages.SMOKE} <= there
 
 
 # What travels to a bare node: every file listed, under the limit, and what cannot be packed told.

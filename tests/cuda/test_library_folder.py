@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from cuda_ext.compiler import find_compiler
 from cuda_ext.host import emulate
 from cuda_ext.host import library_folder as place
+from cuda_ext.toolkit import find_compiler
 
 ROOT = Path(__file__).parents[2]
 # what a library of somebody else would do: tell that it was loaded

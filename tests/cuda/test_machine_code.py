@@ -9,8 +9,19 @@ import pytest
 
 from cuda_ext.machine_code import count_sass, hot_lines
 from cuda_ext.machine_code.check_ptxas import CSRC, KernelUse
-from cuda_ext.machine_code.count_sass import PROCESSORS, find_nvdisasm, kernel_entry, warps_per_processor
-from cuda_ext.machine_code.sass import CLASSES, Flow, class_of, find_loops, loop_line, outside_loops, parse_sass
+from cuda_ext.machine_code.count_sass import (
+    CLASSES,
+    PROCESSORS,
+    Flow,
+    class_of,
+    find_loops,
+    find_nvdisasm,
+    kernel_entry,
+    loop_line,
+    outside_loops,
+    parse_sass,
+    warps_per_processor,
+)
 from cuda_ext.toolkit import find_nvcc
 
 COUNTS = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "sass.json"

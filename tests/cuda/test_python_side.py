@@ -17,9 +17,9 @@ import cuda_ext
 from cuda_ext import build as build_module
 from cuda_ext.build import BuildError
 from cuda_ext.machine_code.check_ptxas import KernelUse, as_table, offenders, parse_ptxas
-from cuda_ext.render.capacity import GROWTH, MOST, Capacity
+from cuda_ext.render.lists import GROWTH, MOST, Capacity
 from cuda_ext.toolkit import find_nvcc
-from cuda_ext.training.graphs import Watch, captured
+from cuda_ext.training.train_step import Watch, captured
 
 PTXAS = """
 ptxas info    : Compiling entry function '_ZN3pop20blend_forward_kernelE' for 'sm_90'

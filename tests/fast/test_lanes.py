@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cuda_ext.compiler import find_compiler
+from cuda_ext.toolkit import find_compiler
 from pop_fast import compiled
 from pop_fast.compiled import build as building
 from pop_fast.compiled import library, losses

@@ -57,19 +57,17 @@ def load(name: str) -> ModuleType:
     return module
 
 
-stages = load("stages")
-kit_tables = load("kit_tables")
 tables = load("tables")
 FAST = {
     name: given
     for path in (ROOT / "pop_fast" / "stages").glob("*.py")
-    for name, given in stages.functions(path).items()
+    for name, given in tables.functions(path).items()
 }
 BOTH_ROOMS = [
     (f"{module}.{name}", reference, FAST[name])
-    for stage in stages.STAGES
+    for stage in tables.STAGES
     for module in stage.modules
-    for name, reference in stages.functions(ROOT / "pop_ref" / f"{module}.py").items()
+    for name, reference in tables.functions(ROOT / "pop_ref" / f"{module}.py").items()
     if name in FAST
 ]
 
@@ -106,18 +104,18 @@ def test_the_results_script_agrees_with_the_readme() -> None:
 
 
 def test_every_stage_of_the_oracle_has_its_row() -> None:
-    named = {module for stage in stages.STAGES for module in stage.modules}
-    present = {path.stem for path in (ROOT / "pop_ref").glob("*.py")} - stages.NOT_STAGES
+    named = {module for stage in tables.STAGES for module in stage.modules}
+    present = {path.stem for path in (ROOT / "pop_ref").glob("*.py")} - tables.NOT_STAGES
     assert present == named
 
 
-@pytest.mark.parametrize("stage", stages.STAGES, ids=lambda stage: stage.title)
+@pytest.mark.parametrize("stage", tables.STAGES, ids=lambda stage: stage.title)
 def test_every_stage_has_functions_and_laws(stage) -> None:
-    assert any(stages.functions(path) for path in stages.files("pop_ref", stage))
-    laws = list(stages.laws(stage))
+    assert any(tables.functions(path) for path in tables.files("pop_ref", stage))
+    laws = list(tables.laws(stage))
     assert laws
     assert all(path.exists() for path in laws)
-    assert all(path.is_file() for path in stages.files("pop_fast", stage))
+    assert all(path.is_file() for path in tables.files("pop_fast", stage))
 
 
 def test_the_rooms_share_most_of_their_functions() -> None:
@@ -182,16 +180,16 @@ def test_every_option_of_the_kit_exists(line: str) -> None:
 
 
 def test_the_list_of_mutants_is_current() -> None:
-    assert f"{kit_tables.mutants()}\n" == kit_tables.MUTANT_LIST.read_text(encoding="utf-8"), (
+    assert f"{tables.mutants()}\n" == tables.MUTANT_LIST.read_text(encoding="utf-8"), (
         "run 'python docs/tables.py --write'"
     )
 
 
-@pytest.mark.parametrize("file", sorted({file for file, _ in kit_tables.JUDGED.values()}))
+@pytest.mark.parametrize("file", sorted({file for file, _ in tables.JUDGED.values()}))
 def test_every_law_stands_on_every_scorecard(file: str) -> None:
     expected = {(law.stage, law.name) for law in every_law().values()}
-    told = kit_tables.card(file)
-    assert set(told["laws"]) == {backend for name, backend in kit_tables.JUDGED.values() if name == file}
+    told = tables.card(file)
+    assert set(told["laws"]) == {backend for name, backend in tables.JUDGED.values() if name == file}
     for backend, stages_of in told["laws"].items():
         found = {(stage, law) for stage, laws in stages_of.items() for law in outcomes(laws)}
         assert found == expected, f"{file}: judge {backend} again"
@@ -204,7 +202,7 @@ def test_every_law_stands_on_every_scorecard(file: str) -> None:
 
 def test_our_own_backends_break_no_law() -> None:
     for file in ("pop_fast.json", "compiled.json"):
-        for column in kit_tables.card(file)["summary"].values():
+        for column in tables.card(file)["summary"].values():
             assert sum(count["failed"] for count in column.values()) == 0
             assert sum(count["passed"] for count in column.values()) > 100
 

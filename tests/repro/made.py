@@ -12,9 +12,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from paper_repro.figures import FIGURES, curves, opacities, style, tradeoffs
+from paper_repro.figures import FIGURES, curves, style, tradeoffs
 from paper_repro.figures.data import Asked
-from paper_repro.figures.sheet import Drawn
+from paper_repro.figures.style import Drawn
 from paper_repro.jobs import Job, job_named
 from paper_repro.record import BINS, Result, run_id, settings_hash
 from paper_repro.scenes import SCENES
@@ -145,7 +145,7 @@ def asked(figure: str, results: list[Result], folder: Path = Path("nowhere"), sc
 
 def drawn(figure: str, results: list[Result], **more) -> Drawn:
     """Draw one figure of results that are nowhere on the disk."""
-    module = {"tradeoffs": tradeoffs, "opacities": opacities, "curves": curves}[FIGURES[figure][0]]
+    module = {"tradeoffs": tradeoffs, "curves": curves}[FIGURES[figure][0]]
     with style.look():
         return getattr(module, FIGURES[figure][1])(asked(figure, results, **more))
 

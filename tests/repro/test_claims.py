@@ -11,15 +11,13 @@ from typing import Any
 import pytest
 
 from paper_repro.claims import HEADLINES, METHODS, SWEEP, WINDOWS, claims, questions
-from paper_repro.claims_page import markdown, outcome, telling
+from paper_repro.claims_page import READINGS, Answer, answers, columns, experiments, markdown, outcome, telling
 from paper_repro.cli import main
 from paper_repro.evidence import DATASETS, Claim, is_shortened, paper_ratios
-from paper_repro.jobs import job_named
+from paper_repro.jobs import ROWS, job_named, load_row
 from paper_repro.judging import OTHERS
 from paper_repro.paper import paper
-from paper_repro.readings import READINGS, Answer, answers, columns, experiments
 from paper_repro.results import Result
-from paper_repro.rows import ROWS, load_row
 from tests.repro.made import WHOLE, curve
 from tests.repro.made import whole as result
 

@@ -19,15 +19,14 @@ from hypothesis import strategies as st
 from paper_repro import figures
 from paper_repro.claims import SWEEP, claims
 from paper_repro.cli import main
-from paper_repro.figures import FIGURES, opacities, style
+from paper_repro.figures import FIGURES, curves, style
 from paper_repro.figures.data import NoDataError, choose, curve_of
-from paper_repro.figures.foot import foot
-from paper_repro.figures.names import Marker, along, places
-from paper_repro.figures.sheet import save
+from paper_repro.figures.style import foot, save
+from paper_repro.figures.tradeoffs import Marker, along, places
+from paper_repro.jobs import load_rows
 from paper_repro.paper import paper
 from paper_repro.record import BINS
 from paper_repro.results import Result, write
-from paper_repro.rows import load_rows
 from pop_fast.errors import PopError
 from tests.repro.made import asked, curve, drawn, lines, result, texts
 
@@ -258,7 +257,7 @@ def test_the_marked_shares_are_those_of_the_histogram():
     assert "The paper's figure is of another capture, kitchen." in texts(other).replace("\n", " ")
     assert {line["what"] for line in lines(other)} == {"bin", "ours under 0.1", "ours over 0.9"}
     with pytest.raises(ValueError, match=r"edge is 0\.15; it must lie between two of 50 bins"):
-        opacities.share_below(np.ones(BINS), 0.15)
+        curves.share_below(np.ones(BINS), 0.15)
 
 
 def test_seeds_count_the_same_in_the_histogram():

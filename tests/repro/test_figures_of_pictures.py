@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from paper_repro.figures import artifact, opacity_one, qualitative, style
+from paper_repro.figures import artifact, qualitative, style
 from paper_repro.figures.data import NoDataError
-from paper_repro.figures.sheet import save
+from paper_repro.figures.style import save
 from paper_repro.jobs import job_named
 from paper_repro.results import RESULTS
 from paper_repro.train_row import Options, capture_folder, load_capture_of
@@ -105,10 +105,10 @@ def artifacts(tmp_path_factory):
     save_ply(job.work(folder) / "ply" / "point_cloud_299.ply", params)
     base = result("3dgs", "demo", scale="toy", schedule={"max_steps": 300})
     with pytest.MonkeyPatch.context() as patch, style.look():
-        patch.setattr(opacity_one, "STEPS", 12)
+        patch.setattr(artifact, "STEPS", 12)
         toy = asked("3", [base], folder, scale="toy")
-        first = opacity_one.pushed(toy)
-        patch.setattr(opacity_one, "_train", lambda *_: pytest.fail("trained again"))
+        first = artifact.pushed(toy)
+        patch.setattr(artifact, "_train", lambda *_: pytest.fail("trained again"))
         made = artifact.six_panels(toy)
         return params, first, made, save(made, folder / "figure_3")
 
@@ -145,4 +145,4 @@ def test_a_constant_map_has_no_correlation():
 
 def test_the_artifacts_need_a_scene(tmp_path):
     with pytest.raises(PopError, match=f"{tmp_path} has none of kitchen; name another --data"):
-        opacity_one.pushed(asked("3", [], tmp_path, scale="paper"))
+        artifact.pushed(asked("3", [], tmp_path, scale="paper"))

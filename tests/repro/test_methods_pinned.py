@@ -11,11 +11,9 @@ from typing import Any
 import pytest
 import torch
 
-from paper_repro.jobs import job_named
+from paper_repro.jobs import ROWS, job_named, load_row
 from paper_repro.methods import load_pinned, pinned_methods
-from paper_repro.rows import ROWS, load_row
-from paper_repro.scales import SCALES
-from paper_repro.scenes import SCENES
+from paper_repro.scenes import SCALES, SCENES
 from pop_fast.cli.train import arguments
 from pop_fast.density import rows
 from pop_fast.train import TrainConfig, TrainingRun

@@ -12,8 +12,7 @@ from typing import Any
 import pytest
 
 from paper_repro import status
-from paper_repro.checks import Statement, checks, places
-from paper_repro.paper import PAPER, load, paper
+from paper_repro.paper import PAPER, Statement, checks, load, paper, places
 from paper_repro.results import RESULTS, SCALES, Result, read_all
 from paper_repro.status import HERE, files, status_table, with_part
 from pop_fast.errors import PopError

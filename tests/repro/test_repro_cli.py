@@ -16,10 +16,9 @@ import pytest
 
 from paper_repro import queue as repro_queue
 from paper_repro.cli import COMMANDS, main
-from paper_repro.jobs import job_named, jobs_of, trainable
+from paper_repro.jobs import ROWS, job_named, jobs_of, load_row, trainable
 from paper_repro.paper import paper
 from paper_repro.results import read_all
-from paper_repro.rows import ROWS, load_row
 
 ROOT = Path(__file__).parents[2]
 HEAVY = ("torch", "scipy", "cv2", "matplotlib", "pycolmap", "tyro", "snakemake")

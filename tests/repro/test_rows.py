@@ -7,12 +7,20 @@ from pathlib import Path
 
 import pytest
 
-from paper_repro import rows, scenes
-from paper_repro.jobs import NotTrainableError, job_named, jobs_of, missing_method
+from paper_repro import jobs, scenes
+from paper_repro.jobs import (
+    CONFIGS,
+    ROWS,
+    NotTrainableError,
+    header_of,
+    job_named,
+    jobs_of,
+    load_row,
+    load_rows,
+    missing_method,
+)
 from paper_repro.paper import paper
-from paper_repro.rows import CONFIGS, ROWS, header_of, load_row, load_rows
-from paper_repro.scales import SCALES
-from paper_repro.scenes import SCENES
+from paper_repro.scenes import SCALES, SCENES
 from pop_fast.errors import PopError
 from pop_ref.constants import PROFILES
 from pop_ref.recipes import BASELINES, L1_DIVIDED, RECIPES, Recipe
@@ -220,7 +228,7 @@ WRONG = {
 
 @pytest.mark.parametrize("line", WRONG)
 def test_a_wrong_field_is_named(tmp_path: Path, line):
-    whole = (rows.CONFIGS / "pop.toml").read_text()
+    whole = (jobs.CONFIGS / "pop.toml").read_text()
     field = line.split(" = ")[0]
     text = "\n".join(line if found.startswith(f"{field} =") else found for found in whole.splitlines())
     if field == "description":
@@ -232,7 +240,7 @@ def test_a_wrong_field_is_named(tmp_path: Path, line):
 
 
 def test_a_missing_field_a_strange_scene_and_what_is_no_toml_are_named(tmp_path: Path):
-    whole = (rows.CONFIGS / "pop.toml").read_text()
+    whole = (jobs.CONFIGS / "pop.toml").read_text()
     (tmp_path / "pop.toml").write_text(whole.replace('method = "pop"\n', ""))
     with pytest.raises(PopError, match=r"pop\.toml: has no method"):
         load_row("pop", tmp_path)

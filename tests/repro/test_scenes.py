@@ -14,8 +14,17 @@ import pytest
 from paper_repro import scenes
 from paper_repro.data_check import HOLD_OUT, check_capture, check_scene, table
 from paper_repro.jobs import job_named
-from paper_repro.scales import SCALES
-from paper_repro.scenes import DATASETS, MADE, SCENES, PaperScene, find_folder, load_scenes, scene_named, source_of
+from paper_repro.scenes import (
+    DATASETS,
+    MADE,
+    SCALES,
+    SCENES,
+    PaperScene,
+    find_folder,
+    load_scenes,
+    scene_named,
+    source_of,
+)
 from pop_fast.data import load_capture
 from pop_fast.demo import make_demo
 from pop_fast.errors import PopError

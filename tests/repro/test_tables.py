@@ -13,8 +13,7 @@ import pytest
 
 from paper_repro.paper import paper
 from paper_repro.results import SCALES, Result, read_all, write
-from paper_repro.table_latex import PREAMBLE, latex
-from paper_repro.table_markdown import COLUMNS, csv_text, markdown
+from paper_repro.table_formats import COLUMNS, PREAMBLE, csv_text, latex, markdown
 from paper_repro.tables import BEYOND, REFERENCES, SCENES_OF, Line, Table, beyond, setting, table
 from pop_fast.errors import PopError
 from tests.repro.made import result

@@ -17,22 +17,21 @@ import pytest
 import torch
 
 from paper_repro import train_row as module
-from paper_repro.base import base_of, steps_for_others
-from paper_repro.collect import PROBE, collect, first_change
-from paper_repro.jobs import NotTrainableError, job_named, jobs_of
+from paper_repro.collect import PROBE, collect, file_hash, first_change
+from paper_repro.jobs import NotTrainableError, job_named, jobs_of, load_rows
 from paper_repro.probe import VIEWS, ProbedRun, gradient_sizes
-from paper_repro.published import file_hash
 from paper_repro.record import run_id, settings_hash
 from paper_repro.results import read, write
-from paper_repro.rows import load_rows
 from paper_repro.train_row import (
     BusyError,
     Options,
+    base_of,
     capture_folder,
     commit,
     finished,
     load_capture_of,
     only_one,
+    steps_for_others,
     train_row,
 )
 from pop_fast.errors import PopError

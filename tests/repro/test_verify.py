@@ -23,10 +23,9 @@ from scipy import stats
 
 from paper_repro.claims import claims, noise_of, questions
 from paper_repro.cli import main
-from paper_repro.evidence import groups
+from paper_repro.evidence import COUNT, MOST_SEEDS, PSNR, SECONDS, Comparison, Noise, compare, groups
 from paper_repro.jobs import job_named
 from paper_repro.judging import judge
-from paper_repro.noise import COUNT, MOST_SEEDS, PSNR, SECONDS, Comparison, Noise, compare
 from paper_repro.paper import paper
 from paper_repro.results import RESULTS, SCALES, Result, find, read_all, write
 from paper_repro.train_row import commit

@@ -122,7 +122,7 @@ def test_families_that_differ_are_told_beside_the_times(bench, monkeypatch):
 
 
 def test_kernel_times_are_added_up_by_name(bench):
-    from gpu_profile import summed
+    from gpu_steps import summed
 
     def event(name, us, device=torch.autograd.DeviceType.CUDA, annotation=False):
         span = types.SimpleNamespace(elapsed_us=lambda: us)

@@ -12,7 +12,7 @@ import torch
 from cuda_ext.arrays import Settings
 from cuda_ext.host import emulate
 from cuda_ext.render.lists import WARP_TILE, make_lists, splat_struct
-from cuda_ext.training.resident import ResidentViews
+from cuda_ext.training.step_buffers import ResidentViews
 from cuda_ext.training.train_step import FusedTrainer
 from pop_fast.density.passes import Passes
 from pop_fast.train.schedule import steady_updates

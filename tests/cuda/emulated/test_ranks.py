@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from cuda_ext.host import emulate
-from cuda_ext.render import capacity
+from cuda_ext.render import lists
 from cuda_ext.training.batch_step import RETURNED, SENT, STRETCH, BatchTrainer, step_bytes, stretches
 from pop_fast.cli import main
 from pop_fast.density import POPStrategy
@@ -206,7 +206,7 @@ def test_one_gpu_continues_what_two_began(gpu, together: Path, tmp_path: Path) -
 
 def test_buffers_that_overflow_in_a_step_of_several_views_lose_nothing(gpu, alone, tmp_path: Path, monkeypatch) -> None:
     whole = alone("window").run
-    monkeypatch.setattr(capacity, "FIRST_GUESS", (0, 1))
+    monkeypatch.setattr(lists, "FIRST_GUESS", (0, 1))
     cramped = train(tmp_path / "cramped", "window")
     assert cramped.stepper.facts()["instance_buffers_grown"] > 0
     assert whole.stepper.facts()["instance_buffers_grown"] == 0

@@ -61,7 +61,7 @@ THETA = 0.02
 
 def fused_trainer(scene: TrainingScene, device, masks=None, **options):
     """Return rows (parameters and moments) and the trainer of them."""
-    from cuda_ext.training.resident import ResidentViews
+    from cuda_ext.training.step_buffers import ResidentViews
     from cuda_ext.training.train_step import FusedTrainer
     from pop_fast.train.schedule import steady_updates
     from pop_fast.train.steps import StepSettings

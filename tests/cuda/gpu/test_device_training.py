@@ -136,12 +136,12 @@ def test_an_interrupted_run_goes_on_to_the_same_bits(engine, method, tmp_path, m
 
 
 def test_buffers_that_overflow_between_views_of_several_sizes_lose_nothing(engine, tmp_path, monkeypatch):
-    from cuda_ext.render import capacity
+    from cuda_ext.render import lists
 
     capture = mixed_sizes(tiny_capture())
     whole = TrainingRun(tiny_config(tmp_path / "whole"), capture, engine=engine)
     whole.run()
-    monkeypatch.setattr(capacity, "FIRST_GUESS", (0, 1))
+    monkeypatch.setattr(lists, "FIRST_GUESS", (0, 1))
     cramped = TrainingRun(tiny_config(tmp_path / "cramped"), capture, engine=engine)
     assert cramped.run()["instance_buffers_grown"] > 0
     for key, value in whole.params.items():

@@ -101,10 +101,10 @@ def test_more_entries_than_the_kernels_can_number_are_refused_in_one_line(gpu):
 
 
 def test_room_shrinks_after_a_phase_of_fat_splats_and_the_steps_stay_the_same(gpu, monkeypatch):
-    from cuda_ext.render import capacity
+    from cuda_ext.render import lists
     from pop_fast.train.steps import Phase
 
-    monkeypatch.setattr(capacity, "FIRST_GUESS", (0, 64))
+    monkeypatch.setattr(lists, "FIRST_GUESS", (0, 64))
     phase, scene = Phase(3, True, True, True), training_scene()
     fat = {**scene.params, "scales": scene.params["scales"] + 1.5}
     (params, m, v), trainer = fused_trainer(replace(scene, params=fat), gpu)

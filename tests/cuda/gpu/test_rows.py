@@ -51,7 +51,7 @@ def _moments(
 
     Before it, `waits` steps are taken in which the harmonics beyond the first band take no part.
     """
-    from cuda_ext.training.resident import ResidentViews
+    from cuda_ext.training.step_buffers import ResidentViews
     from cuda_ext.training.train_step import FusedTrainer
     from pop_fast.train.schedule import steady_updates
     from pop_fast.train.steps import Phase, StepSettings
@@ -223,7 +223,7 @@ def _photographs(height: int, width: int, masked: bool):
 def _found(device, photograph, image, mask, padding, l1, weights, cache):
     from cuda_ext import load
     from cuda_ext.arrays import fill, new_state, stream_of
-    from cuda_ext.training.resident import MARGIN, ResidentViews
+    from cuda_ext.training.step_buffers import MARGIN, ResidentViews
 
     kernels, (height, width) = load(), photograph.shape[:2]
     masks = None if mask is None else [mask]

@@ -32,7 +32,7 @@ def test_a_render_is_the_oracles(gpu, backward):
 
 
 def test_fused_steps_launched_one_by_one_give_the_same_bits_twice_and_learn(gpu):
-    from cuda_ext.training.resident import ResidentViews
+    from cuda_ext.training.step_buffers import ResidentViews
     from cuda_ext.training.train_step import FusedTrainer
     from pop_fast.train.schedule import steady_updates
     from pop_fast.train.steps import Phase, StepSettings, StepStats

@@ -52,10 +52,10 @@ def test_graphs_of_several_sizes_and_phases_are_replayed_in_turn(gpu, options):
 
 @pytest.mark.graph
 def test_buffers_that_overflow_grow_and_nothing_is_lost(gpu, monkeypatch):
-    from cuda_ext.render import capacity
+    from cuda_ext.render import lists
 
     expected = fused(training_scene(), gpu)[1]
-    monkeypatch.setattr(capacity, "FIRST_GUESS", (0, 1))
+    monkeypatch.setattr(lists, "FIRST_GUESS", (0, 1))
     _, small, cramped = fused(training_scene(), gpu)
     assert cramped.grown > 0
     for name, value in expected.items():
