@@ -23,6 +23,7 @@ from paper_repro.status import everything, status_table
 from pop_fast.train.presets import METHODS, options_for
 from pop_ref.conformance.capabilities import STAGES as KIT_STAGES
 from pop_ref.conformance.law_coverage import LIMITS, reason
+from pop_ref.conformance.laws import STANDS_IN
 from pop_ref.conformance.mutants import BLACK_BOXES, FAMILIES, MUTANTS, PROGRAM
 from pop_ref.conformance.mutants.trial import every_law
 from pop_ref.conformance.scorecard import outcomes
@@ -48,8 +49,6 @@ JUDGED = {
     "pop_fast float32": ("pop_fast.json", "fast32"),
     "compiled float64": ("compiled.json", "compiled64"),
     "compiled float32": ("compiled.json", "compiled32"),
-    "host mirror float64": ("host_mirror.json", "mirror64"),
-    "host mirror float32": ("host_mirror.json", "mirror32"),
     "gsplat torch float64": ("gsplat.json", "gsplat-torch64"),
     "gsplat torch float32": ("gsplat.json", "gsplat-torch32"),
 }
@@ -110,19 +109,19 @@ STAGES = (
     Stage("projection of means and covariances (EWA)", "3.1", ("projection",)),
     Stage("low-pass, conics, extents, off-screen cull", "3.1", ("footprint",), ("stages/projection.py",)),
     Stage("tile lists in depth order", "3.1", ("tiles",), ("compiled/compositing.py",)),
-    Stage("falloff and alpha of one splat at one pixel", "eqs. 1, 11", ("alpha",), ("stages/blend/tile_groups.py",)),
+    Stage("falloff and alpha of one splat at one pixel", "eqs. 1, 11", ("alpha",), ("stages/tile_groups.py",)),
     Stage("blending with early ray termination", "eq. 1", ("compositing", "pixel"), ("compiled/compositing.py",)),
     Stage("dominant Gaussians", "eq. 5", ("dominance",), ("stages/compositing.py",)),
-    Stage("a whole view", "eq. 1", ("render", "splatting", "depth"), ("api/rasterize.py", "compiled/splatting.py")),
+    Stage("a whole view", "eq. 1", ("render", "splatting", "depth"), ("api/rasterize.py", "compiled/compositing.py")),
     Stage(
         "L1, L2, SSIM and both objectives",
         "eqs. 2, 4, 9",
-        ("losses", "ssim", "loss_magnitudes"),
+        ("losses", "ssim", "magnitudes"),
         ("compiled/losses.py",),
     ),
-    Stage("importance mask and POP loss", "eqs. 7, 8", ("polarization",)),
+    Stage("importance mask and POP loss", "eqs. 7, 8", ("polarization",), ("stages/regularizers.py",)),
     Stage("terms for few photographs: sparse depth, mean opacity, mean scale", "–", ("regularizers",)),
-    Stage("density control", "eqs. 3, 6", ("density", "density_config", "density_rows")),
+    Stage("density control", "eqs. 3, 6", ("density", "density_rows")),
     Stage("Adam and its schedules", "4.1", ("optimizer",), ("train/model.py", "train/schedule.py")),
     Stage("exposure of photographs, random backgrounds", "–", ("appearance",), ("train/appearance.py",)),
     Stage("corrections of cameras", "–", ("refinement",), ("stages/appearance.py",)),
@@ -131,32 +130,34 @@ STAGES = (
         "sums of weights, pixels and distances over a view",
         "4.2",
         ("contributions",),
-        ("compiled/scores.py",),
+        ("compiled/compositing.py",),
         _SCORES,
     ),
     Stage(
         "Speedy-Splat's score",
         "4.2",
         ("sensitivity",),
-        ("stages/contributions.py", "compiled/scores.py"),
+        ("stages/contributions.py", "compiled/compositing.py"),
         _SCORES,
     ),
     Stage(
         "PUP 3D-GS's score",
         "4.2",
         ("fisher",),
-        ("stages/contributions.py", "compiled/scores.py"),
+        ("stages/contributions.py", "compiled/compositing.py"),
         _SCORES,
     ),
     Stage(
-        "Mini-Splatting's points and importance", "4.2", ("chord", "mini_splatting"), ("compiled/scores.py",), _SCORES
+        "Mini-Splatting's points and importance",
+        "4.2",
+        ("chord", "mini_splatting"),
+        ("stages/contributions.py", "stages/density.py", "compiled/compositing.py"),
+        _SCORES,
     ),
-    Stage("Taming-3DGS's budget and score", "4.2", ("taming",)),
-    Stage("selection by score, by mass, by draw", "4.2", ("selection",)),
+    Stage("Taming-3DGS's budget and score", "4.2", ("taming",), ("stages/density.py",)),
+    Stage("selection by score, by mass, by draw", "4.2", ("selection",), ("stages/density.py",)),
     Stage("exact tile lists (SnugBox, AccuTile)", "4.2", ("tight_tiles",), ("stages/tiles.py",)),
-    Stage(
-        "distance of every decision from flipping", "–", ("margins", "extent_margins", "pixel_margins", "magnitudes")
-    ),
+    Stage("distance of every decision from flipping", "–", ("margins", "magnitudes")),
 )
 
 # modules of pop_ref that are data or types, not stages
@@ -205,9 +206,9 @@ def laws(stage: Stage) -> Iterator[Path]:
     for module in stage.modules:
         if module in LAWS_ELSEWHERE:
             yield ROOT / LAWS_ELSEWHERE[module]
-        folder = ROOT / "pop_ref" / "conformance" / "laws"
-        yield from sorted(folder.glob(f"test_{module}.py"))
-        yield from sorted(folder.glob(f"test_{module}_*.py"))
+        folder, named = ROOT / "pop_ref" / "conformance" / "laws", STANDS_IN.get(module, module)
+        yield from sorted(folder.glob(f"test_{named}.py"))
+        yield from sorted(folder.glob(f"test_{named}_*.py"))
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
