@@ -23,7 +23,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pop_fast.cli import COMMANDS
+from pop_fast.cli import COMMANDS, command, parse
 from pop_fast.io.formats import FORMATS
 from pop_ref.conformance.backends import ELSEWHERE, SHIPPED
 from pop_ref.conformance.capabilities import STAGES as LAW_STAGES
@@ -157,12 +157,13 @@ def shell_lines() -> list[str]:
 def test_every_command_of_the_readme_is_understood(line: str, capsys: pytest.CaptureFixture[str]) -> None:
     words = shlex.split(line)[1:]
     name = " ".join(words[:2]) if " ".join(words[:2]) in COMMANDS else words[0]
-    module = importlib.import_module(f"pop_fast.cli.{re.sub('[ -]', '_', name)}")
+    module = sys.modules[command(name).__module__]
+    kind = {"build-cpu": "CpuArgs", "build-cuda": "CudaArgs"}.get(name, "Args")
     rest = words[len(name.split()) :]
     if name == "train":
         module.arguments(rest)
     else:
-        importlib.import_module("pop_fast.cli").parse(module.Args, rest, name)
+        parse(getattr(module, kind), rest, name)
     assert capsys.readouterr().err == ""
 
 
