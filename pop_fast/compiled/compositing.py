@@ -349,7 +349,7 @@ def _by_the_library(stage: Callable[P, T], /, **own: Any) -> Callable[P, T]:
     """Make a stage of torch's that leaves its work to the library's functions."""
     bound = partial(stage, **own)
 
-    @wraps(stage)
+    @wraps(stage, assigned=("__name__", "__qualname__", "__doc__"))
     def compiled(*args: P.args, **kwargs: P.kwargs) -> T:
         return bound(*args, **kwargs)
 
