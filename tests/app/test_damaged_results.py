@@ -163,8 +163,10 @@ def test_every_defect_of_a_checkpoint_is_named_with_its_tensor_before_it_is_expo
     params[name] = change(params[name])
     path = tmp_path / "broken.pt"
     torch.save({"step": 29, "splats": {k: v for k, v in params.items() if v is not None}}, path)
-    says(pop("export", path, "--out", tmp_path / "o.ply"), "broken.pt", *parts)
-    says(pop("eval", path, "--capture", shared_capture), name)
+    # a zero quaternion is found when the splat is drawn or written, and the others when the file is read
+    parts = (*parts, *(["broken.pt"] if "splats." in parts[0] else []))
+    says(pop("export", path, "--out", tmp_path / "o.ply"), *parts)
+    says(pop("eval", path, "--capture", shared_capture), *parts)
     assert not (tmp_path / "o.ply").exists()
 
 
@@ -190,3 +192,8 @@ def test_endings_may_be_written_in_capitals(pop: Pop, shared_result: Path, tmp_p
         loud = tmp_path / f"LOUD{source.suffix.upper()}"
         loud.write_bytes(source.read_bytes())
         pop.done("export", loud, "--out", tmp_path / f"{source.suffix[1:]}.splat")
+
+
+def test_renders_that_are_nested_beyond_reading_are_somebody_else_s(pop: Pop, shared_result: Path, tmp_path: Path):
+    (tmp_path / "renders.json").write_text("[" * 200_000)
+    says(pop("render", shared_result, "--out", tmp_path, "--overwrite"), "renders.json")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shutil
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from pathlib import Path
@@ -146,12 +147,8 @@ def test_points_in_the_folder_are_used(tmp_path: Path, name: str) -> None:
     assert np.array_equal(capture.points, xyz)
     assert np.array_equal(capture.points_rgb, rgb)
     assert capture.source == "transforms.json: 4 views, 20 points"
-
-
-def test_named_points_that_are_absent_are_an_error(tmp_path: Path) -> None:
-    root = transforms_capture(tmp_path, ply_file_path="named.ply")
-    write_points(root / "sparse_pc.ply")
-    assert_one_line(lambda: raw(root), "named.ply", "absent")
+    edit_transforms(root, lambda listing: listing.update(ply_file_path="absent.ply"))
+    assert_one_line(lambda: raw(root), "absent.ply", "absent;")
 
 
 def test_without_points_random_ones_are_made_where_two_cameras_look(root: Path) -> None:
@@ -428,11 +425,11 @@ def test_a_metashape_export_of_which_every_camera_is_aligned_is_read(original: C
 
 
 def test_polycams_first_cameras_are_read_where_it_has_not_corrected_them(original: Capture, write: Callable) -> None:
-    assert_same_cameras(raw(write("polycam", kind=""), points=20), original)
-
-
-def test_structure_from_motion_takes_a_polycam_exports_photographs_and_nothing_else(write: Callable) -> None:
-    folder = write("polycam")
+    folder = write("polycam", kind="")
+    assert_same_cameras(raw(folder, points=20), original)
+    # structure from motion takes its photographs and nothing else, the corrected ones where there are any
+    shutil.rmtree(folder)
+    write("polycam")
     write_photograph(folder / "keyframes" / "images" / "view_000.png", photograph(0))
     assert [path.relative_to(folder).as_posix() for path in photographs(folder)] == [
         f"keyframes/corrected_images/view_{i:03d}.png" for i in range(8)

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
 
-from pop_fast.api.rasterize import rasterization
 from pop_fast.data import apply_similarity, load_capture, to_capture_frame
 from pop_fast.data.normalize import normalizing_transform, transform_points, transform_viewmats
 from pop_fast.data.similarity import rotate_sh
@@ -74,19 +73,21 @@ def test_a_fisheye_without_coefficients_is_still_a_fisheye() -> None:
     assert undistortion(lens("OPENCV_FISHEYE", (50.0, 52.0, 33.0, 22.5, 0.0, 0.0, 0.0, 0.0)), W, H).maps is not None
 
 
+@pytest.mark.parametrize("shrunk", [1, 2])
 @pytest.mark.parametrize("model", DISTORTED)
-def test_a_new_pixel_shows_what_the_lens_shows_in_its_direction(model: str) -> None:
-    one = lens(model, DISTORTED[model])
-    plan = undistortion(one, W, H)
-    # the principal point and the ratio of the focal lengths are kept
-    before, after = intrinsics(one), plan.K
-    assert np.array_equal(after[:2, 2], before[:2, 2])
+def test_a_new_pixel_shows_what_the_lens_shows_in_its_direction_at_any_stored_size(model: str, shrunk: int) -> None:
+    one, (w, h) = lens(model, DISTORTED[model]), (W // shrunk, H // shrunk)
+    plan = undistortion(one, w, h)
+    # the principal point and the ratio of the focal lengths are kept, and the zoom is that of the whole size
+    before, after, whole = intrinsics(one), plan.K, undistortion(one, W, H).K
+    assert np.array_equal(after[:2, 2] * shrunk, before[:2, 2])
     assert after[0, 0] / before[0, 0] == pytest.approx(after[1, 1] / before[1, 1], rel=1e-12)
     assert after[0, 1] == after[1, 0] == 0.0
+    assert np.allclose(after[:2] * shrunk, whole[:2], rtol=1e-9)
     assert plan.maps is not None
-    rows, columns = np.meshgrid(np.arange(H), np.arange(W), indexing="ij")
+    rows, columns = np.meshgrid(np.arange(h), np.arange(w), indexing="ij")
     rays = np.linalg.inv(plan.K) @ np.stack([columns + 0.5, rows + 0.5, np.ones_like(rows)]).reshape(3, -1)
-    seen_at = one.img_from_cam(rays.T) - 0.5
+    seen_at = one.img_from_cam(rays.T) / shrunk - 0.5
     assert np.abs(np.stack(plan.maps, axis=-1).reshape(-1, 2) - seen_at).max() < 1e-4
 
 
@@ -135,19 +136,6 @@ def test_little_distortion_changes_little() -> None:
         assert plan.maps is not None
         assert plan.K[0, 0] / 50.0 == pytest.approx(1.0, abs=2.0 * abs(k))
         assert np.abs(plan.maps[0] - np.arange(W)).max() < 100.0 * abs(k)
-
-
-@pytest.mark.parametrize("model", DISTORTED)
-def test_a_photograph_stored_at_half_size_gets_half_the_intrinsics_and_the_same_directions(model: str) -> None:
-    full = undistortion(lens(model, DISTORTED[model]), W, H)
-    half = undistortion(lens(model, DISTORTED[model]), W // 2, H // 2)
-    assert np.allclose(half.K[:2], full.K[:2] / 2.0, rtol=1e-9)
-    assert full.maps is not None
-    assert half.maps is not None
-    # the centre of a half-size pixel is the corner where four full-size pixels meet
-    for big, small in zip(full.maps, half.maps, strict=True):
-        corners = 0.25 * (big[::2, ::2] + big[1::2, ::2] + big[::2, 1::2] + big[1::2, 1::2])
-        assert np.abs((corners + 0.5) / 2.0 - 0.5 - small).max() < 0.02
 
 
 def test_a_straight_line_is_straight_again() -> None:
@@ -289,21 +277,6 @@ def test_a_moved_splat_looks_the_same_from_a_moved_camera(transform: np.ndarray,
         assert torch.allclose(back[name], params[name], atol=1e-9), name
     signs = torch.sign((back["quats"] * params["quats"]).sum(dim=1, keepdim=True))
     assert torch.allclose(back["quats"] * signs, params["quats"], atol=1e-9)
-
-
-def test_a_moved_splat_renders_to_the_same_picture() -> None:
-    params, viewmats = some_params(40), ring(2)
-    params["scales"] += 2.0
-    transform = similarity(np.array([0.5, -1.0, 2.0]), np.array([3.0, -1.0, 0.5]), 2.0)
-    moved = apply_similarity(params, transform), transform_viewmats(transform, viewmats)
-    K = torch.tensor([[36.0, 0.0, 20.0], [0.0, 36.0, 15.0], [0.0, 0.0, 1.0]], dtype=torch.float64).repeat(2, 1, 1)
-    pictures = []
-    for splat, cameras in ((params, viewmats), moved):
-        shapes = splat["means"], splat["quats"], splat["scales"].exp(), splat["opacities"].sigmoid()
-        colors = torch.cat([splat["sh0"], splat["shN"]], dim=1)
-        pictures.append(rasterization(*shapes, colors, torch.from_numpy(cameras), K, 40, 30, sh_degree=3)[0])
-    assert pictures[0].std() > 0.05
-    assert torch.allclose(pictures[0], pictures[1], atol=1e-9)
 
 
 @pytest.mark.parametrize("bands", [0, 3, 8, 15])

@@ -80,30 +80,25 @@ def test_messages_keep_letters_of_all_languages_and_are_no_longer_than_can_be_re
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("--seed", "-1"), "seed is -1; it must be at least 0"),
-        (("--threads", "100000"), "threads is 100000; it must be at most 512"),
-        (("--sfm.matcher", "exhaustive", "--sfm.seed", "-1"), "seed is -1; it must be a whole number from 0"),
+        ("--seed -1", "seed is -1; it must be at least 0"),
+        ("--threads 100000", "threads is 100000; it must be at most 512"),
+        ("--sfm.matcher exhaustive --sfm.seed -1", "seed is -1; it must be a whole number from 0"),
     ],
 )
 def test_numbers_that_libraries_cannot_take_are_refused(
-    pop: Pop, shared_capture: Path, tmp_path: Path, words: tuple[str, ...], told: str
+    pop: Pop, shared_capture: Path, tmp_path: Path, words: str, told: str
 ) -> None:
-    outcome = pop("train", shared_capture, "--out", tmp_path / "r", *words)
+    outcome = pop("train", shared_capture, "--out", tmp_path / "r", *words.split())
     assert outcome.status == 2
     assert told in " ".join(outcome.err.replace("│", " ").split())
     assert not (tmp_path / "r").exists()
 
 
-def test_renders_that_are_nested_beyond_reading_are_somebody_else_s(
-    pop: Pop, shared_result: Path, tmp_path: Path
+def test_quiet_prints_nothing_and_help_of_a_switch_that_is_on_reads_forwards(
+    pop: Pop, shared_capture: Path, tmp_path: Path
 ) -> None:
-    out = tmp_path / "views"
-    out.mkdir()
-    (out / "renders.json").write_text("[" * 200_000)
-    says(pop("render", shared_result, "--out", out, "--overwrite"), "renders.json")
-
-
-def test_quiet_prints_nothing(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
+    shown = " ".join(pop("train", "--help-all").out.replace("│", " ").split())
+    assert "--normalize, --no-normalize move the capture into gsplat's normalised world. (default: True)" in shown
     words = ["train", shared_capture, *TRAIN, "--max-steps", "2", "--out"]
     assert pop(*words, tmp_path / "a", "--quiet").out == ""
     assert "PSNR" in pop(*words, tmp_path / "b").out
@@ -158,11 +153,6 @@ def test_no_gpu_is_said_where_there_is_none(tmp_path: Path, monkeypatch: pytest.
     assert choose.choose_backend(config)[1].endswith("there is no NVIDIA GPU here")
     monkeypatch.setattr(choose, "has_gpu", lambda: True)
     assert choose.choose_backend(config)[1].endswith("run `pop build-cuda`")
-
-
-def test_help_of_a_switch_that_is_on_reads_forwards(pop: Pop) -> None:
-    shown = " ".join(pop("train", "--help-all").out.replace("│", " ").split())
-    assert "--normalize, --no-normalize move the capture into gsplat's normalised world. (default: True)" in shown
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
@@ -224,9 +214,6 @@ def test_a_bad_capture_and_bad_settings_are_named_before_the_work(pop: Pop, capt
     assert not (tmp_path / "r").exists()
 
 
-# Disks that are full and folders that are forbidden: refused in one line, nothing touched.
-
-
 @pytest.mark.parametrize("command", ["train", "demo", "render", "export"])
 def test_a_full_disk_leaves_nothing_half_written(
     pop: Pop, shared_capture: Path, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
@@ -244,12 +231,6 @@ def test_a_full_disk_leaves_nothing_half_written(
     }
     says(pop(*words[command]), str(target.parent), "the disk is full", "free some space")
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
-
-
-@pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="root may write anywhere")
-def test_a_folder_that_may_not_be_written_is_named(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
-    (tmp_path / "locked").mkdir(mode=0o500)
-    says(pop("train", shared_capture, "--out", tmp_path / "locked" / "r", *TRAIN), "locked", "permission denied")
 
 
 @pytest.mark.parametrize(
