@@ -66,9 +66,7 @@ def test_a_written_file_holds_what_the_writer_wrote_and_parents_are_made(tmp_pat
         (errno.EACCES, "permission"),
     ],
 )
-def test_a_failing_writer_leaves_the_old_file_and_what_the_system_refuses_is_one_line(
-    old: Path, number: int, word: str
-) -> None:
+def test_a_failing_writer_leaves_the_old_file(old: Path, number: int, word: str) -> None:
     refused = OSError(number, os.strerror(number))
     assert_one_line(lambda: write_atomically(old, failing(refused)), str(old), word)
     assert_untouched(old)
@@ -111,7 +109,6 @@ write_atomically(sys.argv[1], writer)
 def begun(script: str, path: Path) -> subprocess.Popen[bytes]:
     """Start a script that says when it has begun, and wait for it to say so."""
     child = subprocess.Popen([sys.executable, "-c", script, str(path)], stdout=subprocess.PIPE)
-    assert child.stdout is not None
     assert child.stdout.readline() == b"begun\n"
     return child
 
@@ -219,9 +216,7 @@ def test_an_existing_folder_is_kept_unless_it_may_be_replaced(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_a_folder_with_a_file_of_somebody_else_is_never_replaced_and_the_file_is_named(
-    tmp_path: Path, overwrite: bool
-) -> None:
+def test_a_folder_with_a_file_of_somebody_else_is_kept(tmp_path: Path, overwrite: bool) -> None:
     target = old_folder(tmp_path / "folder", "old.txt", "sub/mine.txt")
     told = assert_one_line(
         lambda: fill(target, overwrite, **by_name("old.txt")),
@@ -342,9 +337,7 @@ time.sleep(300.0)
 
 @needs_posix
 @pytest.mark.parametrize("how", ["--resume", "--overwrite"])
-def test_a_run_next_to_a_live_one_is_refused_and_the_next_after_it_is_not(
-    pop: Pop, shared_capture: Path, result: Path, how: str
-) -> None:
+def test_a_run_next_to_a_live_one_is_refused(pop: Pop, shared_capture: Path, result: Path, how: str) -> None:
     before = contents(result)
     with begun(HOLD, result) as holder:
         says(pop("train", shared_capture, "--out", result, *TRAIN, how), "another run is writing to this folder")

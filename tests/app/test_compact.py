@@ -148,9 +148,7 @@ def test_coarser_levels_are_smaller_and_leave_all_but_view_dependence_as_it_is(n
 
 @pytest.mark.parametrize("steps", [0, 12])
 @pytest.mark.parametrize("name", ["spz", "ply"])
-def test_a_budget_shows_training_views_no_worse_than_fewer_gaussians_alone(
-    shared_result: Path, steps: int, name: str
-) -> None:
+def test_a_budget_is_no_worse_than_fewer_gaussians(shared_result: Path, steps: int, name: str) -> None:
     tuner, output = tuner_of(shared_result, steps), Output(name)
     most = len(output.write(tuner.whole)) // 3
 
@@ -203,9 +201,7 @@ def test_a_size_is_met_in_every_format_and_the_file_shows_what_was_told(
 
 
 @pytest.mark.parametrize("name", ["spz", "sog"])
-def test_bits_do_not_depend_on_threads_and_the_result_is_left_as_it_was(
-    pop: Pop, result: Path, tmp_path: Path, name: str
-) -> None:
+def test_bits_do_not_depend_on_threads(pop: Pop, result: Path, tmp_path: Path, name: str) -> None:
     before, files = contents(result), [tmp_path / f"{threads}.{name}" for threads in (1, 3)]
     for threads, file in zip((1, 3), files, strict=True):
         torch.set_num_threads(threads)
@@ -214,9 +210,7 @@ def test_bits_do_not_depend_on_threads_and_the_result_is_left_as_it_was(
     assert contents(result) == before
 
 
-def test_a_number_of_gaussians_is_kept_while_what_is_left_is_tuned(
-    pop: Pop, shared_result: Path, tmp_path: Path
-) -> None:
+def test_a_number_of_gaussians_is_kept_in_tuning(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
     words = ("export", shared_result, "--frame", "training", "--max-gaussians", "60", "--out")
     tuner, found = tuner_of(shared_result, 0, degree=0), []
     for steps in (0, 40):
@@ -240,9 +234,7 @@ def test_what_a_box_leaves_out_is_not_grown_back(pop: Pop, shared_result: Path, 
     assert float(found[1]) > 25.0
 
 
-def test_what_only_a_checkpoint_knows_of_photographs_is_not_guessed(
-    pop: Pop, shared_capture: Path, tmp_path: Path
-) -> None:
+def test_what_only_a_checkpoint_knows_is_not_guessed(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
     result = tmp_path / "exposed"
     pop.done("train", shared_capture, "--out", result, *TRAIN, "--exposure", "--skip-sizes")
     small = ("--target-mb", "0.006", "--fine-tune-steps", "4", "--overwrite", "--out", tmp_path / "x.spz")

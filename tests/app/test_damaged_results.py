@@ -45,27 +45,32 @@ def under(key: str, value: Any, *inside: str) -> Damage:
     return with_fields(lambda content: (content[inside[0]] if inside else content).update({key: value}))
 
 
-# a file of a result, what is done to it, the commands that read it, and what they say after its path
+# a file of a result, what is done to it, what reads it, and what is said; {} is its path and {n} its last line
 DAMAGED: list[tuple[str, Damage, str, tuple[str, ...]]] = [
-    *((STATISTICS, instead(data), "report compare", ("is not JSON", "pop eval")) for data in NOT_JSON),
-    *((STATISTICS, instead(data), "report compare", ("must be an object", "pop eval")) for data in NO_OBJECT),
-    *((STATISTICS, under(*odd), "report compare", (f"{odd[0]} is ", "it must be a number")) for odd in NO_NUMBER),
-    *((STATISTICS, under(*odd), "compare", (f"{odd[0]} is ",)) for odd in NO_TEXT),
+    *((STATISTICS, instead(data), "report compare", ("{}", "is not JSON", "pop eval")) for data in NOT_JSON),
+    *((STATISTICS, instead(data), "report compare", ("{}", "must be an object", "pop eval")) for data in NO_OBJECT),
+    *((STATISTICS, under(*odd), "report compare", (f"{{}}: {odd[0]} is ", "it must be a number")) for odd in NO_NUMBER),
+    *((STATISTICS, under(*odd), "compare", (f"{{}}: {odd[0]} is ",)) for odd in NO_TEXT),
     *(
-        (RECORDS, lambda whole, data=data: whole + data + b"\n", "report", ("line ", "remove the file, or train again"))
+        (
+            RECORDS,
+            lambda whole, data=data: whole + data + b"\n",
+            "report",
+            ("{}: line {n}", "remove the file, or train again"),
+        )
         for data in [*NOT_JSON[1:], *NO_OBJECT, b"{}", b'{"step": "x"}', b'{"step": true}']
     ),
     *(
-        (SETTINGS, under(key, 10**400, "resolved"), "report", (f"config.{key} is a number beyond 2^53",))
+        (SETTINGS, under(key, 10**400, "resolved"), "report", ("{}", f"config.{key} is a number beyond 2^53"))
         for key in ("init_scale", "max_steps", "l2_stop_iter")
     ),
     (SETTINGS, under("colour", 1, "resolved"), "eval", ("config.colour", "not a setting")),
     *(
-        (SETTINGS, instead(data), "eval compare report", ("repair the file",))
+        (SETTINGS, instead(data), "eval compare report", ("{}", "repair the file"))
         for data in (b"", b"{oops", b'{"max_steps": 0}', "{}".encode("utf-16"))
     ),
-    (SETTINGS, instead(b"[" * 5000), "report", ()),
-    ("capture.json", instead(b"[" * 5000), "eval", ()),
+    (SETTINGS, instead(b"[" * 5000), "report", ("{}",)),
+    ("capture.json", instead(b"[" * 5000), "eval", ("{}",)),
 ]
 
 
@@ -75,14 +80,12 @@ def test_a_file_of_a_result_that_is_damaged_is_named(
 ) -> None:
     path = result / file
     path.write_bytes(damage(path.read_bytes()))
-    place = f": line {len(path.read_bytes().splitlines())}" if file == RECORDS else ""
+    last = str(len(path.read_bytes().splitlines()))
     for command in commands.split():
-        says(pop(command, result), f"{path}{place}", *parts)
+        says(pop(command, result), *(part.replace("{}", str(path)).replace("{n}", last) for part in parts))
 
 
-def test_a_record_that_a_kill_cut_off_is_left_out_and_what_is_absent_or_null_becomes_a_dash(
-    pop: Pop, result: Path
-) -> None:
+def test_a_record_cut_off_is_left_out_and_null_becomes_a_dash(pop: Pop, result: Path) -> None:
     with open(result / RECORDS, "ab") as file:
         file.write(b'{"step": 30, "view": "\xc3')
     pop.done("report", result)
@@ -170,9 +173,7 @@ def test_every_defect_of_a_checkpoint_is_named_with_its_tensor_before_it_is_expo
     assert not (tmp_path / "o.ply").exists()
 
 
-def test_a_result_that_was_never_saved_and_a_capture_that_is_no_longer_there_are_named(
-    pop: Pop, capture: Path, result: Path
-) -> None:
+def test_an_unsaved_result_and_an_absent_capture_are_named(pop: Pop, capture: Path, result: Path) -> None:
     gone, path = capture.parent / "gone", result / SETTINGS
     path.write_bytes(under("data", str(gone), "resolved")(path.read_bytes()))
     says(pop("eval", result), str(gone), "not there", "--capture DIR")

@@ -367,9 +367,7 @@ def brighter(image: np.ndarray, stops: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("width", "learned"), [(0.0, False), (0.4, True)])
-def test_training_learns_exposures_where_the_points_say_that_they_differ(
-    demo: Path, width: float, learned: bool
-) -> None:
+def test_training_learns_exposures_that_differ(demo: Path, width: float, learned: bool) -> None:
     capture = load_capture(demo)
     stops = np.random.default_rng(3).permutation(np.linspace(-1.0, 1.0, len(capture.views))) * width
     changed = [replace(v, image=brighter(v.image, stop)) for v, stop in zip(capture.views, stops, strict=True)]

@@ -31,6 +31,7 @@ from tests.app.conftest import TRAIN, Pop
 from tests.app.damage import contents, says
 
 TRAINING = ("--frame", "training")
+Said, Psnr = Callable[..., str], Callable[..., float]
 
 
 @pytest.fixture(autouse=True)
@@ -42,13 +43,13 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def export(pop: Pop, shared_result: Path) -> Callable[..., str]:
+def export(pop: Pop, shared_result: Path) -> Said:
     """Export the tiny result, and return what is said."""
     return lambda *words: pop.done("export", shared_result, *words).out
 
 
 @pytest.fixture
-def psnr(pop: Pop, shared_capture: Path) -> Callable[..., float]:
+def psnr(pop: Pop, shared_capture: Path) -> Psnr:
     """Measure a splat on the tiny capture, without a note."""
 
     def measure(*words: object) -> float:
@@ -70,7 +71,7 @@ def trained(shared_result: Path) -> Any:
     return pytest.approx(stats["psnr"], abs=1e-2)
 
 
-def test_the_training_frame_keeps_every_bit(export: Callable[..., str], own: Path) -> None:
+def test_the_training_frame_keeps_every_bit(export: Said, own: Path) -> None:
     export("--out", "t.ply", *TRAINING)
     assert Path("t.ply").read_bytes() == own.read_bytes()
 
@@ -82,7 +83,7 @@ def test_the_frame_is_found_from_the_capture_where_no_record_was_left(pop: Pop, 
     assert Path("a.ply").read_bytes() == Path("b.ply").read_bytes()
 
 
-def test_what_no_renderer_shows_is_left_out_and_counted(pop: Pop, psnr: Callable[..., float], own: Path) -> None:
+def test_what_no_renderer_shows_is_left_out_and_counted(pop: Pop, psnr: Psnr, own: Path) -> None:
     params = load_ply(own)
     params["opacities"][:7] = torch.logit(torch.tensor(0.0039))  # just under 1/255 = 0.00392...
     save_ply("with.ply", params, frame=frame_of(own))
@@ -93,9 +94,7 @@ def test_what_no_renderer_shows_is_left_out_and_counted(pop: Pop, psnr: Callable
     assert psnr("without.ply") == psnr("with.ply")
 
 
-def test_inria_s_layout_has_what_its_scripts_read(
-    export: Callable[..., str], psnr: Callable[..., float], shared_capture: Path, trained: Any
-) -> None:
+def test_inria_s_layout_has_what_its_scripts_read(export: Said, psnr: Psnr, shared_capture: Path, trained: Any) -> None:
     export("--out", "inria", "--layout", "inria")
     export("--out", "own.ply")
     (ply,) = Path("inria").rglob("*.ply")
@@ -111,7 +110,6 @@ def test_inria_s_layout_has_what_its_scripts_read(
     photo = cv2.imread(str(shared_capture / "images" / "view_000.png"))
     np.testing.assert_array_equal(cv2.imread(str(views / "gt" / "00000.png")), photo)
     call = ast.parse(Path("inria/cfg_args").read_text(), mode="eval").body
-    assert isinstance(call, ast.Call)
     settings = {word.arg: ast.literal_eval(word.value) for word in call.keywords}
     assert settings["source_path"] == str(shared_capture)
     assert settings["white_background"] is False
@@ -151,9 +149,7 @@ def test_inria_s_layout_has_what_its_scripts_read(
         ("--out full.ply --overwrite", "full.ply: a folder of this name is in the way; choose another --out"),
     ],
 )
-def test_what_cannot_be_exported_is_said_and_nothing_is_written(
-    pop: Pop, shared_result: Path, here: Path, words: str, part: str
-) -> None:
+def test_what_cannot_be_exported_is_said(pop: Pop, shared_result: Path, here: Path, words: str, part: str) -> None:
     for folder in ("full", "full.ply"):
         Path(folder).mkdir()
     for file in ("there.ply", "full/notes.txt"):
@@ -165,9 +161,7 @@ def test_what_cannot_be_exported_is_said_and_nothing_is_written(
 
 
 @pytest.mark.parametrize("damage", ["none", "another trainer's", "measured", "no cfg_args"])
-def test_an_inria_folder_is_replaced_when_asked_and_only_if_it_is_just_our_export(
-    pop: Pop, shared_result: Path, here: Path, damage: str
-) -> None:
+def test_only_our_own_inria_folder_is_replaced(pop: Pop, shared_result: Path, here: Path, damage: str) -> None:
     words = ["export", shared_result, "--layout", "inria", "--out", "inria"]
     pop.done(*words)
     settings, before = Path("inria/cfg_args"), contents(here)
@@ -189,9 +183,7 @@ def test_an_inria_folder_is_replaced_when_asked_and_only_if_it_is_just_our_expor
     assert contents(here) == before
 
 
-def test_an_export_takes_the_place_of_nothing_that_it_reads(
-    pop: Pop, capture: Path, result: Path, tmp_path: Path
-) -> None:
+def test_an_export_never_replaces_what_it_reads(pop: Pop, capture: Path, result: Path, tmp_path: Path) -> None:
     words = ["export", result, "--capture", capture, "--overwrite", "--layout", "inria", "--out"]
     pop.done(*words, "inria")
     before = contents(tmp_path)
@@ -204,7 +196,7 @@ def test_an_export_takes_the_place_of_nothing_that_it_reads(
     assert contents(tmp_path) == before
 
 
-def test_every_format_has_a_name_of_its_own_among_those_that_nobody_chose(export: Callable[..., str]) -> None:
+def test_every_format_has_a_name_of_its_own_among_those_that_nobody_chose(export: Said) -> None:
     names = typing.get_args(FormatName)
     assert set(names) == {*format_names(), "html"}
     for name in names:
@@ -214,9 +206,7 @@ def test_every_format_has_a_name_of_its_own_among_those_that_nobody_chose(export
     assert all(path.suffix == ".html" or len(load_splat_file(path).params["means"]) > 0 for path in files)
 
 
-def test_a_box_is_in_the_frame_of_the_capture_in_an_export_and_in_a_conversion(
-    pop: Pop, export: Callable[..., str]
-) -> None:
+def test_a_box_is_in_the_frame_of_the_capture(pop: Pop, export: Said) -> None:
     export("--out", "own.ply")
     export("--out", "t.ply", *TRAINING)
     whole = load_ply("own.ply")["means"]
@@ -232,7 +222,7 @@ def test_a_box_is_in_the_frame_of_the_capture_in_an_export_and_in_a_conversion(
     assert found == {int(((whole >= low) & (whole <= high)).all(1).sum())}
 
 
-def test_limits_are_applied_one_after_the_other_and_said(export: Callable[..., str], own: Path) -> None:
+def test_limits_are_applied_one_after_the_other_and_said(export: Said, own: Path) -> None:
     n = len(load_ply(own)["means"])
     limits = ("--min-opacity", "0.0039", "--final-prune", "0.003", "--max-gaussians", n // 2)
     said = export("--out", "x.ply", *limits)
@@ -242,7 +232,7 @@ def test_limits_are_applied_one_after_the_other_and_said(export: Callable[..., s
     assert len(load_ply("x.ply")["means"]) == n // 2
 
 
-def test_scores_of_views_need_a_capture(pop: Pop, export: Callable[..., str]) -> None:
+def test_scores_of_views_need_a_capture(pop: Pop, export: Said) -> None:
     export("--out", "a.ply")
     said = pop.done("export", "a.ply", "--out", "b.spz", "--max-gaussians", "20").out
     assert "highest visibility: 20 of" in said
@@ -250,7 +240,7 @@ def test_scores_of_views_need_a_capture(pop: Pop, export: Callable[..., str]) ->
     says(pop("export", "a.ply", "--out", "c.spz", "--final-prune", "0.01"), needs)
 
 
-def test_a_conversion_writes_a_page_and_what_its_name_promises(pop: Pop, export: Callable[..., str]) -> None:
+def test_a_conversion_writes_a_page_and_what_its_name_promises(pop: Pop, export: Said) -> None:
     export("--out", "a.ply")
     said = pop.done("convert", "a.ply", "b.html").out
     assert f"Gaussians, {Path('b.html').stat().st_size / 1e6:.2f} MB -> b.html" in said
@@ -279,7 +269,7 @@ def test_a_conversion_writes_a_page_and_what_its_name_promises(pop: Pop, export:
         (". b.ply", "is a folder without SOG's meta.json; 'pop export' reads the folder of a training"),
     ],
 )
-def test_what_cannot_be_converted_is_said(pop: Pop, export: Callable[..., str], words: str, part: str) -> None:
+def test_what_cannot_be_converted_is_said(pop: Pop, export: Said, words: str, part: str) -> None:
     export("--out", "a.ply")
     save_ply("t.ply", load_ply("a.ply"), frame=Frame("training"))
     for file in ("there.spz", "empty.spz"):
@@ -288,9 +278,7 @@ def test_what_cannot_be_converted_is_said(pop: Pop, export: Callable[..., str], 
     assert not Path("b.ply").exists()
 
 
-def test_sog_in_a_folder_and_ksplat_are_converted_and_drawn(
-    pop: Pop, export: Callable[..., str], psnr: Callable[..., float]
-) -> None:
+def test_sog_folders_and_ksplat_are_converted(pop: Pop, export: Said, psnr: Psnr) -> None:
     export("--out", "a.sog")
     with zipfile.ZipFile("a.sog") as archive:
         archive.extractall("folder")
@@ -310,25 +298,23 @@ def test_sog_in_a_folder_and_ksplat_are_converted_and_drawn(
 
 
 def test_an_export_measures_as_its_run_moved_into_the_other_frame_and_back(
-    pop: Pop, export: Callable[..., str], psnr: Callable[..., float], own: Path, shared_result: Path, trained: Any
+    pop: Pop, export: Said, psnr: Psnr, own: Path, shared_result: Path, trained: Any
 ) -> None:
     record = json.loads((shared_result / "capture.json").read_text())
     found = frame_of(own)
-    assert found is not None
     assert found.name == "training"
     np.testing.assert_array_equal(np.array(found.transform), np.array(record["world_transform"]))
     export("--out", "s.ply", "--frame", "capture")
     for way in ("training", "capture", "training"):
         pop.done("export", "s.ply", "--out", "t.ply", "--frame", way, "--overwrite")
         found = frame_of(Path("t.ply"))
-        assert found is not None
         assert found.name == way
         assert psnr("t.ply") == trained
         shutil.copy("t.ply", "s.ply")
 
 
 def test_a_ply_that_says_nothing_is_taken_to_be_in_the_capture_s_frame_with_a_note(
-    pop: Pop, export: Callable[..., str], psnr: Callable[..., float], shared_capture: Path, trained: Any
+    pop: Pop, export: Said, psnr: Psnr, shared_capture: Path, trained: Any
 ) -> None:
     export("--out", "o.ply")
     save_ply("s.ply", load_ply("o.ply"))
@@ -344,7 +330,7 @@ def test_a_ply_that_says_nothing_is_taken_to_be_in_the_capture_s_frame_with_a_no
 
 
 def test_a_ply_of_a_trainer_that_moves_the_world_is_read_as_the_command_says(
-    pop: Pop, psnr: Callable[..., float], shared_capture: Path, own: Path, trained: Any
+    pop: Pop, psnr: Psnr, shared_capture: Path, own: Path, trained: Any
 ) -> None:
     save_ply("s.ply", load_ply(own))
     about = ("--capture", shared_capture, "--training-frame")

@@ -98,9 +98,7 @@ JOBS = {
 
 @pytest.mark.parametrize("job", JOBS)
 @pytest.mark.parametrize("part", ["crashes", "writes"])
-def test_a_process_that_ends_between_two_changes_of_the_disk_or_is_refused_one_leaves_sound_files(
-    tried: dict[str, Any], part: str, job: str
-) -> None:
+def test_a_sudden_end_or_a_refused_change_leaves_sound_files(tried: dict[str, Any], part: str, job: str) -> None:
     if "skipped" in tried[part]:
         pytest.skip(tried[part]["skipped"]["skipped"])
     assert set(tried[part]) == set(JOBS)

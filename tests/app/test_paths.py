@@ -189,9 +189,7 @@ def test_every_kind_of_video_plays_to_its_last_frame(tmp_path: Path, name: str, 
     ],
     ids=["two sizes", "no size", "no frame"],
 )
-def test_a_video_that_fails_half_way_leaves_the_old_file(
-    tmp_path: Path, sizes: list[tuple[int, int]], told: str
-) -> None:
+def test_a_video_that_fails_leaves_the_old_file(tmp_path: Path, sizes: list[tuple[int, int]], told: str) -> None:
     path = tmp_path / "clip.webm"
     path.write_bytes(b"old")
     assert_one_line(lambda: film(path, *sizes), f"{path}: {told}")
@@ -230,9 +228,7 @@ with VideoFile(Path(sys.argv[1])) as video:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX resource limits")
 @pytest.mark.parametrize(("name", "room"), [("clip.webm", 0), ("clip.webm", 4096), ("clip.avi", 4096)])
-def test_a_video_that_the_disk_has_no_room_for_is_told_and_leaves_the_old_file(
-    tmp_path: Path, name: str, room: int
-) -> None:
+def test_a_video_without_room_on_the_disk_leaves_the_old_file(tmp_path: Path, name: str, room: int) -> None:
     path = tmp_path / name
     path.write_bytes(b"old")
     done = in_a_child(_LIMITED, path, room)

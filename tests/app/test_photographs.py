@@ -68,12 +68,10 @@ def test_masks_are_found_under_all_usual_names_and_white_means_keep(tmp_path: Pa
     write_photograph(root / "masks" / name, mask)
     first, second = raw(root).views
     assert first.mask is None
-    assert second.mask is not None
     assert second.mask.dtype == bool
     assert np.array_equal(second.mask, mask > 0)
     assert raw(root, masks=False).views[1].mask is None
     small = raw(root, factor=2).views[1].mask
-    assert small is not None
     assert np.array_equal(small, mask[::2, ::2] > 0)
 
 
@@ -145,9 +143,7 @@ def test_a_png_with_any_byte_changed_is_named(at: int, flip: int, tmp_path_facto
     assert_one_line(lambda: read_image(path), str(path), "PNG")
 
 
-def test_whole_photographs_are_read_and_reading_bad_ones_prints_nothing(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_reading_whole_and_bad_photographs_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     for name, data in WHOLE.items():
         path = tmp_path / name
         path.write_bytes(data)
@@ -212,9 +208,7 @@ def test_the_size_and_exif_are_read_of_every_format_and_any_damage_is_no_error(t
         assert read_exif(tmp_path / "damaged").orientation in range(1, 9)
 
 
-def test_a_photograph_of_another_shape_is_refused_before_it_is_decoded(
-    root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_shape_is_refused_before_it_is_decoded(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     png_of_zeros(root / "images" / "02.png", 8_000)
     decoded: list[Path] = []
 
@@ -250,9 +244,7 @@ def write_heic(path: Path, image: np.ndarray, exif: bytes | None = None) -> None
     file.save(path, quality=95, **({} if exif is None else {"exif": exif}))
 
 
-def test_without_pillow_heif_heic_photographs_are_named_with_the_way_to_convert_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_not_read_is_named_with_the_way_to_convert_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(images, "can_read_heif", lambda: False)
     (tmp_path / "a.HEIC").write_bytes(HEAD)
     one = "a.HEIC: is HEIC, which needs pillow-heif: pip install pillow-heif"
@@ -292,9 +284,7 @@ def test_the_tags_of_a_heic_are_read_and_its_orientation_is_not_obeyed_twice(tmp
 
 
 @needs_heif
-def test_a_capture_whose_photographs_were_heic_loads_and_is_checked(
-    shared_capture: Path, capture: Path, pop: Pop
-) -> None:
+def test_a_capture_of_heic_photographs_loads(shared_capture: Path, capture: Path, pop: Pop) -> None:
     for path in sorted((capture / "images").glob("*.png")):
         write_heic(path.with_suffix(".heic"), read_image(path))
         path.unlink()
@@ -358,9 +348,7 @@ def test_a_jpeg_overwritten_in_the_middle_is_named_and_padding_and_other_formats
         raise KeyError
 
 
-def test_captures_with_such_photographs_are_refused_and_data_check_lists_all_of_them(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_such_captures_are_refused_and_looked_over(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     root = colmap_capture(tmp_path / "scene", names=["0.jpg", "1.jpeg", "2.png"])
     assert load_capture(root).notes == ()
     assert capfd.readouterr().err == ""
@@ -460,9 +448,7 @@ def test_cameras_are_found_where_the_photographs_were_taken(found: Path, photogr
         assert (found / "images" / file.name).read_bytes() == file.read_bytes()
 
 
-def test_the_same_photographs_give_the_same_bytes_and_progress_is_told(
-    found: Path, photographs: Path, tmp_path: Path
-) -> None:
+def test_the_same_photographs_give_the_same_bytes(found: Path, photographs: Path, tmp_path: Path) -> None:
     told: list[tuple[str, int, int]] = []
     folder = Path(shutil.copytree(photographs, tmp_path / "in"))
     # in place this time: the model comes to lie with the photographs
@@ -584,9 +570,7 @@ def test_a_model_that_somebody_else_made_next_to_the_photographs_is_kept(known: 
         assert run_sfm(tmp_path / "images", overwrite=overwrite).capture == tmp_path.resolve()
 
 
-def test_a_capture_made_inside_the_folder_of_photographs_is_no_photograph_the_next_time(
-    known: None, tmp_path: Path
-) -> None:
+def test_a_capture_among_its_photographs_is_none_of_them_the_next_time(known: None, tmp_path: Path) -> None:
     fill(tmp_path)
     for overwrite in (False, True):
         assert run_sfm(tmp_path, tmp_path / "scene", overwrite=overwrite).photographs == 3
@@ -594,9 +578,7 @@ def test_a_capture_made_inside_the_folder_of_photographs_is_no_photograph_the_ne
         assert sorted(path.name for path in (tmp_path / "scene" / "sparse").iterdir()) == ["0", "sfm.sha256"]
 
 
-def test_a_folder_called_images_is_loaded_and_so_are_photographs_in_subfolders_alone(
-    known: None, tmp_path: Path
-) -> None:
+def test_folders_called_images_and_subfolders_alone_are_loaded(known: None, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     for options in ({"sfm": True}, {}):
         assert len(load_capture(fill(tmp_path / "images"), **options).views) == 3
@@ -695,7 +677,6 @@ def test_a_mask_fits_drawn_over_the_stored_or_over_the_shown_picture(sideways: P
         mask = np.rot90(keep, SHOWN[8]) if orientation == 8 else keep
         write_photograph(sideways / "masks" / f"{orientation}.png", mask)
     for view in load_capture(sideways).views:
-        assert view.mask is not None
         np.testing.assert_array_equal(view.mask, np.rot90(keep > 0, SHOWN[int(view.name[0])]))
 
 

@@ -84,7 +84,6 @@ def test_a_new_pixel_shows_what_the_lens_shows_in_its_direction_at_any_stored_si
     assert after[0, 0] / before[0, 0] == pytest.approx(after[1, 1] / before[1, 1], rel=1e-12)
     assert after[0, 1] == after[1, 0] == 0.0
     assert np.allclose(after[:2] * shrunk, whole[:2], rtol=1e-9)
-    assert plan.maps is not None
     rows, columns = np.meshgrid(np.arange(h), np.arange(w), indexing="ij")
     rays = np.linalg.inv(plan.K) @ np.stack([columns + 0.5, rows + 0.5, np.ones_like(rows)]).reshape(3, -1)
     seen_at = one.img_from_cam(rays.T) / shrunk - 0.5
@@ -98,9 +97,7 @@ def test_a_new_pixel_shows_what_the_lens_shows_in_its_direction_at_any_stored_si
     cx=st.floats(20.0, 44.0),
     cy=st.floats(16.0, 32.0),
 )
-def test_every_new_pixel_lies_in_the_photograph_and_no_wider_zoom_would(
-    model: str, k1: float, k2: float, cx: float, cy: float
-) -> None:
+def test_the_zoom_is_the_widest_that_fits(model: str, k1: float, k2: float, cx: float, cy: float) -> None:
     terms = {"SIMPLE_RADIAL": (k1,), "OPENCV": (k1, k2, 0.0, 0.0), "OPENCV_FISHEYE": (k1, k2, 0.0, 0.0)}[model]
     focal = (60.0,) if model == "SIMPLE_RADIAL" else (60.0, 60.0)
     one = lens(model, (*focal, cx, cy, *terms))
@@ -133,7 +130,6 @@ def turns_back(one: Any, rays: np.ndarray) -> bool:
 def test_little_distortion_changes_little() -> None:
     for k in (1e-3, 1e-4, -1e-3):
         plan = undistortion(lens("SIMPLE_RADIAL", (50.0, 33.0, 22.5, k)), W, H)
-        assert plan.maps is not None
         assert plan.K[0, 0] / 50.0 == pytest.approx(1.0, abs=2.0 * abs(k))
         assert np.abs(plan.maps[0] - np.arange(W)).max() < 100.0 * abs(k)
 
@@ -141,7 +137,6 @@ def test_little_distortion_changes_little() -> None:
 def test_a_straight_line_is_straight_again() -> None:
     one = lens("OPENCV", DISTORTED["OPENCV"])
     plan = undistortion(one, W, H)
-    assert plan.maps is not None
     # a checkerboard's edge, painted as the lens shows it: left of x = 0.1 z black, right of it white
     rows, columns = np.meshgrid(np.arange(H), np.arange(W), indexing="ij")
     pixels = np.stack([columns + 0.5, rows + 0.5], axis=-1).reshape(-1, 2)

@@ -85,7 +85,7 @@ def test_messages_keep_letters_of_all_languages_and_are_no_longer_than_can_be_re
         ("--sfm.matcher exhaustive --sfm.seed -1", "seed is -1; it must be a whole number from 0"),
     ],
 )
-def test_numbers_that_libraries_cannot_take_are_refused(
+def test_numbers_out_of_range_are_refused(
     pop: Pop, shared_capture: Path, tmp_path: Path, words: str, told: str
 ) -> None:
     outcome = pop("train", shared_capture, "--out", tmp_path / "r", *words.split())
@@ -94,9 +94,7 @@ def test_numbers_that_libraries_cannot_take_are_refused(
     assert not (tmp_path / "r").exists()
 
 
-def test_quiet_prints_nothing_and_help_of_a_switch_that_is_on_reads_forwards(
-    pop: Pop, shared_capture: Path, tmp_path: Path
-) -> None:
+def test_quiet_prints_nothing_and_help_reads_forwards(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
     shown = " ".join(pop("train", "--help-all").out.replace("│", " ").split())
     assert "--normalize, --no-normalize move the capture into gsplat's normalised world. (default: True)" in shown
     words = ["train", shared_capture, *TRAIN, "--max-steps", "2", "--out"]
