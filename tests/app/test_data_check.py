@@ -324,7 +324,7 @@ def test_exposures_are_found_though_a_third_of_the_points_shine_or_are_hidden(se
     # the errors are about as large as they are said to be
     assert 0.3 < (found.stops - (true - np.median(true))).std() / found.errors.mean() < 2.0
     # and photographs of nothing in common do not drift
-    seen = [np.arange(40)] * 30
+    rng, seen = np.random.default_rng(seed), [np.arange(40)] * 30
     found = exposures([rng.normal(-2.0, 1.0, 40) for _ in seen], seen)
     assert np.nanstd(found.stops) > 0.15
     assert (found.drift or 0.0) < 0.1
