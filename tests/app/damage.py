@@ -11,8 +11,6 @@ import torch
 from pop_fast.train import checkpoint as ckpt
 from tests.app.conftest import Outcome
 
-Damage = Callable[[Path], None]
-
 
 def says(outcome: Outcome, *parts: str) -> None:
     """Assert that the outcome is one clean line of error with all of these parts."""
@@ -22,10 +20,6 @@ def says(outcome: Outcome, *parts: str) -> None:
     assert lines[0].startswith("pop: error: ")
     for part in parts:
         assert part in lines[0], (part, lines[0])
-
-
-def photo(folder: Path, number: int = 0) -> Path:
-    return folder / "images" / f"view_{number:03d}.png"
 
 
 def truncate(path: Path, share: float = 0.5) -> None:

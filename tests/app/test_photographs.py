@@ -589,12 +589,6 @@ def test_folders_called_images_and_subfolders_alone_are_loaded(known: None, tmp_
     assert capture.notes == ()
 
 
-def test_photographs_that_could_not_be_placed_are_told(known: None, tmp_path: Path) -> None:
-    (note,) = load_capture(fill(tmp_path, *(f"{i}.png" for i in range(6))), sfm=True).notes
-    assert note.startswith("4 of 6 photographs in")
-    assert note.endswith("has no camera for 4.png, 5.png")
-
-
 def test_the_search_for_cameras_is_told_apart_from_loading(known: None, pop: Pop, tmp_path: Path, monkeypatch) -> None:
     fill(tmp_path / "photos", *(f"{i}.png" for i in range(5)))
     searched = sfm._find_cameras

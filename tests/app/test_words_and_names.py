@@ -27,7 +27,7 @@ from pop_fast.stages.tiles import tile_lists
 from pop_fast.train import TrainConfig, choose
 from tests.app.captures import edit_transforms, photograph, transforms_capture, write_photograph
 from tests.app.conftest import TRAIN, Pop
-from tests.app.damage import photo, says
+from tests.app.damage import says
 from tests.app.interruptions import interrupt
 
 
@@ -206,7 +206,7 @@ def test_a_replaced_stream_is_no_obstacle(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_a_bad_capture_and_bad_settings_are_named_before_the_work(pop: Pop, capture: Path, tmp_path: Path) -> None:
-    photo(capture, 3).unlink()
+    (capture / "images" / "view_003.png").unlink()
     says(pop("train", capture, "--out", tmp_path / "r", *TRAIN), "view_003.png", "absent", "--missing skip")
     says(pop("train", capture, "--out", tmp_path / "r", "--resume", "--overwrite"), "--resume and --overwrite")
     assert not (tmp_path / "r").exists()
