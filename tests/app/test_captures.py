@@ -163,8 +163,8 @@ def test_photographs_that_were_converted_are_found_unless_two_could_be_meant(tmp
         cv2.imwrite(str(root / "images" / new.lower()), photograph(3)[..., ::-1])
         (root / "images" / new.lower()).rename(root / "images" / new)
     assert shows(raw(root), 3, 3)
-    write_photograph(root / "images" / "a.tif", photograph(1))
-    assert_one_line(lambda: raw(root), "a.JPG", "a.png", "a.tif", "remove one")
+    write_photograph(root / "images" / "b.tif", photograph(1))
+    assert_one_line(lambda: raw(root), "b.jpeg", "b.PNG", "b.tif", "remove one")
 
 
 def test_absent_photographs_are_an_error_or_are_skipped_with_a_note(root: Path) -> None:

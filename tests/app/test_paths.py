@@ -211,6 +211,10 @@ def test_what_cannot_become_a_video_is_refused_at_once(tmp_path: Path, monkeypat
     words = ("cannot write H.264", "name it clip.webm", "ffmpeg -i clip.webm clip.mp4")
     assert_one_line(lambda: VideoFile(tmp_path / "clip.mp4"), "clip.mp4", *words)
     assert os.listdir(tmp_path) == ["clip.webm"]
+    if Path("/proc/self").is_dir():
+        # nobody can write there
+        told = "/proc/self/clip.webm: could not be written: "
+        assert_one_line(lambda: film(Path("/proc/self/clip.webm"), (16, 16)), told, "choose another path")
 
 
 _LIMITED = """
