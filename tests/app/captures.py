@@ -1,9 +1,11 @@
-"""Write small captures for tests: COLMAP models through pycolmap, transforms.json by hand."""
+"""Write small captures: COLMAP models by pycolmap, transforms.json, and cameras as other programs export them."""
 
 from __future__ import annotations
 
 import json
-import re
+import shutil
+import struct
+import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,11 +14,20 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
+from pop_fast.data import Capture, load_capture
 from pop_fast.errors import PopError
 
 WIDTH, HEIGHT = 40, 30
 PINHOLE = (36.0, 35.0, 20.5, 14.25)
+# OpenCV's axes of a camera in OpenGL's, ARKit's and RealityCapture's: y up, z backward
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def raw(root: Path, **options: Any) -> Capture:
+    """Load in the capture's own frame."""
+    return load_capture(root, normalize=False, **options)
 
 
 def photograph(seed: int, width: int = WIDTH, height: int = HEIGHT, channels: int = 3) -> np.ndarray:
@@ -31,6 +42,19 @@ def write_photograph(path: Path, image: np.ndarray) -> None:
     code = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}
     stored = cv2.cvtColor(image, code[image.shape[2]]) if image.ndim == 3 else image
     assert cv2.imwrite(str(path), stored)
+
+
+def png_of_zeros(path: Path, side: int, depth: int = 1, kind: int = 0) -> Path:
+    """Write a PNG of a few kilobytes that decodes to side x side pixels, gray (kind 0) or RGB (kind 2)."""
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    packer, row = zlib.compressobj(9), bytes(1 + side * depth * (1 + kind) // 8)
+    pixels = b"".join([*(packer.compress(row) for _ in range(side)), packer.flush()])
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, depth, kind, 0, 0, 0))
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", pixels) + chunk(b"IEND", b""))
+    return path
 
 
 def look_at(center: Sequence[float] | np.ndarray, target: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)) -> np.ndarray:
@@ -54,9 +78,8 @@ def ring(count: int) -> np.ndarray:
 def cloud(count: int = 20) -> tuple[np.ndarray, np.ndarray]:
     """Points around the origin, flat in z. float64 [count, 3], uint8 [count, 3]"""
     generator = np.random.default_rng(7)
-    return generator.normal(0.0, 1.0, (count, 3)) * [0.6, 0.4, 0.1], generator.integers(
-        0, 256, (count, 3), dtype=np.uint8
-    )
+    xyz = generator.normal(0.0, 1.0, (count, 3)) * [0.6, 0.4, 0.1]
+    return xyz, generator.integers(0, 256, (count, 3), dtype=np.uint8)
 
 
 def make_model(
@@ -104,7 +127,7 @@ def colmap_capture(root: Path, count: int = 4, names: Sequence[str] | None = Non
 
 def opengl(viewmat: np.ndarray) -> list[list[float]]:
     """Camera-to-world matrix as transforms.json has it."""
-    return (np.linalg.inv(viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()
+    return (np.linalg.inv(viewmat) @ FLIP).tolist()
 
 
 def transforms_capture(root: Path, count: int = 4, **fields: Any) -> Path:
@@ -130,6 +153,75 @@ def edit_transforms(root: Path, edit: Callable[[dict[str, Any]], object]) -> Non
     path.write_text(json.dumps(listing))
 
 
+# Cameras as other programs export them, by their published conventions.
+
+
+def polycam(capture: Capture, source: Path, folder: Path, kind: str = "corrected_") -> Path:
+    """Write `keyframes`: one JSON a photograph, and depth maps that are no photographs."""
+    for images in (f"{kind}images", "depth"):
+        shutil.copytree(source / "images", folder / "keyframes" / images)
+    cameras = folder / "keyframes" / f"{kind}cameras"
+    cameras.mkdir()
+    for view in capture.views:
+        pose = np.linalg.inv(view.viewmat) @ FLIP
+        fields = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
+        fields |= {"fx": view.K[0, 0], "fy": view.K[1, 1], "cx": view.K[0, 2], "cy": view.K[1, 2]}
+        fields |= {"width": view.width, "height": view.height, "blur_score": 90.0, "neighbors": [], "timestamp": 1}
+        (cameras / f"{Path(view.name).stem}.json").write_text(json.dumps(fields))
+    return folder
+
+
+def metashape(capture: Capture, source: Path, folder: Path, lens: str = "", kind: str = "frame") -> Path:
+    """Write cameras.xml: a chunk of another scale and orientation than the world's, one camera that is not aligned."""
+    shutil.copytree(source / "images", folder / "images")
+    R, t, s = Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix(), np.array([4.0, -7.0, 2.0]), 2.5
+    cameras = ['<group id="0" label="walk">']
+    for i, view in enumerate(capture.views):
+        pose = np.linalg.inv(view.viewmat)
+        pose[:3, 3] = R.T @ (pose[:3, 3] - t) / s
+        pose[:3, :3] = R.T @ pose[:3, :3]
+        label = Path(view.name).stem if i % 2 else view.name
+        matrix = " ".join(map(repr, pose.ravel().tolist()))
+        one = f'<camera id="{i}" sensor_id="3" component_id="0" label="{label}">'
+        cameras.append(f"{one}<transform>{matrix}</transform></camera>")
+    cameras.append('</group><camera id="98" sensor_id="3" label="lost"></camera>')
+    cameras.append('<camera id="99" sensor_id="3" label="off" enabled="false"><transform>no</transform></camera>')
+    view = capture.views[0]
+    resolution = f'<resolution width="{view.width}" height="{view.height}"/>'
+    middle = (view.K[:2, 2] - [view.width / 2, view.height / 2]).tolist()
+    f, b1 = float(view.K[1, 1]), float(view.K[0, 0] - view.K[1, 1])
+    adjusted = f"<f>{f!r}</f><b1>{b1!r}</b1><cx>{middle[0]!r}</cx><cy>{middle[1]!r}</cy>{lens}"
+    spaced = " ".join(map(repr, R.ravel().tolist()))
+    (folder / "cameras.xml").write_text(
+        f"""<?xml version="1.0" encoding="UTF-8"?>
+<document version="1.5.0"><chunk label="Chunk 1" enabled="true">
+<sensors next_id="4"><sensor id="3" label="phone" type="{kind}">{resolution}
+<calibration type="{kind}" class="initial">{resolution}<f>1</f></calibration>
+<calibration type="{kind}" class="adjusted">{resolution}{adjusted}</calibration></sensor></sensors>
+<components><component id="0" label="Component 1"><transform><rotation>{spaced}</rotation>
+<translation>{t[0]} {t[1]} {t[2]}</translation><scale>{s}</scale></transform></component></components>
+<cameras>{"".join(cameras)}</cameras></chunk></document>
+"""
+    )
+    return folder
+
+
+def realitycapture(capture: Capture, source: Path, folder: Path) -> Path:
+    """Write cameras.csv beside the photographs."""
+    shutil.copytree(source / "images", folder)
+    lines = ["#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"]
+    for view in capture.views:
+        pose = np.linalg.inv(view.viewmat) @ FLIP
+        turned, pitch, roll = Rotation.from_matrix(pose[:3, :3]).as_euler("ZXY", degrees=True).tolist()
+        film = 36.0 / max(view.width, view.height)
+        middle = (view.K[:2, 2] - [view.width / 2, view.height / 2]) * film
+        focal = float(view.K[0, 0] * film)
+        numbers = [*pose[:3, 3].tolist(), -turned, pitch, roll, focal, *middle.tolist(), *[0.0] * 6]
+        lines.append(",".join([view.name, *map(repr, numbers)]))
+    (folder / "cameras.csv").write_text("\n".join(lines) + "\n")
+    return folder
+
+
 def assert_one_line(call: Callable[[], object], *words: str) -> str:
     """Check that a call fails with one clear line that holds all of `words`, and return the line."""
     with pytest.raises(PopError) as caught:
@@ -137,5 +229,5 @@ def assert_one_line(call: Callable[[], object], *words: str) -> str:
     message = str(caught.value)
     assert "\n" not in message
     for word in words:
-        assert re.search(re.escape(word), message), f"{word!r} is not in: {message}"
+        assert word in message, f"{word!r} is not in: {message}"
     return message

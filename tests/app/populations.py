@@ -31,13 +31,12 @@ def make(n: int, seed: int = 0, opacities: float = 0.5, scale: float = 0.005):
 def make_info(
     n: int, grads=None, visible=None, counts=None, cameras: int = 1, width: int = WIDTH, height: int = HEIGHT
 ):
+    def rows(values, otherwise):
+        return otherwise if values is None else torch.as_tensor(values).to(otherwise.dtype).reshape(otherwise.shape)
+
     means2d = torch.zeros(cameras, n, 2, requires_grad=True)
-    grads = torch.zeros(cameras, n, 2) if grads is None else torch.as_tensor(grads).float().reshape(cameras, n, 2)
-    means2d.grad = grads
-    seen = torch.ones(cameras, n, dtype=torch.bool) if visible is None else torch.as_tensor(visible).reshape(cameras, n)
-    counts = (
-        torch.zeros(cameras, n, dtype=torch.int64) if counts is None else torch.as_tensor(counts).reshape(cameras, n)
-    )
+    means2d.grad = rows(grads, torch.zeros(cameras, n, 2))
+    seen = rows(visible, torch.ones(cameras, n, dtype=torch.bool))
     radii = seen[..., None].int().expand(-1, -1, 2) * 4
     return {
         "means2d": means2d,
@@ -45,7 +44,7 @@ def make_info(
         "width": width,
         "height": height,
         "n_cameras": cameras,
-        "dominant_counts": counts,
+        "dominant_counts": rows(counts, torch.zeros(cameras, n, dtype=torch.int64)),
         "gaussian_ids": None,
     }
 

@@ -1,11 +1,14 @@
-"""`pop data check`: what it says is what training will find, and what it says of photographs alone."""
+"""`pop data check` says what training will find, and what is odd among photographs alone; `pop doctor`."""
 
 from __future__ import annotations
 
 import importlib
+import math
+import re
 import shutil
-import struct
 import zipfile
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +19,20 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from benchmarks.faults.corpus import HERE
-from pop_fast.data import load_capture, sfm
-from pop_fast.demo.make import render_view
+from cuda_ext import build, toolkit
+from pop_fast.data import Capture, load_capture, sfm
+from pop_fast.data.photo_quality import GAMMA, UNEVEN, Exposures, exposures, exposures_of, levels_at
+from pop_fast.demo import make_demo
 from pop_fast.demo.scene import make_scene
 from pop_fast.io import images
+from pop_fast.train import TrainConfig
+from pop_fast.train.automatic import choose_terms
 from tests.app.captures import colmap_capture, look_at, photograph, ring, write_model, write_photograph
 from tests.app.conftest import Pop
 from tests.app.damage import says
 
 K = np.array([[150.0, 0.0, 80.0], [0.0, 150.0, 60.0], [0.0, 0.0, 1.0]])
+Check = Callable[..., list[str]]
 
 
 @pytest.fixture(scope="module")
@@ -43,85 +51,126 @@ def bare(tmp_path: Path, pictures: list[np.ndarray]) -> Path:
     return folder
 
 
-def test_a_capture_made_in_place_is_ready_as_training_finds_it(pop: Pop, tmp_path: Path) -> None:
-    root = colmap_capture(tmp_path / "scene")
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A capture of four photographs that a test may change."""
+    return colmap_capture(tmp_path / "scene")
+
+
+@pytest.fixture
+def check(pop: Pop) -> Check:
+    """Look a folder over, which ends with the status, and give the lines that are said."""
+
+    def lines(folder: Path, status: int = 0) -> list[str]:
+        outcome = pop("data", "check", folder)
+        assert (outcome.status, outcome.err) == (status, ""), outcome
+        return outcome.out.splitlines()
+
+    return lines
+
+
+def finding(lines: list[str], mark: str, about: str) -> str:
+    """Give the first finding of that mark and topic."""
+    return next(line for line in lines if line.split()[:2] == [mark, about])
+
+
+def said(lines: list[str], *words: str) -> bool:
+    return all(word in "\n".join(lines) for word in words)
+
+
+def test_a_sound_capture_is_ready(check: Check, shared_capture: Path) -> None:
+    lines = check(shared_capture)
+    assert lines[-1] == "ready to train"
+    assert "8 views from the COLMAP model in sparse/0" in finding(lines, "ok", "poses")
+    assert "8 x PINHOLE 40x32" in finding(lines, "ok", "cameras")
+    assert "8 of 40x32 px" in finding(lines, "ok", "photographs")
+    assert "mean error" in finding(lines, "ok", "reprojection")
+    assert "at factor 4" in finding(lines, "ok", "memory")
+    # eight photographs around a still life are far apart
+    assert [line.split()[1] for line in lines if line.startswith(("LOOK", "BAD"))] == ["spacing"]
+
+
+def test_a_capture_made_in_place_is_ready_as_training_finds_it(check: Check, root: Path) -> None:
     for path in (root / "images").iterdir():
         path.rename(root / path.name)
     (root / "images").rmdir()
     assert len(load_capture(root).views) == 4
-    outcome = pop.done("data", "check", root)
-    assert "absent" not in outcome.out
-    assert "0 MB at factor 1" in outcome.out
-    assert "ready to train" in outcome.out
+    lines = check(root)
+    assert not said(lines, "absent")
+    assert said(lines, "0 MB at factor 1", "ready to train")
 
 
-def test_the_folder_of_the_photographs_can_be_named(pop: Pop, tmp_path: Path) -> None:
-    root = colmap_capture(tmp_path / "scene")
+def test_the_folder_of_the_photographs_can_be_named(pop: Pop, root: Path) -> None:
     (root / "images").rename(root / "small")
     assert pop("data", "check", root, "--images", "small").status == 0
     assert pop("data", "check", root).status == 2
 
 
-def test_photographs_alone_are_looked_over(pop: Pop, bare: Path) -> None:
-    outcome = pop.done("data", "check", bare)
-    for words in ("none yet, 8 photographs", "pop train finds", "8 of 160x120 px", "8 are few", "ready to train"):
-        assert words in outcome.out
-    for about in ("blur", "exposure", "duplicates"):
-        assert f"LOOK  {about}" not in outcome.out
+def test_cameras_that_stand_farthest_from_the_nearest_other_are_named(check: Check, tmp_path: Path) -> None:
+    whole = colmap_capture(tmp_path / "whole", count=36)
+    found = finding(check(whole), "ok", "spacing")
+    assert "neighbours 9.5 degrees apart as the subject sees them (median)" in found
+    # every fourth of these cameras, and one more next to the first
+    numbers = [0, 1, *range(4, 36, 4)]
+    names = [f"{number:02d}.png" for number in numbers]
+    write_model(whole / "sparse" / "0", names, ring(36)[numbers])
+    found = finding(check(whole), "LOOK", "spacing")
+    assert "far; photographs between these would help most: 38 degrees between" in found
+    assert "00.png and 01.png" not in found
 
 
-def test_one_photograph_is_too_few(pop: Pop, tmp_path: Path) -> None:
-    write_photograph(tmp_path / "0.png", photograph(0))
-    outcome = pop("data", "check", tmp_path)
-    assert outcome.status == 1
-    assert "none yet, 1 photograph: a scene needs two or more" in outcome.out
-    assert "1 is few" in outcome.out
+def test_every_problem_of_a_damaged_capture_is_listed_at_once(check: Check, capture: Path) -> None:
+    photos = sorted((capture / "images").iterdir())
+    photos[1].unlink()
+    photos[2].write_bytes(photos[2].read_bytes()[:200])
+    write_photograph(photos[3], np.zeros((40, 32, 3), np.uint8))
+    write_photograph(capture / "images" / "extra.png", np.zeros((32, 40, 3), np.uint8))
+    lines = check(capture, 1)
+    assert said(lines, "1 of 8 listed are absent, first view_001.png", "view_002.png")
+    assert said(lines, "view_003.png is 32x40 px, its camera 40x32: another shape")
+    assert "1 files in images/ are not listed, first extra.png" in finding(lines, "LOOK", "pairing")
+    assert lines[-1] == "3 problems stand against training"
 
 
-def test_a_blurred_a_dark_and_a_copied_photograph_are_named(pop: Pop, bare: Path, pictures: list[np.ndarray]) -> None:
-    write_photograph(bare / "2.png", cv2.GaussianBlur(pictures[2], (0, 0), 3.0))
-    write_photograph(bare / "4.png", np.zeros_like(pictures[4]))
-    shutil.copy(bare / "6.png", bare / "6 copy.png")
-    # the same picture, written otherwise
-    assert cv2.imwrite(str(bare / "7 again.jpg"), cv2.imread(str(bare / "7.png")), [cv2.IMWRITE_JPEG_QUALITY, 95])
-    lines = pop("data", "check", bare).out.splitlines()
-    (blur,) = [line for line in lines if "far less sharp" in line]
-    assert "2.png" in blur
-    assert "1 is over a quarter pure black, first 4.png" in "\n".join(lines)
-    assert any("2 are the same file more than once" in line and "6 copy.png" in line for line in lines)
-    assert any("1 pair looks the same" in line and "7 again.jpg" in line for line in lines)
+def test_photographs_of_half_the_size_are_fine_and_said_so(check: Check, capture: Path) -> None:
+    for path in (capture / "images").iterdir():
+        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (20, 16)))
+    lines = check(capture)
+    assert "K is scaled to fit" in finding(lines, "ok", "sizes")
+    assert lines[-2] == "and 3 more of the same kinds; --all prints them"
 
 
-def test_exposures_and_lenses_that_differ_are_told(pop: Pop, tmp_path: Path, pictures: list[np.ndarray]) -> None:
-    for i, picture in enumerate(pictures):
-        exif = Image.Exif()
-        exif[0x10F], exif[0x110] = "Maker", "Maker X"
-        exif[0x8769] = {0x829A: IFDRational(1, 100 * 2 ** (i % 3)), 0x8827: 100, 0x920A: IFDRational(4 + i % 2, 1)}
-        Image.fromarray(picture).save(tmp_path / f"{i}.jpg", exif=exif, quality=95)
-    out = pop("data", "check", tmp_path).out
-    assert "8 x Maker X; focal length 4 mm, 5 mm: several lenses" in out
-    assert "exposures differ by 2.0 stops; lock the exposure, or train with --exposure" in out
-    assert "no focal length" not in out
-    write_photograph(tmp_path / "edited.jpg", photograph(1, 160, 120))
-    assert (
-        "1 has no focal length, first edited.jpg; where photographs were edited" in pop("data", "check", tmp_path).out
-    )
+@pytest.mark.parametrize(("orientation", "turned"), [(1, False), (3, True), (6, True)])
+def test_exif_orientation_is_pointed_out(check: Check, capture: Path, orientation: int, turned: bool) -> None:
+    path, exif = capture / "images" / "view_000.png", Image.Exif()
+    exif[0x112] = orientation
+    Image.open(path).save(path.with_suffix(".jpg"), exif=exif)
+    path.unlink()
+    found = [line for line in check(capture) if line.split()[:2] == ["LOOK", "EXIF"]]
+    assert len(found) == turned
+    assert not turned or "1 ask to be rotated, first view_000.png" in found[0]
 
 
-def test_what_is_not_read_is_mentioned_among_what_is(pop: Pop, bare: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(images, "can_read_heif", lambda: False)
-    (bare / "a.HEIC").write_bytes(b"no JPEG")
-    (bare / "b.MOV").write_bytes(b"no JPEG")
-    outcome = pop.done("data", "check", bare)
-    for words in ("1 file is HEIC", "mogrify -format jpg *.HEIC", "1 file is a video", "pop frames b.MOV"):
-        assert words in outcome.out
+@pytest.mark.parametrize(("kept", "mark"), [(0.9, "ok"), (0.1, "LOOK")])
+def test_masks_that_look_inverted_are_pointed_out(check: Check, capture: Path, kept: float, mark: str) -> None:
+    mask = np.zeros((32, 40), np.uint8)
+    mask[: round(32 * kept)] = 255
+    for path in sorted((capture / "images").iterdir())[:-1]:
+        write_photograph(capture / "masks" / path.name, mask)
+    lines = check(capture)
+    about = finding(lines, mark, "masks")
+    assert "7 masks keep" in about
+    assert ("inverted" in about) == (mark == "LOOK")
+    assert said(lines, "1 photographs have none, first view_007.png")
 
 
-def test_a_damaged_photograph_stands_against_training(pop: Pop, bare: Path) -> None:
-    (bare / "3.png").write_bytes((bare / "3.png").read_bytes()[:-40])
-    outcome = pop("data", "check", bare)
-    assert outcome.status == 1
-    assert "3.png: the PNG file is truncated" in outcome.out
+def test_photographs_without_a_camera_are_named(check: Check, root: Path) -> None:
+    for name in ("late.png", "later.png"):
+        write_photograph(root / "images" / name, photograph(9))
+    note = next(line for line in check(root) if "has no camera for" in line)
+    assert "4 of 6 photographs" in note
+    assert note.endswith("late.png, later.png")
+    assert load_capture(root).notes[0] in note
 
 
 def test_tracks_that_colmap_refuses_are_told_with_the_models_folder(pop: Pop, tmp_path: Path) -> None:
@@ -133,6 +182,61 @@ def test_tracks_that_colmap_refuses_are_told_with_the_models_folder(pop: Pop, tm
     assert f"{tmp_path / 'scene' / 'sparse' / '0'}: COLMAP cannot read its tracks" in line
     assert line.endswith("training does without its tracks; write the model again to have them")
     assert pop("data", "check", HERE / "tracked").out.count("mean error") == 1
+
+
+# Photographs alone.
+
+
+def test_photographs_alone_are_looked_over(check: Check, bare: Path, tmp_path: Path) -> None:
+    lines = check(bare)
+    assert said(lines, "none yet, 8 photographs", "pop train finds", "8 of 160x120 px", "8 are few", "ready to train")
+    for about in ("LOOK  blur", "LOOK  exposure", "LOOK  duplicates", "mixed cameras"):
+        assert not said(lines, about)
+    write_photograph(tmp_path / "one" / "0.png", photograph(0))
+    assert said(check(tmp_path / "one", 1), "none yet, 1 photograph: a scene needs two or more", "1 is few")
+
+
+def test_what_is_odd_among_photographs_is_named(check: Check, bare: Path, pictures: list[np.ndarray]) -> None:
+    write_photograph(bare / "2.png", cv2.GaussianBlur(pictures[2], (0, 0), 3.0))
+    write_photograph(bare / "4.png", np.zeros_like(pictures[4]))
+    shutil.copy(bare / "6.png", bare / "6 copy.png")
+    # the same picture, written otherwise
+    assert cv2.imwrite(str(bare / "7 again.jpg"), cv2.imread(str(bare / "7.png")), [cv2.IMWRITE_JPEG_QUALITY, 95])
+    lines = check(bare)
+    (blur,) = [line for line in lines if "far less sharp" in line]
+    assert "2.png" in blur
+    assert said(lines, "1 is over a quarter pure black, first 4.png")
+    assert any("2 are the same file more than once" in line and "6 copy.png" in line for line in lines)
+    assert any("1 pair looks the same" in line and "7 again.jpg" in line for line in lines)
+    write_photograph(bare / "3.png", pictures[3][:110])
+    write_photograph(bare / "5.png", pictures[5][:100])
+    assert "mixed cameras: the photographs have 3 sizes" in finding(check(bare), "LOOK", "cameras")
+
+
+def test_exposures_and_lenses_that_differ_are_told(check: Check, tmp_path: Path, pictures: list[np.ndarray]) -> None:
+    for i, picture in enumerate(pictures):
+        exif = Image.Exif()
+        exif[0x10F], exif[0x110] = "Maker", "Maker X"
+        exif[0x8769] = {0x829A: IFDRational(1, 100 * 2 ** (i % 3)), 0x8827: 100, 0x920A: IFDRational(4 + i % 2, 1)}
+        Image.fromarray(picture).save(tmp_path / f"{i}.jpg", exif=exif, quality=95)
+    lines = check(tmp_path)
+    assert said(lines, "8 x Maker X; focal length 4 mm, 5 mm: several lenses")
+    assert said(lines, "exposures differ by 2.0 stops; lock the exposure, or train with --exposure")
+    assert not said(lines, "no focal length")
+    write_photograph(tmp_path / "edited.jpg", photograph(1, 160, 120))
+    assert said(check(tmp_path), "1 has no focal length, first edited.jpg; where photographs were edited")
+
+
+def test_what_is_not_read_is_mentioned_and_a_damaged_photograph_stands_against_training(
+    check: Check, bare: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(images, "can_read_heif", lambda: False)
+    for name in ("a.HEIC", "b.MOV"):
+        (bare / name).write_bytes(b"no JPEG")
+    words = ("1 file is HEIC", "mogrify -format jpg *.HEIC", "1 file is a video", "pop frames b.MOV")
+    assert said(check(bare), *words)
+    (bare / "3.png").write_bytes((bare / "3.png").read_bytes()[:-40])
+    assert said(check(bare, 1), "3.png: the PNG file is truncated")
 
 
 def noise(seed: int) -> np.ndarray:
@@ -149,74 +253,163 @@ HOPELESS = {
 
 @pytest.mark.parametrize("what", HOPELESS)
 def test_photographs_that_no_cameras_can_be_found_for_are_refused_by_check_and_training_alike(
-    pop: Pop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+    pop: Pop, check: Check, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     make, words = HOPELESS[what]
     for i in range(4):
         write_photograph(tmp_path / "photos" / f"{i}.png", make(i))
-    checked = pop("data", "check", tmp_path / "photos")
-    assert checked.status == 1
-    assert words in checked.out
-    assert "1 problem stands against training" in checked.out
-    monkeypatch.setattr(sfm, "find_cameras", never)
+    assert said(check(tmp_path / "photos", 1), words, "1 problem stands against training")
+    monkeypatch.setattr(sfm, "find_cameras", lambda *_, **__: pytest.fail("the long work has begun"))
     says(pop("train", tmp_path / "photos", "--out", tmp_path / "out"), words, "no cameras could be found")
 
 
-def never(*_: object, **__: object) -> None:
-    raise AssertionError("the long work has begun")
-
-
-def test_photographs_that_overlap_are_not_called_unrelated(pop: Pop, tmp_path: Path) -> None:
+def test_photographs_that_overlap_are_not_called_unrelated(check: Check, tmp_path: Path) -> None:
     wall = np.random.default_rng(0).integers(0, 256, (60, 240, 3), dtype=np.uint8)
     wall = cv2.resize(wall, (1200, 300), interpolation=cv2.INTER_CUBIC)
     for i in range(3):
         write_photograph(tmp_path / f"{i}.png", wall[:, 300 * i : 300 * i + 500])
-    assert pop("data", "check", tmp_path).status == 0
+    check(tmp_path)
 
 
-@pytest.mark.parametrize("name", ["walk.mp4", "photos.zip", "gone"])
+WRONG = {"walk.mp4": "is no video", "photos.zip": "outside of its folder", "gone": "no such folder"}
+
+
+@pytest.mark.parametrize("name", WRONG)
 def test_what_is_no_folder_is_refused_in_the_same_words(pop: Pop, tmp_path: Path, name: str) -> None:
+    (tmp_path / "walk.mp4").write_bytes(b"no JPEG")
+    with zipfile.ZipFile(tmp_path / "photos.zip", "w") as archive:
+        archive.writestr("../a.jpg", b"")
     path = tmp_path / name
-    if name.endswith("zip"):
-        with zipfile.ZipFile(path, "w") as archive:
-            archive.writestr("../a.jpg", b"")
-    elif name.endswith("mp4"):
-        path.write_bytes(b"no JPEG")
     checked, trained = pop("data", "check", path), pop("train", path, "--out", tmp_path / "out")
     assert checked.status == trained.status == 2
     assert checked.err == trained.err
-    words = {"walk.mp4": "is no video", "photos.zip": "outside of its folder", "gone": "no such folder"}
-    assert words[name] in checked.err
+    assert WRONG[name] in checked.err
 
 
-def test_sizes_that_differ_are_called_mixed_cameras(pop: Pop, bare: Path, pictures: list[np.ndarray]) -> None:
-    assert "mixed cameras" not in pop("data", "check", bare).out
-    write_photograph(bare / "3.png", pictures[3][:110])
-    write_photograph(bare / "4.png", pictures[4][:100])
-    lines = pop("data", "check", bare).out.splitlines()
-    assert any(
-        line.startswith("LOOK  cameras") and "mixed cameras: the photographs have 3 sizes" in line for line in lines
-    )
+# Exposures told by the points that photographs share: measured, chosen by, and told before training.
+
+N_VIEWS, N_POINTS = 30, 400
 
 
-def test_photographs_without_a_camera_are_named(pop: Pop, tmp_path: Path) -> None:
-    root = colmap_capture(tmp_path / "scene")
-    for name in ("late.png", "later.png"):
-        write_photograph(root / "images" / name, photograph(9))
-    note = next(line for line in pop("data", "check", root).out.splitlines() if "has no camera for" in line)
-    assert "4 of 6 photographs" in note
-    assert note.endswith("late.png, later.png")
-    assert load_capture(root).notes[0] in note
+def test_a_level_is_stops_under_white_and_nothing_at_the_ends_of_the_scale() -> None:
+    image = np.full((40, 60, 3), 128, np.uint8)
+    image[:, 40:] = 255
+    image[20:, :20] = 5
+    places = np.array([[10.5, 5.5], [55.0, 5.0], [5.0, 35.0], [-0.1, 5.0], [60.0, 5.0], [np.nan, 5.0], [30.0, 39.9]])
+    found = levels_at(image, places)
+    gray = GAMMA * math.log2(128 / 255)
+    np.testing.assert_allclose(found, [gray, np.nan, np.nan, np.nan, np.nan, np.nan, gray], atol=1e-5)
+    # x is the column
+    image = np.tile(np.linspace(60, 200, 60, dtype=np.uint8)[None, :, None], (40, 1, 3))
+    left, right = levels_at(image, np.array([[12.0, 30.0], [48.0, 10.0]]))
+    assert right > left + 1.0
 
 
-# `pop doctor` and `pop data check`: what they find, and what they say about it.
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_exposures_are_found_though_a_third_of_the_points_shine_or_are_hidden(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    true, albedo = rng.normal(0.0, 0.3, N_VIEWS), rng.normal(-2.0, 1.0, N_POINTS)
+    seen = [rng.permutation(N_POINTS)[: rng.integers(60, 200)] for _ in range(N_VIEWS)]
+    levels = []
+    for i, rows in enumerate(seen):
+        values = true[i] + albedo[rows] + rng.normal(0.0, 0.05, len(rows))
+        wrong = rng.random(len(rows)) < 1 / 3
+        values[wrong] += rng.normal(0.0, 2.0, wrong.sum())
+        values[rng.random(len(rows)) < 0.1] = np.nan
+        levels.append(values)
+    found = exposures(levels, seen)
+    np.testing.assert_allclose(found.stops, true - np.median(true), atol=0.12)
+    assert found.drift == pytest.approx(true.std(), abs=0.03)
+    # the errors are about as large as they are said to be
+    assert 0.3 < (found.stops - (true - np.median(true))).std() / found.errors.mean() < 2.0
+    # and photographs of nothing in common do not drift
+    rng, seen = np.random.default_rng(seed), [np.arange(40)] * 30
+    found = exposures([rng.normal(-2.0, 1.0, 40) for _ in seen], seen)
+    assert np.nanstd(found.stops) > 0.15
+    assert (found.drift or 0.0) < 0.1
+
+
+def test_what_changes_from_place_to_place_is_no_unevenness() -> None:
+    viewmats = ring(N_VIEWS)
+    slow = np.sin(np.linspace(0.0, 2.0 * np.pi, N_VIEWS, endpoint=False))
+    order = np.random.default_rng(0).permutation(N_VIEWS)
+    for stops, low, high in ((slow, 0.0, 0.1), (slow[order], 0.6, 1.2), (np.zeros(N_VIEWS), 0.0, 0.001)):
+        found = Exposures(stops, np.full(N_VIEWS, 0.01))
+        assert found.drift == pytest.approx(stops.std(), abs=0.01)
+        assert low <= (found.unevenness(viewmats) or 0.0) < high
+    # photographs in another order are the same photographs
+    exact = np.zeros(N_VIEWS)
+    reordered = Exposures(slow[order], exact).unevenness(viewmats[order])
+    assert reordered == pytest.approx(Exposures(slow, exact).unevenness(viewmats))
+    assert Exposures(slow[:4], np.zeros(4)).unevenness(viewmats[:4]) is None
+
+
+def test_a_photograph_that_shares_no_points_has_no_exposure() -> None:
+    rows = [np.arange(50), np.arange(50), np.arange(100, 150), np.arange(10)]
+    levels = [np.zeros(50), np.ones(50), np.ones(50), np.zeros(10)]
+    found = exposures(levels, rows)
+    assert np.isnan(found.stops).tolist() == [False, False, True, True]
+    assert found.stops[1] - found.stops[0] == pytest.approx(1.0)
+    assert found.drift == pytest.approx(0.5)
+    assert exposures(levels[2:], rows[2:]).drift is None
+    assert exposures([], []).drift is None
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_demo(tmp_path_factory.mktemp("drift") / "demo", views=24, width=120, height=90)
+
+
+def brighter(image: np.ndarray, stops: float) -> np.ndarray:
+    """Let a photograph take so many stops more light."""
+    return np.clip(image * 2.0 ** (stops / GAMMA), 0.0, 255.0).round().astype(np.uint8)
+
+
+@pytest.mark.parametrize(("width", "learned"), [(0.0, False), (0.4, True)])
+def test_training_learns_exposures_that_differ(demo: Path, width: float, learned: bool) -> None:
+    capture = load_capture(demo)
+    stops = np.random.default_rng(3).permutation(np.linspace(-1.0, 1.0, len(capture.views))) * width
+    changed = [replace(v, image=brighter(v.image, stop)) for v, stop in zip(capture.views, stops, strict=True)]
+    config = TrainConfig.of(preset="auto", backend="fast")
+
+    def terms(views: list[Any]) -> tuple[Exposures, Any]:
+        of: Capture = replace(capture, views=tuple(views))
+        return exposures_of(of), choose_terms(of, config, None)
+
+    found, chosen = terms(changed)
+    np.testing.assert_allclose(found.stops, stops - np.median(stops), atol=0.1)
+    assert chosen.settings.get("exposure", False) is learned
+    assert any("by their common points they differ by" in why for why in chosen.why) is learned
+    found, chosen = terms([replace(view, seen=None) for view in changed])
+    assert found.drift is None
+    assert "exposure" not in chosen.settings
+
+
+def test_data_check_says_what_training_will_do(check: Check, demo: Path, tmp_path: Path) -> None:
+    assert said(check(demo), "exposure      the same points differ by 0.0")
+    shutil.copytree(demo, tmp_path / "demo")
+    stops = np.random.default_rng(5).permutation(np.linspace(-0.8, 0.8, 24))
+    paths = sorted((tmp_path / "demo" / "images").iterdir())
+    for path, stop in zip(paths, stops, strict=True):
+        assert cv2.imwrite(str(path), brighter(cv2.imread(str(path)), stop))
+    (line,) = [line for line in check(tmp_path / "demo") if "the same points differ" in line]
+    assert line.startswith("LOOK")
+    told = float(line.partition("differ by ")[2].split()[0])
+    assert told == pytest.approx(stops.std(), abs=0.1)
+    assert float(line.partition("a photograph differs by ")[2].split()[0]) > UNEVEN
+    darkest, brightest = paths[int(stops.argmin())].name, paths[int(stops.argmax())].name
+    assert re.search(rf"photograph, -0\.\d+ \({darkest}\) to \+0\.\d+ \({brightest}\); a ", line)
+    assert line.endswith("; lock the exposure, or train with --exposure")
+
+
+# `pop doctor`.
 
 
 def test_a_whole_install_is_found_whole(pop: Pop) -> None:
-    outcome = pop.done("doctor")
+    out = pop.done("doctor").out
     for name in ("numpy", "torch", "pycolmap", "opencv-contrib-python-headless", "backend fast", "processor", "memory"):
-        assert name in outcome.out
-    assert "everything that pop needs is here" in outcome.out
+        assert name in out
+    assert "everything that pop needs is here" in out
 
 
 @pytest.mark.parametrize(
@@ -226,17 +419,14 @@ def test_a_whole_install_is_found_whole(pop: Pop) -> None:
 def test_what_building_the_cuda_extension_lacks_is_said(
     pop: Pop, monkeypatch: pytest.MonkeyPatch, missing: str | None, words: str
 ) -> None:
-    from cuda_ext import build, toolkit
-
     monkeypatch.setattr(build, "find_nvcc", lambda: None if missing == "nvcc" else "/opt/nvcc")
     monkeypatch.setattr(build, "_program", lambda name: None if name == missing else f"/bin/{name}")
     monkeypatch.setattr(build.importlib.util, "find_spec", lambda name: object())
     monkeypatch.setattr(toolkit, "nvcc_version", lambda nvcc: (13, 0))
     monkeypatch.setattr("cuda_ext.why_not", lambda: "the CUDA extension is not built")
-    outcome = pop.done("doctor")
-    line = next(line for line in outcome.out.splitlines() if "CUDA build" in line)
-    assert words in line
-    backend = next(line for line in outcome.out.splitlines() if "backend cuda" in line)
+    lines = pop.done("doctor").out.splitlines()
+    assert words in next(line for line in lines if "CUDA build" in line)
+    backend = next(line for line in lines if "backend cuda" in line)
     assert " ".join(backend.split()) == "- backend cuda the CUDA extension is not built (optional)"
 
 
@@ -259,96 +449,3 @@ def test_a_missing_package_is_named_with_the_way_to_get_it(pop: Pop, monkeypatch
     assert "pip install" in line
     assert ("libxyz.so" in line) == (how == "broken")
     assert outcome.out.rstrip().endswith("missing: plyfile")
-
-
-def check(pop: Pop, folder: Path, status: int) -> list[str]:
-    outcome = pop("data", "check", folder)
-    assert outcome.status == status, outcome
-    return outcome.out.splitlines()
-
-
-def finding(lines: list[str], mark: str, about: str) -> str:
-    """Give the first finding of that mark and topic."""
-    return next(line for line in lines if line.split()[:2] == [mark, about])
-
-
-def test_a_sound_capture_is_ready(pop: Pop, shared_capture: Path) -> None:
-    lines = check(pop, shared_capture, 0)
-    assert lines[-1] == "ready to train"
-    assert "8 views from the COLMAP model in sparse/0" in finding(lines, "ok", "poses")
-    assert "8 x PINHOLE 40x32" in finding(lines, "ok", "cameras")
-    assert "8 of 40x32 px" in finding(lines, "ok", "photographs")
-    assert "mean error" in finding(lines, "ok", "reprojection")
-    assert "at factor 4" in finding(lines, "ok", "memory")
-    # eight photographs around a still life are far apart
-    assert [line.split()[1] for line in lines if line.startswith(("LOOK", "BAD"))] == ["spacing"]
-
-
-def test_cameras_that_stand_farthest_from_the_nearest_other_are_named(pop: Pop, tmp_path: Path) -> None:
-    whole = colmap_capture(tmp_path / "whole", count=36)
-    found = finding(check(pop, whole, 0), "ok", "spacing")
-    assert "neighbours 9.5 degrees apart as the subject sees them (median)" in found
-    # every fourth of these cameras, and one more beside the first
-    numbers = [0, 1, *range(4, 36, 4)]
-    names = [f"{number:02d}.png" for number in numbers]
-    write_model(whole / "sparse" / "0", names, ring(36)[numbers])
-    found = finding(check(pop, whole, 0), "LOOK", "spacing")
-    assert "far; photographs between these would help most: 38 degrees between" in found
-    assert "00.png and 01.png" not in found
-
-
-def test_every_problem_of_a_damaged_capture_is_listed_at_once(pop: Pop, capture: Path) -> None:
-    photos = sorted((capture / "images").iterdir())
-    photos[1].unlink()
-    photos[2].write_bytes(photos[2].read_bytes()[:200])
-    cv2.imwrite(str(photos[3]), np.zeros((40, 32, 3), np.uint8))
-    cv2.imwrite(str(capture / "images" / "extra.png"), np.zeros((32, 40, 3), np.uint8))
-    lines = check(pop, capture, 1)
-    text = "\n".join(lines)
-    assert "1 of 8 listed are absent, first view_001.png" in text
-    assert "view_002.png" in text
-    assert "view_003.png is 32x40 px, its camera 40x32: another shape" in text
-    assert "1 files in images/ are not listed, first extra.png" in finding(lines, "LOOK", "pairing")
-    assert lines[-1] == "3 problems stand against training"
-
-
-def test_photographs_of_half_the_size_are_fine_and_said_so(pop: Pop, capture: Path) -> None:
-    for path in (capture / "images").iterdir():
-        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (20, 16)))
-    lines = check(pop, capture, 0)
-    assert "K is scaled to fit" in finding(lines, "ok", "sizes")
-    assert lines[-2] == "and 3 more of the same kinds; --all prints them"
-
-
-def with_exif_orientation(jpeg: bytes, orientation: int) -> bytes:
-    """Insert an EXIF segment that holds an orientation alone."""
-    tiff = b"II*\0" + struct.pack("<IH", 8, 1) + struct.pack("<HHIHH", 0x0112, 3, 1, orientation, 0) + bytes(4)
-    body = b"Exif\0\0" + tiff
-    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + jpeg[2:]
-
-
-@pytest.mark.parametrize(("orientation", "turned"), [(1, False), (3, True), (6, True)])
-def test_exif_orientation_is_pointed_out(pop: Pop, capture: Path, orientation: int, turned: bool) -> None:
-    path = capture / "images" / "view_000.png"
-    ok, data = cv2.imencode(".jpg", cv2.imread(str(path)))
-    assert ok
-    path.unlink()
-    path.with_suffix(".jpg").write_bytes(with_exif_orientation(data.tobytes(), orientation))
-    lines = check(pop, capture, 0)
-    found = [line for line in lines if line.split()[:2] == ["LOOK", "EXIF"]]
-    assert len(found) == turned
-    assert not turned or "1 ask to be rotated, first view_000.png" in found[0]
-
-
-@pytest.mark.parametrize(("kept", "mark"), [(0.9, "ok"), (0.1, "LOOK")])
-def test_masks_that_look_inverted_are_pointed_out(pop: Pop, capture: Path, kept: float, mark: str) -> None:
-    (capture / "masks").mkdir()
-    mask = np.zeros((32, 40), np.uint8)
-    mask[: round(32 * kept)] = 255
-    for path in sorted((capture / "images").iterdir())[:-1]:
-        cv2.imwrite(str(capture / "masks" / path.name), mask)
-    lines = check(pop, capture, 0)
-    said = finding(lines, mark, "masks")
-    assert "7 masks keep" in said
-    assert ("inverted" in said) == (mark == "LOOK")
-    assert "1 photographs have none, first view_007.png" in "\n".join(lines)

@@ -1,98 +1,114 @@
-"""`pop export`: the same splat, in files that other programs open."""
+"""`pop export` and `pop convert`: the same splat, in files that other programs open, each of which says its world."""
 
 from __future__ import annotations
 
 import ast
 import json
-import re
+import shutil
 import typing
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from benchmarks.faults.ksplat import ksplat_of
+from pop_fast.cli import main
 from pop_fast.cli.options import FormatName
 from pop_fast.data import load_capture
 from pop_fast.data.colmap import read_model
-from pop_fast.density import shrink
-from pop_fast.density.passes import Passes
-from pop_fast.errors import PopError
-from pop_fast.io.formats import format_names, load_splat_file
-from pop_fast.io.ply import Frame, load_ply, save_ply
-from pop_fast.train.views import ViewTensors
+from pop_fast.io.formats import default_name, format_names, load_splat_file
+from pop_fast.io.ply import Frame, frame_of, load_ply, save_ply
+from tests.app.captures import assert_one_line
 from tests.app.clouds import many
-from tests.app.conftest import Pop
+from tests.app.conftest import TRAIN, Pop
 from tests.app.damage import contents, says
-from tests.app.tiny import tiny_capture
+
+TRAINING = ("--frame", "training")
+Said, Psnr = Callable[..., str], Callable[..., float]
 
 
-def exported(pop: Pop, *words: object) -> str:
-    outcome = pop.done("export", *words)
-    return outcome.out
+@pytest.fixture(autouse=True)
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder that a test runs and writes in."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    return tmp_path / "here"
 
 
-def psnr(pop: Pop, tmp_path: Path, *words: object) -> float:
-    assert pop("eval", *words, "--json", tmp_path / "e.json").status == 0
-    return float(json.loads((tmp_path / "e.json").read_text())["psnr"])
+@pytest.fixture
+def export(pop: Pop, shared_result: Path) -> Said:
+    """Export the tiny result, and return what is said."""
+    return lambda *words: pop.done("export", shared_result, *words).out
 
 
-def test_the_training_frame_keeps_every_bit(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
-    exported(pop, shared_result, "--out", tmp_path / "t.ply", "--frame", "training")
-    assert (tmp_path / "t.ply").read_bytes() == (shared_result / "ply" / "point_cloud_29.ply").read_bytes()
+@pytest.fixture
+def psnr(pop: Pop, shared_capture: Path) -> Psnr:
+    """Measure a splat on the tiny capture, without a note."""
+
+    def measure(*words: object) -> float:
+        assert "note" not in pop.done("eval", *words, "--capture", shared_capture, "--json", "e.json").err
+        return json.loads(Path("e.json").read_text())["psnr"]
+
+    return measure
 
 
-def test_the_frame_is_found_from_the_capture_where_no_record_was_left(pop: Pop, result: Path, tmp_path: Path) -> None:
-    exported(pop, result, "--out", tmp_path / "a.ply")
+@pytest.fixture
+def own(shared_result: Path) -> Path:
+    """The PLY of the tiny result."""
+    return shared_result / "ply" / "point_cloud_29.ply"
+
+
+@pytest.fixture
+def trained(shared_result: Path) -> Any:
+    stats = json.loads((shared_result / "stats" / "val_step0029.json").read_text())
+    return pytest.approx(stats["psnr"], abs=1e-2)
+
+
+def test_the_frame_is_found_from_the_capture_where_no_record_was_left(pop: Pop, result: Path) -> None:
+    pop.done("export", result, "--out", "a.ply")
     (result / "capture.json").unlink()
-    exported(pop, result, "--out", tmp_path / "b.ply")
-    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    pop.done("export", result, "--out", "b.ply")
+    assert Path("a.ply").read_bytes() == Path("b.ply").read_bytes()
 
 
-def test_what_no_renderer_shows_is_left_out_and_counted(
-    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path
-) -> None:
-    params = load_ply(shared_result / "ply" / "point_cloud_29.ply")
+def test_what_no_renderer_shows_is_left_out_and_counted(pop: Pop, psnr: Psnr, own: Path) -> None:
+    params = load_ply(own)
     params["opacities"][:7] = torch.logit(torch.tensor(0.0039))  # just under 1/255 = 0.00392...
-    save_ply(tmp_path / "with.ply", params)
+    save_ply("with.ply", params, frame=frame_of(own))
     n = len(params["means"])
-    said = exported(pop, tmp_path / "with.ply", "--out", tmp_path / "without.ply", "--drop-invisible")
+    said = pop.done("export", "with.ply", "--out", "without.ply", "--drop-invisible", *TRAINING).out
     assert f"{n - 7:,} of {n:,} Gaussians kept, 7 left out" in said
-    assert len(load_ply(tmp_path / "without.ply")["means"]) == n - 7
-    words = ["--capture", shared_capture]
-    assert psnr(pop, tmp_path, tmp_path / "without.ply", *words) == psnr(pop, tmp_path, tmp_path / "with.ply", *words)
+    assert len(load_ply("without.ply")["means"]) == n - 7
+    assert psnr("without.ply") == psnr("with.ply")
 
 
-def test_inria_s_layout_has_what_its_scripts_read(
-    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path
-) -> None:
-    exported(pop, shared_result, "--out", tmp_path / "inria", "--layout", "inria")
-    own = load_ply(tmp_path / "inria" / "point_cloud" / "iteration_30" / "point_cloud.ply")
-    exported(pop, shared_result, "--out", tmp_path / "own.ply")
-    for name, value in load_ply(tmp_path / "own.ply").items():
-        torch.testing.assert_close(own[name], value)
-    renders = sorted((tmp_path / "inria" / "test" / "ours_30" / "renders").iterdir())
-    photos = sorted((tmp_path / "inria" / "test" / "ours_30" / "gt").iterdir())
-    assert [p.name for p in renders] == [p.name for p in photos] == ["00000.png"]
+def test_inria_s_layout_has_what_its_scripts_read(export: Said, psnr: Psnr, shared_capture: Path, trained: Any) -> None:
+    export("--out", "inria", "--layout", "inria")
+    export("--out", "own.ply")
+    (ply,) = Path("inria").rglob("*.ply")
+    assert ply == Path("inria/point_cloud/iteration_30/point_cloud.ply")
+    exported = load_ply(ply)
+    for name, value in load_ply("own.ply").items():
+        torch.testing.assert_close(exported[name], value)
+    assert psnr(ply) == trained
+    views = Path("inria/test/ours_30")
+    assert (
+        [p.name for p in (views / "renders").iterdir()] == [p.name for p in (views / "gt").iterdir()] == ["00000.png"]
+    )
     photo = cv2.imread(str(shared_capture / "images" / "view_000.png"))
-    np.testing.assert_array_equal(cv2.imread(str(photos[0])), photo)
-    call = ast.parse((tmp_path / "inria" / "cfg_args").read_text(), mode="eval").body
-    assert isinstance(call, ast.Call)
+    np.testing.assert_array_equal(cv2.imread(str(views / "gt" / "00000.png")), photo)
+    call = ast.parse(Path("inria/cfg_args").read_text(), mode="eval").body
     settings = {word.arg: ast.literal_eval(word.value) for word in call.keywords}
     assert settings["source_path"] == str(shared_capture)
     assert settings["white_background"] is False
-
-
-def test_inria_s_cameras_are_those_of_the_colmap_model(
-    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path
-) -> None:
-    exported(pop, shared_result, "--out", tmp_path / "inria", "--layout", "inria")
-    cameras = json.loads((tmp_path / "inria" / "cameras.json").read_text())
+    cameras = json.loads(Path("inria/cameras.json").read_text())
     shots, _ = read_model(shared_capture / "sparse" / "0")
     assert len(cameras) == len(shots) == len(load_capture(shared_capture).views)
     for camera, shot in zip(cameras, shots, strict=True):
@@ -105,301 +121,332 @@ def test_inria_s_cameras_are_those_of_the_colmap_model(
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        ((), "nothing says what to write; give --out FILE or --to FORMAT"),
-        (("--out", "x.spz", "--to", "sog"), "ends in .spz, which is not how files of sog end"),
-        (("--out", "x.ply", "--to", "html"), "a page ends in .html"),
-        (("--out", "x.html", "--frame", "capture"), "a page has no frame of its own"),
-        (("--out", "x.ply", "--min-opacity", "1.5"), "--min-opacity 1.5 must be in [0, 1]"),
-        (("--out", "x.ply", "--crop", "1", "0", "0", "0", "1", "1"), "each minimum under its maximum"),
-        (("--out", "x.ply", "--crop", "91", "91", "91", "99", "99", "99"), "in the box leaves no Gaussian"),
-        (("--out", "x.ply", "--final-prune", "1"), "--final-prune 1 must be in [0, 1)"),
-        (("--out", "x.ply", "--max-gaussians", "0"), "--max-gaussians 0 must be at least 1"),
-        (("--out", "x.ply", "--target-mb", "0"), "--target-mb 0 must be over 0"),
-        (("--out", "x.ply", "--target-mb", "0.0001"), "a file without any Gaussian has"),
-        (("--out", "x", "--layout", "inria", "--max-gaussians", "5"), "no --to or limits"),
-        (("--out", "x.obj"), "must end in one of .compressed.ply, .glb, .ply, .sog, .splat, .spz"),
-        (("--out", "there.ply"), "exists; pass --overwrite"),
-        (("--out", "full", "--layout", "inria"), "full: holds what this command did not write (notes.txt)"),
-        (("--out", "full", "--layout", "inria", "--overwrite"), "did not write (notes.txt)"),
-        (("--out", "full.ply", "--overwrite"), "full.ply: a folder of this name is in the way; choose another --out"),
+        ("", "nothing says what to write; give --out FILE or --to FORMAT"),
+        ("--out x.spz --to sog", "ends in .spz, which is not how files of sog end"),
+        ("--out x.ply --to html", "a page ends in .html"),
+        ("--out x.html --frame capture", "a page has no frame of its own"),
+        ("--out x.ply --min-opacity 1.5", "--min-opacity 1.5 must be in [0, 1]"),
+        ("--out x.ply --crop 1 0 0 0 1 1", "each minimum under its maximum"),
+        ("--out x.ply --crop 91 91 91 99 99 99", "in the box leaves no Gaussian"),
+        ("--out x.ply --final-prune 1", "--final-prune 1 must be in [0, 1)"),
+        ("--out x.ply --max-gaussians 0", "--max-gaussians 0 must be at least 1"),
+        ("--out x.ply --target-mb 0", "--target-mb 0 must be over 0"),
+        ("--out x.ply --target-mb 0.0001", "a file without any Gaussian has"),
+        ("--out x.spz --target-mb nan", "--target-mb nan must be over 0 and finite"),
+        ("--out x.spz --target-mb inf", "--target-mb inf must be over 0 and finite"),
+        ("--out x.spz --target-mb 1 --fine-tune-steps -1", "--fine-tune-steps -1 must be 0 to 30,000"),
+        ("--out x.spz --target-mb 1 --fine-tune-steps 30001", "--fine-tune-steps 30001 must be 0 to 30,000"),
+        ("--out x --layout inria --max-gaussians 5", "no --to or limits"),
+        ("--out x.obj", "must end in one of .compressed.ply, .glb, .ply, .sog, .splat, .spz"),
+        ("--out there.ply", "exists; pass --overwrite"),
+        ("--out full --layout inria", "full: holds what this command did not write (notes.txt)"),
+        ("--out full --layout inria --overwrite", "did not write (notes.txt)"),
+        ("--out full.ply --overwrite", "full.ply: a folder of this name is in the way; choose another --out"),
     ],
 )
-def test_what_cannot_be_exported_is_said_and_nothing_is_written(
-    pop: Pop, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], part: str
-) -> None:
-    (tmp_path / "there.ply").write_text("mine")
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "notes.txt").write_text("mine")
-    (tmp_path / "full.ply").mkdir()
-    monkeypatch.chdir(tmp_path)
-    before = sorted(tmp_path.rglob("*"))
-    says(pop("export", shared_result, *words), part)
-    assert sorted(tmp_path.rglob("*")) == before
-    assert (tmp_path / "there.ply").read_text() == "mine"
+def test_what_cannot_be_exported_is_said(pop: Pop, shared_result: Path, here: Path, words: str, part: str) -> None:
+    for folder in ("full", "full.ply"):
+        Path(folder).mkdir()
+    for file in ("there.ply", "full/notes.txt"):
+        Path(file).write_text("mine")
+    before = sorted(here.rglob("*"))
+    says(pop("export", shared_result, *words.split()), part)
+    assert sorted(here.rglob("*")) == before
+    assert Path("there.ply").read_text() == "mine"
 
 
-def test_an_earlier_export_in_inria_s_layout_is_replaced_only_when_asked(
-    pop: Pop, shared_result: Path, tmp_path: Path
-) -> None:
-    words = ["export", shared_result, "--layout", "inria", "--out", tmp_path / "inria"]
-    assert pop(*words).status == 0
-    before = contents(tmp_path)
-    (tmp_path / "inria" / "test" / "ours_30" / "gt" / "00001.png").write_bytes(b"of a longer test set")
-    says(pop(*words), "inria: the folder exists and is not empty; choose another or pass --overwrite")
-    assert pop(*words, "--overwrite").status == 0
-    assert contents(tmp_path) == before
-
-
-@pytest.mark.parametrize("damage", ["another trainer's", "measured", "no cfg_args"])
-def test_an_inria_folder_that_is_not_just_our_export_is_never_replaced(
-    pop: Pop, shared_result: Path, tmp_path: Path, damage: str
-) -> None:
-    words = ["export", shared_result, "--layout", "inria", "--out", tmp_path / "inria"]
-    assert pop(*words).status == 0
-    settings = tmp_path / "inria" / "cfg_args"
-    if damage == "another trainer's":
-        settings.write_text(settings.read_text().replace(", exported_by='pop export'", ""))
-    elif damage == "measured":
-        (tmp_path / "inria" / "results.json").write_text("{}")
+@pytest.mark.parametrize("damage", ["none", "another trainer's", "measured", "no cfg_args"])
+def test_only_our_own_inria_folder_is_replaced(pop: Pop, shared_result: Path, here: Path, damage: str) -> None:
+    words = ["export", shared_result, "--layout", "inria", "--out", "inria"]
+    pop.done(*words)
+    settings, before = Path("inria/cfg_args"), contents(here)
+    if damage == "none":
+        Path("inria/test/ours_30/gt/00001.png").write_bytes(b"of a longer test set")
+        says(pop(*words), "inria: the folder exists and is not empty; choose another or pass --overwrite")
+        pop.done(*words, "--overwrite")
     else:
-        settings.unlink()
-    before = contents(tmp_path)
-    said = {"measured": "(results.json)", "no cfg_args": "(cameras.json"}.get(damage, "(cameras.json, cfg_args")
-    says(pop(*words, "--overwrite"), "inria: holds what this command did not write", said, "move these files away")
-    assert contents(tmp_path) == before
+        if damage == "another trainer's":
+            settings.write_text(settings.read_text().replace(", exported_by='pop export'", ""))
+        elif damage == "measured":
+            Path("inria/results.json").write_text("{}")
+        else:
+            settings.unlink()
+        before = contents(here)
+        said = {"measured": "(results.json)", "no cfg_args": "(cameras.json"}.get(damage, "(cameras.json, cfg_args")
+        outcome = pop(*words, "--overwrite")
+        says(outcome, "inria: holds what this command did not write", said, "move these files away")
+    assert contents(here) == before
 
 
-def test_an_export_takes_the_place_of_nothing_that_it_reads(
-    pop: Pop, capture: Path, result: Path, tmp_path: Path
-) -> None:
+def test_an_export_never_replaces_what_it_reads(pop: Pop, capture: Path, result: Path, tmp_path: Path) -> None:
     words = ["export", result, "--capture", capture, "--overwrite", "--layout", "inria", "--out"]
-    assert pop(*words, tmp_path / "inria").status == 0
+    pop.done(*words, "inria")
     before = contents(tmp_path)
-    says(pop(*words, capture), f"{capture}: is read by this command, so it is not replaced")
-    says(pop(*words, result), f"{result}: is read by this command, so it is not replaced")
-    lone = tmp_path / "inria" / "point_cloud" / "iteration_30" / "point_cloud.ply"
+    for read in (capture, result):
+        says(pop(*words, read), f"{read}: is read by this command, so it is not replaced")
+    lone = Path("inria/point_cloud/iteration_30/point_cloud.ply")
     again = ["export", lone, "--capture", capture, "--own-frame", "--overwrite"]
-    says(
-        pop(*again, "--layout", "inria", "--out", tmp_path / "inria"), "inria: holds", "point_cloud.ply, which is read"
-    )
+    says(pop(*again, "--layout", "inria", "--out", "inria"), "inria: holds", "point_cloud.ply, which is read")
     says(pop(*again, "--out", lone), "point_cloud.ply: is the splat that is read; choose another --out")
     assert contents(tmp_path) == before
 
 
-# `pop export --to`, `pop convert`, and the options that make files smaller, as a user meets them.
-
-
-def test_the_options_name_every_format() -> None:
-    assert set(typing.get_args(FormatName)) == {*format_names(), "html"}
-
-
-def test_no_two_formats_share_a_name_that_nobody_chose(
-    pop: Pop, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_every_format_has_a_name_of_its_own_among_those_that_nobody_chose(export: Said) -> None:
     names = typing.get_args(FormatName)
+    assert set(names) == {*format_names(), "html"}
     for name in names:
-        exported(pop, shared_result, "--to", name)
-    assert len(list(tmp_path.iterdir())) == len(names)
-    for path in tmp_path.iterdir():
-        assert path.suffix == ".html" or len(load_splat_file(path).params["means"]) > 0
+        export("--to", name)
+    files = list(Path().iterdir())
+    assert len(files) == len(names)
+    assert all(path.suffix == ".html" or len(load_splat_file(path).params["means"]) > 0 for path in files)
 
 
-def test_a_conversion_writes_a_page_too(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
-    exported(pop, shared_result, "--out", tmp_path / "a.ply")
-    outcome = pop.done("convert", tmp_path / "a.ply", tmp_path / "b.html")
-    size = (tmp_path / "b.html").stat().st_size
-    assert f"Gaussians, {size / 1e6:.2f} MB -> {tmp_path / 'b.html'}" in outcome.out
-    assert (tmp_path / "b.html").read_text().startswith("<!doctype html>")
-
-
-def test_a_box_is_in_the_frame_of_the_capture_in_a_conversion_too(
-    pop: Pop, shared_result: Path, tmp_path: Path
-) -> None:
-    exported(pop, shared_result, "--out", tmp_path / "own.ply")
-    exported(pop, shared_result, "--out", tmp_path / "t.ply", "--frame", "training")
-    own = load_ply(tmp_path / "own.ply")["means"]
-    box = [f"{value:.6f}" for value in (*own.quantile(0.2, dim=0).tolist(), *own.quantile(0.9, dim=0).tolist())]
+def test_a_box_is_in_the_frame_of_the_capture(pop: Pop, export: Said) -> None:
+    export("--out", "own.ply")
+    export("--out", "t.ply", *TRAINING)
+    whole = load_ply("own.ply")["means"]
+    box = [f"{value:.6f}" for share in (0.2, 0.9) for value in whole.quantile(share, dim=0).tolist()]
+    low, high = torch.tensor([float(value) for value in box]).split(3)
+    export("--out", "box.ply", "--crop", *box)
     for name in ("own", "t"):
-        words = (tmp_path / f"{name}.ply", tmp_path / f"{name}_box.ply", "--crop", *box)
-        assert pop("convert", *words).status == 0
-    assert 0 < len(load_ply(tmp_path / "own_box.ply")["means"]) < len(own)
-    assert len(load_ply(tmp_path / "own_box.ply")["means"]) == len(load_ply(tmp_path / "t_box.ply")["means"])
+        pop.done("convert", f"{name}.ply", f"{name}_box.ply", "--crop", *box)
+    kept = load_ply("box.ply")["means"]
+    assert 0 < len(kept) < len(whole)
+    assert ((kept >= low - 1e-5) & (kept <= high + 1e-5)).all()
+    found = {len(kept), *(len(load_ply(f"{name}_box.ply")["means"]) for name in ("own", "t"))}
+    assert found == {int(((whole >= low) & (whole <= high)).all(1).sum())}
 
 
-def test_limits_are_applied_one_after_the_other_and_said(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
-    n = len(load_ply(shared_result / "ply" / "point_cloud_29.ply")["means"])
-    said = exported(
-        pop, shared_result, "--out", tmp_path / "x.ply", "--min-opacity", "0.0039", "--final-prune", "0.003",
-        "--max-gaussians", n // 2,
-    )  # fmt: skip
+def test_limits_are_applied_one_after_the_other_and_said(export: Said, own: Path) -> None:
+    n = len(load_ply(own)["means"])
+    limits = ("--min-opacity", "0.0039", "--final-prune", "0.003", "--max-gaussians", n // 2)
+    said = export("--out", "x.ply", *limits)
     assert f"opacity >= 0.0039: {n:,} of {n:,} Gaussians kept" in said
     assert "all but 0.30% of the blending weights: " in said
     assert f"highest sensitivity: {n // 2:,} of" in said
-    assert len(load_ply(tmp_path / "x.ply")["means"]) == n // 2
+    assert len(load_ply("x.ply")["means"]) == n // 2
 
 
-def test_a_box_is_in_the_frame_of_the_capture(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
-    exported(pop, shared_result, "--out", tmp_path / "whole.ply")
-    whole = load_ply(tmp_path / "whole.ply")["means"]
-    low, high = whole.quantile(0.2, dim=0), whole.quantile(0.9, dim=0)
-    box = [f"{value:.6f}" for value in (*low.tolist(), *high.tolist())]
-    low, high = torch.tensor([float(value) for value in box]).split(3)
-    exported(pop, shared_result, "--out", tmp_path / "box.ply", "--crop", *box)
-    kept = load_ply(tmp_path / "box.ply")["means"]
-    assert 0 < len(kept) < len(whole)
-    assert ((kept >= low - 1e-5) & (kept <= high + 1e-5)).all()
-    assert len(kept) == int(((whole >= low) & (whole <= high)).all(1).sum())
-
-
-@pytest.mark.parametrize("share", [0.6, 0.4])
-@pytest.mark.parametrize("name", typing.get_args(FormatName))
-def test_a_size_is_met_in_every_format_and_the_file_shows_what_was_told(
-    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str,
-    share: float,
-) -> None:  # fmt: skip
-    monkeypatch.chdir(tmp_path)
-    exported(pop, shared_result, "--to", name)
-    (file,) = tmp_path.iterdir()
-    # most of a tiny page is its script
-    whole, script = file.stat().st_size, 27_000 if name == "html" else 0
-    most = script + int(share * (whole - script))
-    budget = ("--target-mb", f"{most / 1e6:.6f}", "--fine-tune-steps", "8")
-    said = exported(pop, shared_result, "--to", name, "--overwrite", *budget)
-    assert file.stat().st_size <= most
-    # with fewer bands all of them may fit, and nothing is left to spend on
-    assert file.stat().st_size > 0.7 * most or " 461 of 461 Gaussians" in said
-    told = re.search(r"PSNR of the file in 1 held-out views: ([0-9.]+) dB", said)
-    assert told is not None, said
-    if name != "html":
-        assert f"{psnr(pop, tmp_path, file, '--capture', shared_capture):.2f}" == told[1]
-
-
-def test_scores_of_views_need_a_capture(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
-    exported(pop, shared_result, "--out", tmp_path / "a.ply")
-    said = exported(pop, tmp_path / "a.ply", "--out", tmp_path / "b.spz", "--max-gaussians", "20")
+def test_scores_of_views_need_a_capture(pop: Pop, export: Said) -> None:
+    export("--out", "a.ply")
+    said = pop.done("export", "a.ply", "--out", "b.spz", "--max-gaussians", "20").out
     assert "highest visibility: 20 of" in said
-    says(
-        pop("export", tmp_path / "a.ply", "--out", tmp_path / "c.spz", "--final-prune", "0.01"),
-        "contributions is summed over the training views; give --capture DIR",
-    )
+    needs = "contributions is summed over the training views; give --capture DIR"
+    says(pop("export", "a.ply", "--out", "c.spz", "--final-prune", "0.01"), needs)
+
+
+def test_a_conversion_writes_a_page_and_what_its_name_promises(pop: Pop, export: Said) -> None:
+    export("--out", "a.ply")
+    said = pop.done("convert", "a.ply", "b.html").out
+    assert f"Gaussians, {Path('b.html').stat().st_size / 1e6:.2f} MB -> b.html" in said
+    assert Path("b.html").read_text().startswith("<!doctype html>")
+    export("--out", "a.compressed.ply")
+    header = Path("a.compressed.ply").read_bytes().partition(b"end_header")[0]
+    assert b"packed_position" in header
+    assert b"f_dc_0" not in header
 
 
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        (("gone.ply", "b.spz"), "gone.ply: the PLY file is absent"),
-        (("gone.sog", "b.spz"), "gone.sog: the file is absent"),
-        (("a.ply", "b.obj"), "must end in one of"),
-        (("a.ply", "a.ply"), "is the splat that is read"),
-        (("a.ply", "there.spz"), "exists; pass --overwrite"),
-        (("a.ply", "b.html", "--to", "sog"), "a page ends in .html, and --to sog was asked for"),
-        (("a.ply", "b.ksplat"), "b.ksplat: is of a format that is read and not written"),
-        (("a.ply", "meta.json"), "meta.json: is of a format that is read and not written"),
-        (("t.ply", "b.spz", "--crop", "0", "0", "0", "1", "1", "1"), "t.ply: is in a training frame"),
-        (("a.ply", "b.spz", "--score", "dominance"), "needs the training views"),
-        (("empty.spz", "b.ply"), "empty.spz: is cut off in its header"),
-        (("empty.splat2", "b.ply"), "must end in one of"),
-        ((".", "b.ply"), "is a folder without SOG's meta.json; 'pop export' reads the folder of a training"),
+        ("gone.ply b.spz", "gone.ply: the PLY file is absent"),
+        ("gone.sog b.spz", "gone.sog: the file is absent"),
+        ("a.ply b.obj", "must end in one of"),
+        ("a.ply a.ply", "is the splat that is read"),
+        ("a.ply there.spz", "exists; pass --overwrite"),
+        ("a.ply b.html --to sog", "a page ends in .html, and --to sog was asked for"),
+        ("a.ply b.ksplat", "b.ksplat: is of a format that is read and not written"),
+        ("a.ply meta.json", "meta.json: is of a format that is read and not written"),
+        ("t.ply b.spz --crop 0 0 0 1 1 1", "t.ply: is in a training frame"),
+        ("a.ply b.spz --score dominance", "needs the training views"),
+        ("empty.spz b.ply", "empty.spz: is cut off in its header"),
+        ("empty.splat2 b.ply", "must end in one of"),
+        (". b.ply", "is a folder without SOG's meta.json; 'pop export' reads the folder of a training"),
     ],
 )
-def test_what_cannot_be_converted_is_said(
-    pop: Pop, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], part: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    exported(pop, shared_result, "--out", "a.ply")
+def test_what_cannot_be_converted_is_said(pop: Pop, export: Said, words: str, part: str) -> None:
+    export("--out", "a.ply")
     save_ply("t.ply", load_ply("a.ply"), frame=Frame("training"))
     for file in ("there.spz", "empty.spz"):
         Path(file).touch()
-    says(pop("convert", *words), part)
+    says(pop("convert", *words.split()), part)
     assert not Path("b.ply").exists()
 
 
-def test_sog_in_a_folder_and_ksplat_are_converted_and_drawn(
-    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path
-) -> None:
-    exported(pop, shared_result, "--out", tmp_path / "a.sog")
-    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
-        archive.extractall(tmp_path / "folder")
-    (tmp_path / "a.ksplat").write_bytes(ksplat_of(load_splat_file(tmp_path / "a.sog").params, 0))
-    of_sog = psnr(pop, tmp_path, tmp_path / "a.sog", "--capture", shared_capture)
+def test_sog_folders_and_ksplat_are_converted(pop: Pop, export: Said, psnr: Psnr) -> None:
+    export("--out", "a.sog")
+    with zipfile.ZipFile("a.sog") as archive:
+        archive.extractall("folder")
+    params = load_splat_file(Path("a.sog")).params
+    Path("a.ksplat").write_bytes(ksplat_of(params, 0))
+    of_sog = psnr("a.sog")
     for source in ("folder", "folder/meta.json", "a.ksplat"):
-        out = tmp_path / f"{source.replace('/', '_')}.ply"
-        pop.done("convert", tmp_path / source, out)
-        for file in (tmp_path / source, out):
-            assert abs(psnr(pop, tmp_path, file, "--capture", shared_capture) - of_sog) < 0.01, file
+        out = f"{source.replace('/', '_')}.ply"
+        pop.done("convert", source, out)
+        for file in (source, out):
+            # KSPLAT has no room for the frame, which is the capture's here
+            told = ["--own-frame"] if "ksplat" in file else []
+            assert abs(psnr(file, *told) - of_sog) < 0.01, file
 
 
-# Fewer Gaussians in a file: which go, and how far down a size is met.
+# A PLY says which world it is in, so that what is exported measures as what was trained, without being told.
 
 
-def test_opacity_is_compared_activated() -> None:
-    params = many(4)
-    params["opacities"] = torch.logit(torch.tensor([0.1, 0.5, 0.049, 0.999]))
-    assert shrink.opaque_enough(params, 0.05).tolist() == [True, True, False, True]
-    assert shrink.opaque_enough(params, 0.0).all()
+def test_an_export_measures_as_its_run_moved_into_the_other_frame_and_back(
+    pop: Pop, export: Said, psnr: Psnr, own: Path, shared_result: Path, trained: Any
+) -> None:
+    record = json.loads((shared_result / "capture.json").read_text())
+    found = frame_of(own)
+    assert found.name == "training"
+    np.testing.assert_array_equal(np.array(found.transform), np.array(record["world_transform"]))
+    # the training frame keeps every bit
+    export("--out", "t.ply", *TRAINING)
+    assert Path("t.ply").read_bytes() == own.read_bytes()
+    export("--out", "s.ply", "--frame", "capture")
+    for way in ("training", "capture", "training"):
+        pop.done("export", "s.ply", "--out", "t.ply", "--frame", way, "--overwrite")
+        found = frame_of(Path("t.ply"))
+        assert found.name == way
+        assert psnr("t.ply") == trained
+        shutil.copy("t.ply", "s.ply")
 
 
-def test_a_box_keeps_what_lies_in_it_or_on_its_faces() -> None:
-    means = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [1.5, 0.0, 0.0], [0.5, 0.5, -0.25]])
-    assert shrink.inside(means, (0, 0, 0, 1, 1, 1)).tolist() == [True, True, False, False]
-    with pytest.raises(PopError, match="every lower bound must be under"):
-        shrink.inside(means, (0, 0, 1, 1, 1, 0))
+def test_a_ply_that_says_nothing_is_taken_to_be_in_the_capture_s_frame_with_a_note(
+    pop: Pop, export: Said, psnr: Psnr, shared_capture: Path, trained: Any
+) -> None:
+    export("--out", "o.ply")
+    save_ply("s.ply", load_ply("o.ply"))
+    outcome = pop.done("eval", "s.ply", "--capture", shared_capture, "--json", "e.json")
+    assert json.loads(Path("e.json").read_text())["psnr"] == trained
+    assert "s.ply: says nothing of its world, and is taken to be in the capture's own" in outcome.err
+    assert "--training-frame" in outcome.err
+    # an explicit frame brings no note
+    psnr("s.ply", "--own-frame")
+    # what is not known is not made up
+    pop.done("export", "s.ply", "--out", "t.ply")
+    assert frame_of(Path("t.ply")) is None
 
 
-@given(scores=st.lists(st.integers(0, 5), max_size=20), count=st.integers(0, 25))
-def test_the_best_are_those_that_none_left_out_exceeds(scores: list[int], count: int) -> None:
-    values = torch.tensor(scores, dtype=torch.float64)
-    kept = shrink.best(values, count)
-    assert int(kept.sum()) == min(count, len(scores))
-    if kept.any() and not kept.all():
-        assert values[kept].min() >= values[~kept].max()
+def test_a_ply_of_a_trainer_that_moves_the_world_is_read_as_the_command_says(
+    pop: Pop, psnr: Psnr, shared_capture: Path, own: Path, trained: Any
+) -> None:
+    save_ply("s.ply", load_ply(own))
+    about = ("--capture", shared_capture, "--training-frame")
+    assert psnr("s.ply", "--training-frame") == trained
+    pop.done("export", "s.ply", "--out", "t.ply", *about, "--frame", "capture")
+    assert psnr("t.ply") == trained
+    says(pop("eval", "s.ply", *about, "--own-frame"), "--own-frame and --training-frame exclude each other")
 
 
-@given(
-    scores=st.lists(st.floats(0.0, 10.0, width=32), min_size=1, max_size=40),
-    each=st.integers(1, 9),
-    most=st.integers(0, 400),
+def test_another_capture_than_the_one_trained_on_is_refused(pop: Pop, own: Path, capture: Path) -> None:
+    (capture / "images" / "view_003.png").unlink()
+    shutil.copy(own, "s.ply")
+    says(pop("eval", "s.ply", "--capture", capture, "--missing", "skip"), "normalizes otherwise than toy")
+
+
+@pytest.mark.parametrize(
+    "words", ["", "world", "capture 1 2", "training nan" + 15 * " 0", "training " + 16 * "x ", "training" + 16 * " 1"]
 )
-def test_a_size_is_kept_and_used(scores: list[float], each: int, most: int) -> None:
-    values = torch.tensor(scores, dtype=torch.float64)
-    sizes: list[int] = []
-
-    def size_of(kept: torch.Tensor) -> int:
-        sizes.append(7 + each * int(kept.sum()))
-        return sizes[-1]
-
-    if most < 7:
-        with pytest.raises(PopError, match="a file without any Gaussian has 7 bytes"):
-            shrink.best_within(values, most, size_of)
-        return
-    kept = shrink.best_within(values, most, size_of)
-    size = 7 + each * int(kept.sum())
-    assert size <= most
-    assert kept.all() or size + each > most or size >= 0.98 * most
-    assert len(sizes) <= 14
+def test_a_damaged_comment_is_named(words: str) -> None:
+    save_ply("a.ply", many(3), frame=Frame("capture"))
+    data = Path("a.ply").read_bytes()
+    Path("a.ply").write_bytes(data.replace(b"pop-frame: capture", f"pop-frame: {words}".encode()))
+    assert_one_line(lambda: frame_of(Path("a.ply")), "a.ply", "pop-frame:", "damaged")
 
 
-def test_the_least_that_make_up_a_share_go_and_so_do_the_unseen() -> None:
-    scores = torch.tensor([0.0, 1.0, 100.0, 2.0, 897.0])
-    assert shrink.all_but_the_least(scores, 0.0).tolist() == [False, True, True, True, True]
-    assert shrink.all_but_the_least(scores, 0.002).tolist() == [False, False, True, False, True]
+# Every file that `pop` writes shows in `pop eval`, `render` and `compare` what the run showed that it is of.
+
+# dB that a format may lose of the tiny run, by what the table of formats states; the wrong frame loses ten
+LOSES = {"ply": 0.01, "gltf": 0.01, "compressed-ply": 0.2} | dict.fromkeys(
+    ("spz", "spz-4", "sog", "splat", "gltf-spz"), 0.1
+)
 
 
-@pytest.mark.parametrize("score", ["contributions", "dominance", "sensitivity"])
-def test_what_no_view_shows_scores_nothing(score: shrink.Score) -> None:
-    capture = tiny_capture()
-    views = [ViewTensors.of(view) for view in capture.views]
-    params = many(30, 0)
-    params["means"][:10] = torch.tensor([1e4, 1e4, 1e4])
-    found = shrink.view_scores(score, Passes("fast", views), params, 0)
-    assert (found[:10] == 0.0).all()
-    assert (found[10:] > 0.0).any()
-    assert (found >= 0.0).all()
+@pytest.fixture(scope="module")
+def turned(shared_capture: Path, made_once: Callable[..., Path]) -> Path:
+    """The tiny capture in another world."""
+
+    def make(folder: Path) -> None:
+        sparse = Path(shutil.copytree(shared_capture, folder / "toy")) / "sparse" / "0"
+        model = pycolmap.Reconstruction(sparse)
+        rotation = pycolmap.Rotation3d(Rotation.from_rotvec([1.1, -0.7, 2.0]).as_matrix())
+        model.transform(pycolmap.Sim3d(3.5, rotation, np.array([40.0, -25.0, 60.0])))
+        model.write(sparse)
+
+    return made_once("turned", make) / "toy"
 
 
-def test_without_a_view_larger_and_more_opaque_is_more_visible() -> None:
-    params = many(3)
-    params["scales"] = torch.tensor([[-2.0, -2.0, -9.0], [-3.0, -3.0, -9.0], [-2.0, -2.0, -9.0]])
-    params["opacities"] = torch.tensor([0.0, 0.0, -4.0])
-    assert shrink.visibility(params).argsort(descending=True).tolist()[0] == 0
+@pytest.fixture(scope="module")
+def run(turned: Path, made_once: Callable[..., Path]) -> Path:
+    """A result on it, which tests only read."""
+
+    def make(folder: Path) -> None:
+        words = ("--out", str(folder / "toy_pop"), *TRAIN, "--steps-scaler", "0.01", "--export", "splat", "sog")
+        assert main(["train", str(turned), *words]) == 0
+
+    folder = made_once("run", make) / "toy_pop"
+    # the two frames have nothing in common
+    transform = np.array(json.loads((folder / "capture.json").read_text())["world_transform"])
+    scale = np.cbrt(np.linalg.det(transform[:3, :3]))
+    assert scale < 0.5
+    assert np.linalg.norm(transform[:3, 3]) > 1.0
+    assert Rotation.from_matrix(transform[:3, :3] / scale).magnitude() > 0.5
+    return folder
+
+
+def stats(run: Path) -> dict[str, Any]:
+    """What the run states: its PSNR, and under "encodings" that of every format."""
+    path = max((run / "stats").glob("val_step*.json"))
+    return json.loads(path.read_text())
+
+
+def assert_shows_the_same(pop: Pop, file: Path, turned: Path, run: Path, name: str, *words: str) -> None:
+    """Hold `eval`, `render` and `compare` of a file to the PSNR of its run."""
+    own, about = stats(run)["psnr"], ("--capture", turned, *words)
+    outcome = pop.done("eval", file, *about, "--json", "e.json")
+    assert ("says nothing of its world" in outcome.err) == (name == "splat" and not words)
+    measured = json.loads(Path("e.json").read_text())["psnr"]
+    assert measured == pytest.approx(own, abs=LOSES[name])
+    pop.done("render", file, *about, "--out", "views", "--overwrite")
+    listing = json.loads(Path("views/renders.json").read_text())["renders"]
+    psnrs = [shown_psnr(Path("views", entry["file"]), turned / "images" / entry["view"]) for entry in listing]
+    # pictures are rounded to bytes
+    assert float(np.mean(psnrs)) == pytest.approx(measured, abs=0.02)
+    outcome = pop.done("compare", run, file, *about, "--markdown")
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in outcome.out.splitlines()]
+    column = rows[0].index("PSNR")
+    assert [row[column] for row in rows[2:]] == [f"{own:.2f}", f"{measured:.2f}"]
+    assert rows[3][rows[0].index("method")] == file.name
+
+
+def shown_psnr(render: Path, photograph: Path) -> float:
+    a, b = (cv2.imread(str(path)).astype(np.float64) / 255.0 for path in (render, photograph))
+    return float(-10.0 * np.log10(((a - b) ** 2).mean()))
+
+
+@pytest.mark.parametrize("frame", [(), TRAINING], ids=["capture", "training"])
+@pytest.mark.parametrize("name", format_names())
+def test_an_export_shows_what_was_trained(pop: Pop, turned: Path, run: Path, name: str, frame: tuple[str, ...]) -> None:
+    outcome = pop.done("export", run, "--to", name, *frame)
+    (file,) = Path().iterdir()
+    # a format without room for the frame says what the commands that read it have to be told
+    lost = name == "splat" and bool(frame)
+    assert ("--training-frame" in outcome.err) == lost
+    assert_shows_the_same(pop, file, turned, run, name, *(["--training-frame"] if lost else []))
+
+
+@pytest.mark.parametrize("name", format_names())
+def test_a_conversion_shows_what_was_trained(pop: Pop, turned: Path, run: Path, name: str) -> None:
+    pop.done("export", run, "--out", "a.ply")
+    pop.done("convert", "a.ply", default_name("b", name), "--to", name)
+    assert_shows_the_same(pop, Path(default_name("b", name)), turned, run, name)
+
+
+@pytest.mark.parametrize("name", ["splat", "sog"])
+def test_what_a_training_exports_shows_what_the_training_stated(pop: Pop, run: Path, name: str) -> None:
+    # in the result's folder it has a run, which is in another frame
+    pop.done("eval", run / "export" / f"toy_pop.{name}", "--json", "e.json")
+    measured = json.loads(Path("e.json").read_text())["psnr"]
+    (stated,) = (entry["psnr"] for entry in stats(run)["encodings"] if entry["format"] == name)
+    assert measured == pytest.approx(stated, abs=1e-3)
+    assert measured == pytest.approx(stats(run)["psnr"], abs=LOSES[name])

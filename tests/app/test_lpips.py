@@ -12,37 +12,30 @@ from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun
 from pop_fast.train.evaluate import average, measure
 from pop_fast.train.lpips import LPIPS, load_nets
+from tests.app.captures import assert_one_line
 from tests.app.tiny import tiny_capture, tiny_config
 
-# the networks as torchvision lays them out: convolutions (index: in, out, kernel, stride, padding), pools by index
-VGG_WIDTHS = [64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512, "M"]
+# the networks as torchvision lays them out: of a convolution its width, kernel, stride and padding, and "M", a pool
+VGG = [*[(64, 3, 1, 1)] * 2, "M", *[(128, 3, 1, 1)] * 2, "M", *[(256, 3, 1, 1)] * 3, "M"]
+VGG += [*[(512, 3, 1, 1)] * 3, "M"] * 2
+ALEX = [(64, 11, 4, 2), "M", (192, 5, 1, 2), "M", (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1), "M"]
+# with the last layer of each slice whose output is compared, and the widths there
+NETS = {
+    "vgg": (VGG, 2, (3, 8, 15, 22, 29), (64, 128, 256, 512, 512)),
+    "alex": (ALEX, 3, (1, 4, 7, 9, 11), (64, 192, 384, 256, 256)),
+}
 
 
-def vgg_features():
+def made(layout, pool):
     layers: list[nn.Module] = []
-    width = 3
-    for entry in VGG_WIDTHS:
+    before = 3
+    for entry in layout:
         if entry == "M":
-            layers.append(nn.MaxPool2d(2, 2))
+            layers.append(nn.MaxPool2d(pool, 2))
         else:
-            layers += [nn.Conv2d(width, entry, 3, padding=1), nn.ReLU()]
-            width = entry
-    return nn.Sequential(*layers)
-
-
-def alex_features():
-    return nn.Sequential(
-        *(nn.Conv2d(3, 64, 11, 4, 2), nn.ReLU(), nn.MaxPool2d(3, 2)),
-        *(nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)),
-        *(nn.Conv2d(192, 384, 3, padding=1), nn.ReLU()),
-        *(nn.Conv2d(384, 256, 3, padding=1), nn.ReLU()),
-        *(nn.Conv2d(256, 256, 3, padding=1), nn.ReLU(), nn.MaxPool2d(3, 2)),
-    )
-
-
-# the last layer of each slice whose output is compared
-TAPS = {"vgg": (3, 8, 15, 22, 29), "alex": (1, 4, 7, 9, 11)}
-FEATURES = {"vgg": vgg_features, "alex": alex_features}
+            layers += [nn.Conv2d(before, *entry), nn.ReLU()]
+            before = entry[0]
+    return nn.Sequential(*layers).eval()
 
 
 @pytest.fixture(scope="module")
@@ -50,18 +43,12 @@ def weights(tmp_path_factory):
     """For each net: the features module, the linear weights, and its files."""
     folder = tmp_path_factory.mktemp("weights")
     found = {}
-    for net in ("vgg", "alex"):
+    for net, (layout, pool, _, widths) in NETS.items():
         torch.manual_seed(5)
-        features = FEATURES[net]().eval()
+        features = made(layout, pool)
         backbone = {f"features.{key}": value for key, value in features.state_dict().items()}
         backbone["classifier.6.weight"] = torch.zeros(2, 2)
-        convs = [layer for layer in features if isinstance(layer, nn.Conv2d)]
-        widths = [
-            next(l.out_channels for l in reversed(features[: tap + 1]) if hasattr(l, "out_channels"))
-            for tap in TAPS[net]
-        ]
         lins = {f"lin{i}.model.1.weight": torch.rand(1, width, 1, 1) for i, width in enumerate(widths)}
-        assert len(convs) >= len(widths)
         paths = [folder / f"{net}_backbone.pth", folder / f"{net}_lin.pth", folder / f"{net}_merged.pth"]
         for path, content in zip(paths, (backbone, lins, {**backbone, **lins}), strict=True):
             torch.save(content, path)
@@ -94,34 +81,25 @@ def by_the_book(features, lins, taps, image, target, rescaled):
 def test_each_variant_follows_the_definition(weights, net, variant):
     features, lins, paths = weights[net]
     got = LPIPS(net, paths[2:])(*pictures(), variant)
-    want = by_the_book(features, lins, TAPS[net], *pictures(), variant.endswith("norm"))
+    want = by_the_book(features, lins, NETS[net][2], *pictures(), variant.endswith("norm"))
     assert got == pytest.approx(want, rel=1e-4)
     assert got > 0.0
 
 
-def test_equal_pictures_are_at_distance_zero(weights):
-    image, _ = pictures()
-    assert LPIPS("alex", weights["alex"][2][2:])(image, image, "alex_norm") == 0.0
-
-
-def test_two_files_in_any_order_equal_one_merged_file(weights):
+def test_two_files_in_any_order_and_the_lpips_packages_own_equal_one_merged_file(weights, tmp_path):
     paths = weights["alex"][2]
-    values = [LPIPS("alex", files)(*pictures(), "alex_01") for files in (paths[:2], paths[1::-1], paths[2:])]
-    assert values[0] == values[1] == values[2]
-
-
-def test_the_lpips_packages_own_state_dict_is_read(weights, tmp_path):
-    backbone = torch.load(weights["alex"][2][0], weights_only=True)
     slices = {0: 1, 3: 2, 6: 3, 8: 4, 10: 5}
-    renamed = {}
-    for key, value in backbone.items():
+    package = torch.load(paths[1], weights_only=True) | {"scaling_layer.shift": torch.zeros(3)}
+    for key, value in torch.load(paths[0], weights_only=True).items():
         if key.startswith("features."):
             index, kind = key.split(".")[1:]
-            renamed[f"net.slice{slices[int(index)]}.{index}.{kind}"] = value
-    renamed |= torch.load(weights["alex"][2][1], weights_only=True)
-    torch.save({**renamed, "scaling_layer.shift": torch.zeros(3)}, tmp_path / "package.pth")
-    ours, want = LPIPS("alex", [tmp_path / "package.pth"]), LPIPS("alex", weights["alex"][2][2:])
-    assert ours(*pictures(), "alex_norm") == want(*pictures(), "alex_norm")
+            package[f"net.slice{slices[int(index)]}.{index}.{kind}"] = value
+    torch.save(package, tmp_path / "package.pth")
+    merged = LPIPS("alex", paths[2:])
+    for files in (paths[:2], paths[1::-1], [tmp_path / "package.pth"]):
+        assert LPIPS("alex", files)(*pictures(), "alex_norm") == merged(*pictures(), "alex_norm")
+    image, _ = pictures()
+    assert merged(image, image, "alex_norm") == 0.0
 
 
 def test_hashes_of_the_weight_files_are_reported_with_every_variant(weights):
@@ -135,26 +113,18 @@ def test_hashes_of_the_weight_files_are_reported_with_every_variant(weights):
     assert len(means["lpips_weights_sha256"]) == 3
     for name, value in means["lpips_weights_sha256"].items():
         assert value == hashlib.sha256(files[name].read_bytes()).hexdigest()
-
-
-def test_vgg_alone_is_reported_as_vgg(weights):
     nets = load_nets(vgg=weights["vgg"][2][2:])
     assert average([measure(*pictures(), nets=nets)], nets)["lpips_net"] == "vgg_01"
 
 
-def test_a_variant_of_the_other_net_is_refused(weights):
-    with pytest.raises(ValueError, match="alex computes alex_norm, alex_01"):
-        LPIPS("alex", weights["alex"][2][2:])(*pictures(), "vgg_01")
-
-
-def test_pictures_too_small_for_the_nets_are_refused(weights):
+def test_a_variant_of_the_other_net_and_pictures_too_small_for_the_nets_are_refused(weights, tmp_path):
     net = LPIPS("alex", weights["alex"][2][2:])
+    with pytest.raises(ValueError, match="alex computes alex_norm, alex_01"):
+        net(*pictures(), "vgg_01")
     with pytest.raises(PopError, match="images of 66 x 63 px are too small for LPIPS, which needs 64 px a side"):
         net(*pictures(63), "alex_01")
     assert net(*pictures(64), "alex_01") > 0.0
-
-
-def test_views_too_small_for_lpips_are_refused_before_training(weights, tmp_path):
+    # before training
     config = tiny_config(tmp_path, lpips_alex=tuple(map(str, weights["alex"][2][2:])))
     with pytest.raises(PopError, match="32 x 24 px are too small for LPIPS"):
         TrainingRun(config, tiny_capture())
@@ -162,17 +132,14 @@ def test_views_too_small_for_lpips_are_refused_before_training(weights, tmp_path
 
 def test_bad_weight_files_are_named(weights, tmp_path):
     backbone, lins, merged = weights["alex"][2]
-    with pytest.raises(PopError, match="no such file"):
-        LPIPS("alex", [tmp_path / "absent.pth"])
     (tmp_path / "text.pth").write_text("hello")
-    with pytest.raises(PopError, match=r"text\.pth: cannot be read"):
-        LPIPS("alex", [tmp_path / "text.pth"])
     torch.save([1], tmp_path / "list.pth")
-    with pytest.raises(PopError, match="holds list"):
-        LPIPS("alex", [tmp_path / "list.pth"])
-    with pytest.raises(PopError, match=r"has no lin0\.model\.1\.weight; give the backbone and"):
-        LPIPS("alex", [backbone])
-    with pytest.raises(PopError, match=r"has no features\.0\.weight"):
-        LPIPS("alex", [lins])
-    with pytest.raises(PopError, match=r"features\.0\.weight has shape \[64, 3, 11, 11\]; it must be \[64, 3, 3, 3\]"):
-        LPIPS("vgg", [merged])
+    for net, path, told in (
+        ("alex", tmp_path / "absent.pth", "no such file"),
+        ("alex", tmp_path / "text.pth", "text.pth: cannot be read"),
+        ("alex", tmp_path / "list.pth", "holds list"),
+        ("alex", backbone, "has no lin0.model.1.weight; give the backbone and"),
+        ("alex", lins, "has no features.0.weight"),
+        ("vgg", merged, "features.0.weight has shape [64, 3, 11, 11]; it must be [64, 3, 3, 3]"),
+    ):
+        assert_one_line(lambda net=net, path=path: LPIPS(net, [path]), told)

@@ -1,13 +1,16 @@
-"""Photographs and masks as they come: damaged, rotated, transparent, gray, of sixteen bit."""
+"""Photographs as they come: files of every kind, damaged, turned and transparent, bare folders of them, and videos."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import shutil
 import struct
+import time
 import tracemalloc
-import zlib
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,40 +20,43 @@ from hypothesis import strategies as st
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from pop_fast.data import Capture, load_capture, run_sfm, sfm
+from pop_fast.cli import main
+from pop_fast.data import load_capture, run_sfm, sfm
+from pop_fast.data.capture import View
+from pop_fast.data.photo_quality import sharpness
 from pop_fast.data.read_images import _upright, shrink_bicubic
-from pop_fast.errors import CaptureError
+from pop_fast.data.sfm import pairs_of
+from pop_fast.data.unpack import take_frames
+from pop_fast.demo.make import render_view
+from pop_fast.demo.scene import make_scene
+from pop_fast.errors import CaptureError, PopError
 from pop_fast.io import images
 from pop_fast.io.image_header import Exif, can_read_heif, read_exif, read_size, size_of
 from pop_fast.io.images import list_images, read_image, sound_jpegs
+from pop_fast.view.paths import VideoFile
 from tests.app.captures import (
     HEIGHT,
     WIDTH,
     assert_one_line,
     camera,
     colmap_capture,
+    look_at,
+    make_model,
     photograph,
+    png_of_zeros,
+    raw,
+    ring,
     transforms_capture,
     write_photograph,
 )
-from tests.app.conftest import Pop
+from tests.app.conftest import TRAIN, Pop
+from tests.app.damage import contents, says
 
 
-def raw(root: Path, **options) -> Capture:
-    """Load in the capture's own frame."""
-    return load_capture(root, normalize=False, **options)
-
-
-def test_exif_orientation_is_ignored_as_colmap_ignores_it(tmp_path: Path) -> None:
-    root = colmap_capture(tmp_path, names=["a.jpg", "b.jpg"])
-    plain = raw(root).views[0].image
-    data = (root / "images" / "a.jpg").read_bytes()
-    rotate = b"Exif\0\0II*\0" + struct.pack("<IHHHIII", 8, 1, 0x0112, 3, 1, 6, 0)
-    (root / "images" / "a.jpg").write_bytes(
-        data[:2] + b"\xff\xe1" + struct.pack(">H", len(rotate) + 2) + rotate + data[2:]
-    )
-    assert cv2.imread(str(root / "images" / "a.jpg")).shape[:2] == (WIDTH, HEIGHT)
-    assert np.array_equal(raw(root).views[0].image, plain)
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A capture of four photographs that a test may change."""
+    return colmap_capture(tmp_path / "scene")
 
 
 @pytest.mark.parametrize("name", ["01.png", "01.PNG.png", "01.jpg"])
@@ -61,17 +67,14 @@ def test_masks_are_found_under_all_usual_names_and_white_means_keep(tmp_path: Pa
     write_photograph(root / "masks" / name, mask)
     first, second = raw(root).views
     assert first.mask is None
-    assert second.mask is not None
     assert second.mask.dtype == bool
     assert np.array_equal(second.mask, mask > 0)
     assert raw(root, masks=False).views[1].mask is None
     small = raw(root, factor=2).views[1].mask
-    assert small is not None
     assert np.array_equal(small, mask[::2, ::2] > 0)
 
 
-def test_masks_that_fit_no_photograph_or_hide_all_of_it_are_refused(tmp_path: Path) -> None:
-    root = colmap_capture(tmp_path)
+def test_masks_that_fit_no_photograph_or_hide_all_of_it_are_refused(root: Path) -> None:
     write_photograph(root / "masks" / "elsewhere.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
     assert_one_line(lambda: raw(root), "masks", "no mask named as a photograph")
     write_photograph(root / "masks" / "02.png", np.zeros((HEIGHT, WIDTH), np.uint8))
@@ -80,8 +83,7 @@ def test_masks_that_fit_no_photograph_or_hide_all_of_it_are_refused(tmp_path: Pa
     assert_one_line(lambda: raw(root), "02.png", "the mask is 30x40", "40x30")
 
 
-def test_transparency_is_composited_over_the_background_and_is_no_mask(tmp_path: Path) -> None:
-    root = colmap_capture(tmp_path)
+def test_transparency_is_composited_over_the_background_and_is_no_mask(root: Path) -> None:
     rgba = photograph(5, channels=4)
     write_photograph(root / "images" / "00.png", rgba)
     alpha = rgba[:, :, 3:] / 255.0
@@ -107,8 +109,7 @@ def test_transparency_is_undistorted_shrunk_and_turned_with_its_photograph(tmp_p
     np.testing.assert_array_equal(turned.image[:, :, 0], turned.alpha)
 
 
-def test_gray_and_sixteen_bit_photographs_become_eight_bit_rgb(tmp_path: Path) -> None:
-    root = colmap_capture(tmp_path)
+def test_gray_and_sixteen_bit_photographs_become_eight_bit_rgb(root: Path) -> None:
     gray = photograph(5)[:, :, 0]
     write_photograph(root / "images" / "00.png", gray)
     write_photograph(root / "images" / "01.png", gray.astype(np.uint16) * 257)
@@ -116,25 +117,12 @@ def test_gray_and_sixteen_bit_photographs_become_eight_bit_rgb(tmp_path: Path) -
         assert np.array_equal(view.image, np.repeat(gray[:, :, None], 3, axis=2))
 
 
-def encoded(extension: str) -> bytes:
-    return cv2.imencode(extension, photograph(3, 64, 48))[1].tobytes()
+def encoded(extension: str, *options: int) -> bytes:
+    return cv2.imencode(extension, photograph(3, 64, 48), options)[1].tobytes()
 
 
-PROGRESSIVE = cv2.imencode(".jpg", photograph(3, 64, 48), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
-WHOLE = {
-    "png": encoded(".png"),
-    "jpg": encoded(".jpg"),
-    "progressive.jpg": PROGRESSIVE,
-    "webp": encoded(".webp"),
-    "bmp": encoded(".bmp"),
-    "tiff": encoded(".tiff"),
-}
-
-
-@pytest.mark.parametrize("name", WHOLE)
-def test_a_whole_photograph_is_read(tmp_path: Path, name: str) -> None:
-    (tmp_path / name).write_bytes(WHOLE[name])
-    assert read_image(tmp_path / name).shape == (48, 64, 3)
+WHOLE = {name: encoded(f".{name}") for name in ("png", "jpg", "webp", "bmp", "tiff")}
+WHOLE["progressive.jpg"] = encoded(".jpg", cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
 
 
 @pytest.mark.parametrize("name", WHOLE)
@@ -154,38 +142,33 @@ def test_a_png_with_any_byte_changed_is_named(at: int, flip: int, tmp_path_facto
     assert_one_line(lambda: read_image(path), str(path), "PNG")
 
 
-def test_a_jpeg_overwritten_in_the_middle_is_named(tmp_path: Path) -> None:
-    data = bytearray(WHOLE["jpg"])
-    scan = data.index(b"\xff\xda") + 20
-    data[scan : scan + 40] = b"\xff\x42" * 20
-    (tmp_path / "x.jpg").write_bytes(data)
-    assert_one_line(lambda: read_image(tmp_path / "x.jpg"), "x.jpg", "unexpected marker")
-
-
-@pytest.mark.parametrize("name", ["jpg", "progressive.jpg"])
-def test_what_cameras_append_to_a_jpeg_does_no_harm(tmp_path: Path, name: str) -> None:
-    (tmp_path / name).write_bytes(WHOLE[name])
-    plain = read_image(tmp_path / name)
-    (tmp_path / name).write_bytes(WHOLE[name] + bytes(100) + WHOLE["jpg"])
-    assert np.array_equal(read_image(tmp_path / name), plain)
+def test_reading_whole_and_bad_photographs_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    for name, data in WHOLE.items():
+        path = tmp_path / name
+        path.write_bytes(data)
+        plain = read_image(path)
+        assert plain.shape == (48, 64, 3)
+        if name.endswith("jpg"):
+            # what cameras append to a JPEG does no harm
+            path.write_bytes(data + bytes(100) + WHOLE["jpg"])
+            assert np.array_equal(read_image(path), plain)
+        path.write_bytes(data[: len(data) // 2])
+        assert_one_line(lambda path=path: read_image(path))
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize(
-    ("content", "word"), [(b"", "empty"), (b"no picture at all", "is no image"), (b"\xff\xd8\xff", "truncated")]
+    ("content", "word"),
+    [
+        (b"", "empty"),
+        (b"no picture at all", "is no image"),
+        (b"P5 2 2 255\n" + bytes(4), "is no image that states its size"),
+        (b"\xff\xd8\xff", "truncated"),
+    ],
 )
-def test_what_is_no_photograph_is_named_by_the_capture_too(tmp_path: Path, content: bytes, word: str) -> None:
-    root = colmap_capture(tmp_path)
+def test_what_is_no_photograph_is_named_by_the_capture_too(root: Path, content: bytes, word: str) -> None:
     (root / "images" / "02.png").write_bytes(content)
     assert_one_line(lambda: load_capture(root), str(root / "images" / "02.png"), word, "copy it again")
-
-
-def test_reading_bad_photographs_prints_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    for name, data in WHOLE.items():
-        (tmp_path / name).write_bytes(data[: len(data) // 2])
-        assert_one_line(lambda path=tmp_path / name: read_image(path))
-    out, err = capfd.readouterr()
-    assert out == ""
-    assert err == ""
 
 
 # What a file's header says, held against what another library writes; and headers that promise too much.
@@ -199,29 +182,21 @@ def save(path: Path, orientation: int | None = None) -> Path:
         exif[0x10F], exif[0x110], exif[0x112] = "Maker", "Maker X", orientation
         if path.suffix != ".tif":  # Pillow copies the directory of the exposure into no TIFF
             exif[0x8769] = {0x829A: IFDRational(1, 125), 0x8827: 400, 0x920A: IFDRational(17, 4), 0xA405: 26}
-    picture = Image.fromarray(photograph(0, 61, 37))
-    picture.save(path, exif=exif, lossless=True) if "lossless" in path.name else picture.save(path, exif=exif)
+    lossless = {"lossless": True} if "lossless" in path.name else {}
+    Image.fromarray(photograph(0, 61, 37)).save(path, exif=exif, **lossless)
     return path
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_the_size_is_read_of_every_format(tmp_path: Path, name: str) -> None:
-    assert read_size(save(tmp_path / name)) == (61, 37)
-
-
-@pytest.mark.parametrize("name", [name for name in FORMATS if not name.endswith("bmp")])
-@pytest.mark.parametrize("orientation", range(1, 9))
-def test_exif_is_read_of_every_format_that_has_it(tmp_path: Path, name: str, orientation: int) -> None:
-    found = read_exif(save(tmp_path / name, orientation))
+def test_the_size_and_exif_are_read_of_every_format_and_any_damage_is_no_error(tmp_path: Path, name: str) -> None:
+    plain = save(tmp_path / name)
+    assert read_size(plain) == (61, 37)
+    assert read_exif(plain) == Exif()
     exposure = () if name.endswith("tif") else (0.008, 400.0, 4.25, 26.0)
-    assert found == Exif(orientation, "Maker X", *exposure)
-    assert read_exif(save(tmp_path / name)) == Exif()
-
-
-@pytest.mark.parametrize("name", FORMATS)
-def test_any_damage_is_no_error_and_no_absurd_answer(tmp_path: Path, name: str) -> None:
-    whole = save(tmp_path / name, 6).read_bytes()
-    random = np.random.default_rng(5)
+    for orientation in range(1, 9):
+        found = read_exif(save(tmp_path / name, orientation))
+        assert found == Exif(orientation, "Maker X", *exposure) or name.endswith("bmp")
+    whole, random = save(tmp_path / name, 6).read_bytes(), np.random.default_rng(5)
     for _ in range(300):
         data = bytearray(whole[: int(random.integers(0, len(whole)))])
         for at in random.integers(0, max(len(data), 1), 3 if data else 0):
@@ -232,25 +207,8 @@ def test_any_damage_is_no_error_and_no_absurd_answer(tmp_path: Path, name: str) 
         assert read_exif(tmp_path / "damaged").orientation in range(1, 9)
 
 
-def bomb(path: Path, side: int) -> Path:
-    """A PNG of a few kilobytes that decodes to side x side pixels."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    packer = zlib.compressobj(9)
-    row = bytes(1 + side // 8)
-    pixels = b"".join([*(packer.compress(row) for _ in range(side)), packer.flush()])
-    head = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0))
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", pixels) + chunk(b"IEND", b""))
-    return path
-
-
-def test_a_photograph_of_another_shape_is_refused_before_it_is_decoded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    root = colmap_capture(tmp_path)
-    bomb(root / "images" / "02.png", 8_000)
+def test_another_shape_is_refused_before_it_is_decoded(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    png_of_zeros(root / "images" / "02.png", 8_000)
     decoded: list[Path] = []
 
     def reading(path: Path) -> np.ndarray:
@@ -263,7 +221,7 @@ def test_a_photograph_of_another_shape_is_refused_before_it_is_decoded(
 
 
 def test_more_pixels_than_any_camera_has_are_refused(tmp_path: Path) -> None:
-    path = bomb(tmp_path / "a.png", 16_400)
+    path = png_of_zeros(tmp_path / "a.png", 16_400)
     tracemalloc.start()
     assert_one_line(lambda: read_image(path), "a.png", "16400x16400", "million pixels")
     assert tracemalloc.get_traced_memory()[1] < 2**24
@@ -285,76 +243,61 @@ def write_heic(path: Path, image: np.ndarray, exif: bytes | None = None) -> None
     file.save(path, quality=95, **({} if exif is None else {"exif": exif}))
 
 
-def test_without_pillow_heif_a_heic_photograph_is_one_line_that_says_what_to_install(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_not_read_is_named_with_the_way_to_convert_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(images, "can_read_heif", lambda: False)
-    (tmp_path / "a.heic").write_bytes(HEAD)
-    with pytest.raises(CaptureError, match=r"a\.heic: is HEIC, which needs pillow-heif: pip install pillow-heif"):
-        read_image(tmp_path / "a.heic")
+    (tmp_path / "a.HEIC").write_bytes(HEAD)
+    one = "a.HEIC: is HEIC, which needs pillow-heif: pip install pillow-heif"
+    assert_one_line(lambda: read_image(tmp_path / "a.HEIC"), one)
     assert list_images(tmp_path) == []
-    with pytest.raises(CaptureError, match="1 file is HEIC or the like, which is not read: pip install pillow-heif"):
-        load_capture(tmp_path)
+    one = "1 file is HEIC or the like, which is not read: pip install pillow-heif"
+    assert_one_line(lambda: load_capture(tmp_path), one)
+    for name in ("b.HEIC", "c.dng"):
+        (tmp_path / name).write_bytes(b"no JPEG")
+    words = ("3 files are HEIC", "pip install pillow-heif, or convert them to JPEG", "mogrify -format jpg *.HEIC")
+    assert_one_line(lambda: load_capture(tmp_path, sfm=True), "has no photographs", *words)
+    assert_one_line(lambda: run_sfm(tmp_path), "has 0 photograph(s)", *words)
 
 
 @needs_heif
 @pytest.mark.parametrize("channels", [3, 4])
-def test_a_heic_photograph_is_read_as_others_are(tmp_path: Path, channels: int) -> None:
-    image = photograph(3, 128, 96, channels)
-    write_heic(tmp_path / "a.HEIC", image)
-    found = read_image(tmp_path / "a.HEIC")
+def test_a_heic_photograph_is_read_as_others_are_and_a_damaged_one_named(tmp_path: Path, channels: int) -> None:
+    image, path = photograph(3, 128, 96, channels), tmp_path / "a.HEIC"
+    write_heic(path, image)
+    found = read_image(path)
     assert found.shape == image.shape
     assert np.abs(found.astype(int) - image).mean() < 3.0
-    assert [path.name for path in list_images(tmp_path)] == ["a.HEIC"]
-
-
-@needs_heif
-def test_a_damaged_heic_photograph_is_one_line(tmp_path: Path) -> None:
-    write_heic(tmp_path / "a.heic", photograph(3, 128, 96))
-    data = (tmp_path / "a.heic").read_bytes()
+    assert list_images(tmp_path) == [path]
+    data = path.read_bytes()
     for cut in (40, len(data) // 2):
-        (tmp_path / "a.heic").write_bytes(data[:cut])
-        with pytest.raises(CaptureError, match=r"a\.heic: the HEIC file is truncated or corrupt"):
-            read_image(tmp_path / "a.heic")
+        path.write_bytes(data[:cut])
+        assert_one_line(lambda: read_image(path), "a.HEIC: the HEIC file is truncated or corrupt")
 
 
 @needs_heif
 def test_the_tags_of_a_heic_are_read_and_its_orientation_is_not_obeyed_twice(tmp_path: Path) -> None:
-    # a TIFF block of three tags: maker, model, orientation 6
-    entries = [(0x10F, 2, 4, b"Abc\0"), (0x110, 2, 4, b"Xyz\0"), (0x112, 3, 1, b"\x06\0\0\0")]
-    body = b"".join(
-        tag.to_bytes(2, "little") + kind.to_bytes(2, "little") + count.to_bytes(4, "little") + value
-        for tag, kind, count, value in entries
-    )
-    tiff = b"II*\0\x08\0\0\0" + len(entries).to_bytes(2, "little") + body + bytes(4)
-    write_heic(tmp_path / "a.heic", photograph(3, 128, 96), b"Exif\0\0" + tiff)
+    exif = Image.Exif()
+    exif[0x10F], exif[0x110], exif[0x112] = "Abc", "Xyz", 6
+    write_heic(tmp_path / "a.heic", photograph(3, 128, 96), exif.tobytes())
     found = read_exif(tmp_path / "a.heic")
     assert (found.camera, found.orientation) == ("Abc Xyz", 1)
 
 
 @needs_heif
-def test_a_capture_whose_photographs_were_heic_loads_and_is_checked(
-    shared_capture: Path, tmp_path: Path, pop: Pop
-) -> None:
-    folder = Path(shutil.copytree(shared_capture, tmp_path / "toy"))
-    for path in sorted((folder / "images").glob("*.png")):
+def test_a_capture_of_heic_photographs_loads(shared_capture: Path, capture: Path, pop: Pop) -> None:
+    for path in sorted((capture / "images").glob("*.png")):
         write_heic(path.with_suffix(".heic"), read_image(path))
         path.unlink()
-    views = load_capture(folder, normalize=False).views
-    originals = load_capture(shared_capture, normalize=False).views
-    for ours, theirs in zip(views, originals, strict=True):
+    for ours, theirs in zip(raw(capture).views, raw(shared_capture).views, strict=True):
         np.testing.assert_array_equal(ours.viewmat, theirs.viewmat)
         assert np.abs(ours.image.astype(int) - theirs.image).mean() < 8.0
-    assert pop("data", "check", folder).status == 0
+    assert pop("data", "check", capture).status == 0
 
 
 @needs_heif
 def test_structure_from_motion_is_given_what_colmap_can_read(tmp_path: Path) -> None:
-    image = photograph(3, 128, 96)
-    (tmp_path / "photos").mkdir()
     (tmp_path / "work").mkdir()
-    write_heic(tmp_path / "photos" / "a.heic", image)
-    cv2.imwrite(str(tmp_path / "photos" / "b.png"), image)
+    write_photograph(tmp_path / "photos" / "b.png", photograph(3, 128, 96))
+    write_heic(tmp_path / "photos" / "a.heic", photograph(3, 128, 96))
     staged = sfm._stage(tmp_path / "photos", [Path("a.heic"), Path("b.png")], tmp_path / "work")
     assert staged == ["000000.png", "000001.png"]
     found = cv2.imread(str(tmp_path / "work" / "images" / staged[0]))
@@ -364,15 +307,18 @@ def test_structure_from_motion_is_given_what_colmap_can_read(tmp_path: Path) -> 
 # JPEG files with damaged coded pixels, which OpenCV decodes without an error.
 
 
-def jpeg(seed: int = 0, progressive: bool = False) -> bytes:
+def jpeg(seed: int = 0, progressive: bool = False, zeroed: float | None = None) -> bytes:
+    """A JPEG file, of which 400 bytes from a share of its length on may be zeros."""
     noise = np.random.default_rng(seed).integers(0, 256, (120, 160, 3), dtype=np.uint8)
     options = [cv2.IMWRITE_JPEG_PROGRESSIVE, int(progressive)]
-    return cv2.imencode(".jpg", cv2.GaussianBlur(noise, (0, 0), 1.0), options)[1].tobytes()
+    data = cv2.imencode(".jpg", cv2.GaussianBlur(noise, (0, 0), 1.0), options)[1].tobytes()
+    at = len(data) if zeroed is None else int(zeroed * len(data))
+    return data[:at] + bytes(len(data[at : at + 400])) + data[at + 400 :]
 
 
-def zeroed(data: bytes, share: float) -> bytes:
-    at = int(share * len(data))
-    return data[:at] + bytes(400) + data[at + 400 :]
+def check_jpegs(*files: Path) -> None:
+    with sound_jpegs(files):
+        pass
 
 
 @pytest.mark.parametrize("progressive", [False, True])
@@ -380,54 +326,43 @@ def zeroed(data: bytes, share: float) -> bytes:
 def test_zeros_in_the_middle_are_named_with_the_file(tmp_path: Path, share: float, progressive: bool) -> None:
     files = [tmp_path / f"{i} ü.JPG" for i in range(20)]
     for i, file in enumerate(files):
-        data = jpeg(i, progressive)
-        file.write_bytes(zeroed(data, share) if i in (13, 17) else data)
+        file.write_bytes(jpeg(i, progressive, share if i in (13, 17) else None))
     read_image(files[13])  # OpenCV itself finds nothing
-
-    def read() -> None:
-        with sound_jpegs(files):
-            pass
-
-    assert_one_line(read, str(files[13]), "JPEG file is corrupt", "copy it again")
+    assert_one_line(lambda: check_jpegs(*files), str(files[13]), "JPEG file is corrupt", "copy it again")
 
 
-def test_a_capture_with_such_a_photograph_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    root = colmap_capture(tmp_path, names=["0.jpg", "1.jpeg", "2.png"])
-    assert load_capture(root).notes == ()
-    assert capfd.readouterr().err == ""
-    (root / "images" / "1.jpeg").write_bytes(zeroed(jpeg(), 0.5))
-    assert_one_line(lambda: load_capture(root), str(root / "images" / "1.jpeg"), "corrupt", "copy it again")
-    assert_one_line(lambda: run_sfm(root / "images", tmp_path / "out"), str(root / "images" / "1.jpeg"), "corrupt")
-    assert not (tmp_path / "out").exists()
-
-
-def test_data_check_lists_all_of_them(pop: Pop, tmp_path: Path) -> None:
-    root = colmap_capture(tmp_path, names=["0.jpg", "1.jpg", "2.png"])
-    for name in ("0.jpg", "1.jpg"):
-        (root / "images" / name).write_bytes(zeroed(jpeg(), 0.5))
-    outcome = pop("data", "check", root)
-    assert outcome.status == 1
-    for name in ("0.jpg", "1.jpg"):
-        assert f"{name}: the JPEG file is corrupt" in outcome.out
-
-
-def test_padding_and_other_formats_do_no_harm(tmp_path: Path) -> None:
-    data = jpeg()
-    (tmp_path / "a.jpg").write_bytes(data[:-2] + bytes(8) + data[-2:])
+def test_a_jpeg_overwritten_in_the_middle_is_named_and_padding_and_other_formats_do_no_harm(tmp_path: Path) -> None:
+    data = bytearray(WHOLE["jpg"])
+    scan = data.index(b"\xff\xda") + 20
+    data[scan : scan + 40] = b"\xff\x42" * 20
+    (tmp_path / "x.jpg").write_bytes(data)
+    assert_one_line(lambda: read_image(tmp_path / "x.jpg"), "x.jpg", "unexpected marker")
+    (tmp_path / "a.jpg").write_bytes(jpeg()[:-2] + bytes(8) + jpeg()[-2:])
     write_photograph(tmp_path / "b.png", photograph(0))
     (tmp_path / "c.jpg").write_bytes(b"no picture")
-    with sound_jpegs([tmp_path / name for name in ("a.jpg", "b.png", "c.jpg", "absent.jpg")]):
-        pass
-
-
-def test_an_error_of_the_block_comes_first(tmp_path: Path) -> None:
-    (tmp_path / "a.jpg").write_bytes(zeroed(jpeg(), 0.5))
+    check_jpegs(*(tmp_path / name for name in ("a.jpg", "b.png", "c.jpg", "absent.jpg")))
+    # an error of the block comes first
+    (tmp_path / "a.jpg").write_bytes(jpeg(zeroed=0.5))
     with pytest.raises(KeyError), sound_jpegs([tmp_path / "a.jpg"]):
         raise KeyError
 
 
-# Photographs shrunk as Pillow shrinks them, to the bit.
+def test_such_captures_are_refused_and_looked_over(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    root = colmap_capture(tmp_path / "scene", names=["0.jpg", "1.jpeg", "2.png"])
+    assert load_capture(root).notes == ()
+    assert capfd.readouterr().err == ""
+    first, second = root / "images" / "0.jpg", root / "images" / "1.jpeg"
+    second.write_bytes(jpeg(zeroed=0.5))
+    assert_one_line(lambda: load_capture(root), str(second), "corrupt", "copy it again")
+    assert_one_line(lambda: run_sfm(root / "images", tmp_path / "out"), str(second), "corrupt")
+    assert not (tmp_path / "out").exists()
+    first.write_bytes(jpeg(zeroed=0.5))
+    assert main(["data", "check", str(root)]) == 1
+    out = capfd.readouterr().out
+    assert all(f"{path.name}: the JPEG file is corrupt" in out for path in (first, second))
 
+
+# Photographs shrunk as Pillow shrinks them, to the bit.
 
 # of what a NumPy implementation of Pillow's filter made of the same pictures
 DIGESTS = {
@@ -441,37 +376,394 @@ DIGESTS = {
 }
 
 
-def picture(width: int, height: int) -> np.ndarray:
-    """Noise, with black next to white in its upper half, where a cubic overshoots on both sides."""
-    image = np.random.default_rng(width).integers(0, 256, (height, width, 3), dtype=np.uint8)
-    image[: height // 2] = np.where(image[: height // 2] < 128, 0, 255)
-    return image
-
-
 @pytest.mark.parametrize(("width", "height", "new_width", "new_height"), DIGESTS)
 def test_bits_are_those_of_the_filter_by_rows_and_then_by_columns(width, height, new_width, new_height):
-    image, size = picture(width, height), (new_width, new_height)
+    # noise, with black next to white in its upper half, where a cubic overshoots on both sides
+    image, size = np.random.default_rng(width).integers(0, 256, (height, width, 3), np.uint8), (new_width, new_height)
+    image[: height // 2] = np.where(image[: height // 2] < 128, 0, 255)
     found = shrink_bicubic(image, size)
     assert hashlib.sha256(found.tobytes()).hexdigest()[:16] == DIGESTS[width, height, new_width, new_height]
     assert found.shape == (new_height, new_width, 3)
     assert found.flags.c_contiguous
     assert found.flags.writeable
-
-
-@pytest.mark.parametrize("factor", [2, 4, 8])
-def test_the_factors_that_captures_are_shrunk_by_are_pillows_in_one_call_too(factor):
-    image = picture(619, 411)
-    size = (round(619 / factor), round(411 / factor))
-    in_one = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BICUBIC))
-    assert np.abs(shrink_bicubic(image, size).astype(int) - in_one).max() <= 1
+    if width == 619:
+        # the factors that captures are shrunk by are Pillow's in one call too
+        in_one = np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BICUBIC))
+        assert np.abs(found.astype(int) - in_one).max() <= 1
 
 
 def test_a_capture_is_shrunk_by_the_filter_that_is_asked_for(tmp_path):
     root = transforms_capture(tmp_path)
-    whole = load_capture(root, normalize=False).views[0].image
-    size = (round(whole.shape[1] / 2), round(whole.shape[0] / 2))
+    whole = raw(root).views[0].image
     shrunk = {resize: load_capture(root, factor=2, resize=resize).views[0].image for resize in ("area", "bicubic")}
-    np.testing.assert_array_equal(shrunk["bicubic"], shrink_bicubic(whole, size))
+    np.testing.assert_array_equal(shrunk["bicubic"], shrink_bicubic(whole, (WIDTH // 2, HEIGHT // 2)))
     assert (shrunk["area"] != shrunk["bicubic"]).any()
     with pytest.raises(CaptureError, match=r"resize is 'nearest'; it must be 'area' or 'bicubic'"):
         load_capture(root, factor=2, resize="nearest")
+
+
+# Structure from motion on a bare folder of photographs.
+
+K = np.array([[300.0, 0.0, 160.0], [0.0, 300.0, 120.0], [0.0, 0.0, 1.0]])
+CENTERS = [(4.0 * np.cos(a), 4.0 * np.sin(a), 1.5 + 0.2 * (i % 2)) for i, a in enumerate(np.linspace(0.3, 1.3, 7))]
+
+
+@pytest.fixture(scope="module")
+def photographs(made_once: Callable[..., Path]) -> Path:
+    def make(folder: Path) -> None:
+        scene = make_scene(0)
+        for i, center in enumerate(CENTERS):
+            view = render_view(scene, look_at(center, (0.0, 0.0, 0.4)), K, 320, 240)
+            write_photograph(folder / f"walk {i}.png", view)
+
+    return made_once("photographs", make)
+
+
+@pytest.fixture(scope="module")
+def found(photographs: Path, made_once: Callable[..., Path]) -> Path:
+    def make(folder: Path) -> None:
+        result = run_sfm(photographs, folder / "capture")
+        assert result.capture == folder / "capture"
+        assert result.registered == result.photographs == len(CENTERS)
+        assert result.points >= 50
+        assert result.reprojection_error < 1.0
+
+    return made_once("sfm", make) / "capture"
+
+
+def test_cameras_are_found_where_the_photographs_were_taken(found: Path, photographs: Path) -> None:
+    views = raw(found).views
+    assert [view.name for view in views] == [f"walk {i}.png" for i in range(len(CENTERS))]
+    centers = np.stack([view.camera_center for view in views])
+    truth = np.array(CENTERS)
+    # up to a similarity: align by the singular value decomposition of the covariance (Umeyama)
+    a, b = centers - centers.mean(axis=0), truth - truth.mean(axis=0)
+    U, S, Vt = np.linalg.svd(b.T @ a)
+    mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    aligned = (np.trace(np.diag(S) @ mirror) / (a**2).sum()) * a @ (U @ mirror @ Vt).T
+    assert np.abs(aligned - b).max() < 0.05
+    assert views[0].K[0, 0] == pytest.approx(300.0, rel=0.05)
+    for file in photographs.iterdir():
+        assert (found / "images" / file.name).read_bytes() == file.read_bytes()
+
+
+def test_the_same_photographs_give_the_same_bytes(found: Path, photographs: Path, tmp_path: Path) -> None:
+    told: list[tuple[str, int, int]] = []
+    folder = Path(shutil.copytree(photographs, tmp_path / "in"))
+    # in place this time: the model comes to lie with the photographs
+    result = run_sfm(folder, progress=lambda *what: told.append(what))
+    assert result.capture == folder.resolve()
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        assert (folder / "sparse" / "0" / name).read_bytes() == (found / "sparse" / "0" / name).read_bytes()
+    n = len(CENTERS)
+    totals = {
+        "checking photographs": n,
+        "finding features in photographs": n,
+        "matching pairs of photographs": n * (n - 1) // 2,
+        "finding cameras of photographs": n,
+    }
+    assert {stage for stage, _, _ in told} == totals.keys()
+    assert all((stage, total, total) in told for stage, total in list(totals.items())[1:])
+    assert all(0 <= done <= total for _, done, total in told)
+    assert len(load_capture(folder).views) == n
+    assert_one_line(lambda: run_sfm(folder), "sparse", "--overwrite")
+
+
+def test_a_bare_folder_is_loaded_only_when_sfm_is_asked_for(photographs: Path, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    shutil.copytree(photographs, scene / "images")
+    assert_one_line(lambda: load_capture(scene), "7 photographs", "pop sfm")
+    assert sorted(file.name for file in scene.iterdir()) == ["images"]
+    assert len(load_capture(scene, sfm=True).views) == len(CENTERS)
+    assert (scene / "sparse" / "0" / "cameras.bin").is_file()
+    assert len(load_capture(scene).views) == len(CENTERS)
+
+
+def fill(folder: Path, *names: str | bytes) -> Path:
+    """Write photographs, by default 0.png to 2.png."""
+    for i, name in enumerate(names or ("0.png", "1.png", "2.png")):
+        path = folder / (name if isinstance(name, str) else name.decode(errors="surrogateescape"))
+        write_photograph(folder / "plain.png", photograph(i, 64, 48))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        (folder / "plain.png").rename(path)
+    return folder
+
+
+def test_what_cannot_be_searched_for_cameras_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
+    assert_one_line(lambda: run_sfm(tmp_path / "absent"), "absent", "no such folder")
+    assert_one_line(lambda: run_sfm(tmp_path), "has 0 photograph")
+    fill(tmp_path / "one", "a.png", "masks/a.png")
+    assert_one_line(lambda: run_sfm(tmp_path / "one"), "has 1 photograph")
+    some = fill(tmp_path / "in")
+    # they have nothing in common
+    assert_one_line(lambda: run_sfm(some, tmp_path / "out"), "in", "no cameras could be found", "overlap")
+    assert_one_line(lambda: run_sfm(some, camera_model="PINHOLES"), "'PINHOLES'", "SIMPLE_RADIAL")
+    # before the long work begins
+    (some / "b.jpg").write_bytes(WHOLE["jpg"][:-40])
+    assert_one_line(lambda: run_sfm(some), "b.jpg", "truncated")
+    assert sorted(file.name for file in some.iterdir()) == ["0.png", "1.png", "2.png", "b.jpg"]
+    bytes_of_a_name = fill(tmp_path / "bytes", b"a\xff.png", b"b.png")
+    assert_one_line(lambda: run_sfm(bytes_of_a_name), "not UTF-8", "rename the photograph")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["bytes", "in", "one"]
+
+
+def test_few_photographs_are_all_matched_and_many_with_their_neighbours() -> None:
+    assert len(pairs_of(60, "auto")) == 60 * 59 // 2
+    assert len(pairs_of(200, "exhaustive")) == 200 * 199 // 2
+    assert pairs_of(30, "sequential") == [pair for pair in pairs_of(200, "auto") if pair[1] < 30]
+    many = pairs_of(200, "auto")
+    assert len(many) < 200 * 20
+    assert {(0, 1), (0, 10), (0, 16), (0, 128), (198, 199)} <= set(many)
+    assert all(i < j < 200 for i, j in many)
+
+
+# Bare folders of photographs: what is read, what is written where, and what is never removed.
+
+
+@pytest.fixture
+def known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cameras of the first four photographs, without a search for them."""
+    monkeypatch.setattr(
+        sfm, "_find_cameras", lambda job, *_: make_model(job.names[:4], ring(len(job.names[:4])), [camera()])
+    )
+
+
+def test_photographs_are_never_replaced_by_the_capture_that_is_made_of_them(known: None, tmp_path: Path) -> None:
+    shoot = tmp_path / "shoot"
+    fill(shoot / "jpgs")
+    (shoot / "raw").mkdir()
+    (shoot / "raw" / "a.dng").write_bytes(b"raw")
+    before = contents(tmp_path)
+    for overwrite in (False, True):
+        for out in (shoot, tmp_path, shoot / "raw" / ".."):
+            says = (str(out), "jpgs", "--out")
+            assert_one_line(lambda out=out, o=overwrite: run_sfm(shoot / "jpgs", out, overwrite=o), *says)
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("mine", ["notes.txt", "raw/a.dng", "images/more.png", "sparse/0/project.ini", "images/0.png"])
+def test_only_what_was_written_before_is_replaced(known: None, tmp_path: Path, mine: str) -> None:
+    photos, out = fill(tmp_path / "in"), tmp_path / "out"
+    run_sfm(photos, out)
+    # another result of the same photographs, and one of fewer, take its place
+    run_sfm(photos, out, overwrite=True)
+    (photos / "2.png").unlink()
+    run_sfm(photos, out, overwrite=True)
+    assert sorted(path.name for path in (out / "images").iterdir()) == ["0.png", "1.png"]
+    (out / mine).parent.mkdir(exist_ok=True)
+    (out / mine).write_bytes(b"mine")
+    before = contents(tmp_path)
+    assert_one_line(lambda: run_sfm(photos, out, overwrite=True), str(out), mine, "not replaced")
+    assert contents(tmp_path) == before
+
+
+def test_a_model_that_somebody_else_made_next_to_the_photographs_is_kept(known: None, tmp_path: Path) -> None:
+    fill(tmp_path / "images")
+    (tmp_path / "sparse" / "0").mkdir(parents=True)
+    (tmp_path / "sparse" / "0" / "cameras.bin").write_bytes(b"mine")
+    before = contents(tmp_path)
+    assert_one_line(lambda: run_sfm(tmp_path / "images", overwrite=True), "sparse", "0/cameras.bin", "did not write")
+    assert contents(tmp_path) == before
+    shutil.rmtree(tmp_path / "sparse")
+    for overwrite in (False, True):
+        assert run_sfm(tmp_path / "images", overwrite=overwrite).capture == tmp_path.resolve()
+
+
+def test_a_capture_among_its_photographs_is_none_of_them_the_next_time(known: None, tmp_path: Path) -> None:
+    fill(tmp_path)
+    for overwrite in (False, True):
+        assert run_sfm(tmp_path, tmp_path / "scene", overwrite=overwrite).photographs == 3
+        # photographs that are upright as stored leave no note
+        assert sorted(path.name for path in (tmp_path / "scene" / "sparse").iterdir()) == ["0", "sfm.sha256"]
+
+
+def test_folders_called_images_and_subfolders_alone_are_loaded(known: None, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    for options in ({"sfm": True}, {}):
+        assert len(load_capture(fill(tmp_path / "images"), **options).views) == 3
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["images", "notes.txt"]
+    names = ["left cam/0.png", "left cam/1.png", "right/0.png"]
+    capture = load_capture(fill(tmp_path / "scene", *names), sfm=True)
+    assert [view.name for view in capture.views] == names
+    assert capture.notes == ()
+
+
+def test_the_search_for_cameras_is_told_apart_from_loading(known: None, pop: Pop, tmp_path: Path, monkeypatch) -> None:
+    fill(tmp_path / "photos", *(f"{i}.png" for i in range(5)))
+    searched = sfm._find_cameras
+
+    def slowly(*given: Any) -> Any:
+        time.sleep(1.0)
+        return searched(*given)
+
+    monkeypatch.setattr(sfm, "_find_cameras", slowly)
+    done = pop.done("train", tmp_path / "photos", "--out", tmp_path / "out", "--max-steps", "2", *TRAIN, "--skip-sizes")
+    lines = done.out.splitlines()
+    assert lines[0] in ("cameras found in 1 s", "cameras found in 2 s", "cameras found in 3 s")
+    assert any("the model has no camera for 4.png" in line for line in lines)
+    stats = json.loads((tmp_path / "out" / "stats" / "val_step0001.json").read_text())
+    assert stats["seconds_sfm"] >= 1.0
+    assert f"loading {stats['seconds_loading']:.0f} s, finding cameras {stats['seconds_sfm']:.0f} s" in done.out
+
+
+# Photographs that a camera stored sideways: where the program finds the cameras itself, all is shown upright.
+
+# what a viewer does to the stored pixels, by the orientation in EXIF
+SHOWN = {1: 0, 6: -1, 3: 2, 8: 1}
+
+
+@pytest.fixture
+def sideways(known: None, tmp_path: Path) -> Path:
+    """Photographs of 40 x 30 stored pixels, each held another way, and their cameras."""
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for orientation in SHOWN:
+        exif = Image.Exif()
+        exif[0x112] = orientation
+        Image.fromarray(photograph(orientation)).save(folder / f"{orientation}.png", exif=exif)
+    run_sfm(folder)
+    return folder
+
+
+def colors_at(view: View, points: np.ndarray) -> np.ndarray:
+    """The colours of the pixels that points are seen in; those outside the picture are black."""
+    seen = points @ view.viewmat[:3, :3].T + view.viewmat[:3, 3]
+    u, v = (view.K @ seen.T)[:2] / seen[:, 2]
+    inside = (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
+    colors = np.zeros((len(points), 3), np.uint8)
+    colors[inside] = view.image[np.floor(v[inside]).astype(int), np.floor(u[inside]).astype(int)]
+    assert inside.sum() > len(points) // 2
+    return colors
+
+
+def test_pictures_are_upright_and_every_point_keeps_its_pixel(pop: Pop, sideways: Path) -> None:
+    outcome = pop("data", "check", sideways)
+    assert "3 are stored turned and shown upright" in outcome.out
+    assert "LOOK  EXIF" not in outcome.out
+    turned = {view.name: view for view in raw(sideways).views}
+    (sideways / "sparse" / "upright.json").unlink()
+    # EXIF is ignored as COLMAP ignores it, where nothing says that the program found the cameras
+    stored = {view.name: view for view in raw(sideways).views}
+    points = np.random.default_rng(0).uniform(-0.6, 0.6, (300, 3))
+    for orientation, quarters in SHOWN.items():
+        name = f"{orientation}.png"
+        np.testing.assert_array_equal(stored[name].image, photograph(orientation))
+        np.testing.assert_array_equal(turned[name].image, np.rot90(stored[name].image, quarters))
+        np.testing.assert_array_equal(colors_at(turned[name], points), colors_at(stored[name], points))
+        assert np.linalg.det(turned[name].viewmat) == pytest.approx(1.0)
+        np.testing.assert_allclose(turned[name].camera_center, stored[name].camera_center, atol=1e-12)
+
+
+def test_exif_orientation_is_ignored_in_a_jpeg_which_opencv_would_turn(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path, names=["a.jpg", "b.jpg"])
+    plain, path = raw(root).views[0].image, root / "images" / "a.jpg"
+    data, rotate = path.read_bytes(), b"Exif\0\0II*\0" + struct.pack("<IHHHIII", 8, 1, 0x0112, 3, 1, 6, 0)
+    path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(rotate) + 2) + rotate + data[2:])
+    assert cv2.imread(str(path)).shape[:2] == (WIDTH, HEIGHT)
+    assert np.array_equal(raw(root).views[0].image, plain)
+
+
+def test_a_mask_fits_drawn_over_the_stored_or_over_the_shown_picture(sideways: Path) -> None:
+    keep = np.zeros((30, 40), np.uint8)
+    keep[:7, :11] = 255
+    for orientation in SHOWN:
+        mask = np.rot90(keep, SHOWN[8]) if orientation == 8 else keep
+        write_photograph(sideways / "masks" / f"{orientation}.png", mask)
+    for view in load_capture(sideways).views:
+        np.testing.assert_array_equal(view.mask, np.rot90(keep > 0, SHOWN[int(view.name[0])]))
+
+
+def test_a_capture_of_its_own_is_upright_too_and_may_be_made_again(sideways: Path, tmp_path: Path) -> None:
+    for overwrite in (False, True):
+        run_sfm(sideways, tmp_path / "scene", overwrite=overwrite)
+        sizes = {view.name: (view.width, view.height) for view in load_capture(tmp_path / "scene").views}
+        assert sizes == {"1.png": (40, 30), "3.png": (40, 30), "6.png": (30, 40), "8.png": (30, 40)}
+
+
+@pytest.mark.parametrize("text", ["{", '{"6.png": 4}', '{"6.png": true}', "[]"])
+def test_a_damaged_note_is_named(sideways: Path, text: str) -> None:
+    (sideways / "sparse" / "upright.json").write_text(text)
+    assert_one_line(lambda: load_capture(sideways), "upright.json", "pop sfm again with --overwrite")
+
+
+# Photographs out of a video: sharp ones, spread over its time, and none of a camera at rest.
+
+# of every five frames these are sharp; two stretches of ten in the middle show the same
+SHARP = (2, 4)
+RESTING = range(30, 50)
+
+
+def frame(number: int) -> np.ndarray:
+    """A window that wanders over a texture; blurred unless the camera is held still for it."""
+    coarse = np.random.default_rng(3).integers(0, 256, (24, 60, 3)).astype(np.uint8)
+    texture = cv2.resize(coarse, (480, 192), interpolation=cv2.INTER_CUBIC)
+    at = RESTING.start if number in RESTING else number
+    window = np.ascontiguousarray(texture[20 : 20 + 96, 4 * at : 4 * at + 128])
+    return window if number % 5 in SHARP else cv2.GaussianBlur(window, (0, 0), 3.0)
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("video") / "walk.avi"
+    with VideoFile(path, fps=30.0) as video:
+        for number in range(80):
+            video.add(frame(number))
+    return path
+
+
+def test_every_stretch_gives_a_sharp_frame_and_a_rest_gives_one(clip: Path, tmp_path: Path) -> None:
+    taken = take_frames(clip, tmp_path / "out", count=8)
+    assert taken.of == 80
+    assert len(taken.frames) + taken.alike == 8
+    assert all(number % 5 in SHARP for number in taken.frames)
+    assert all(later - earlier >= 5 for earlier, later in zip(taken.frames, taken.frames[1:], strict=False))
+    assert sum(number in RESTING for number in taken.frames) == 1
+    assert taken.alike == 1
+    files = list_images(tmp_path / "out")
+    assert [path.name for path in files] == [f"walk_{number:06d}.jpg" for number in taken.frames]
+    assert np.abs(read_image(files[0]).astype(int) - frame(taken.frames[0])).mean() < 6.0
+    # more frames than there are give all that differ, and photographs can be made smaller
+    taken = take_frames(clip, tmp_path / "all", count=1000, max_size=64)
+    assert len(taken.frames) + taken.alike == 80
+    assert len(taken.frames) >= 55
+    assert {read_image(path).shape for path in list_images(tmp_path / "all")} == {(48, 64, 3)}
+
+
+def test_sharpness_is_that_of_the_picture_shrunk_and_falls_with_blur() -> None:
+    sharp, soft = (cv2.cvtColor(frame(number), cv2.COLOR_RGB2GRAY) for number in (2, 3))
+    assert sharpness(sharp) > 4.0 * sharpness(soft)
+    large = np.kron(sharp, np.ones((8, 8), np.uint8))
+    assert sharpness(large) == pytest.approx(sharpness(cv2.resize(large, (512, 384), interpolation=cv2.INTER_AREA)))
+
+
+def test_the_command_writes_next_to_the_video_and_says_what_comes_next(clip: Path, tmp_path: Path, pop: Pop) -> None:
+    video, folder = Path(shutil.copy(clip, tmp_path / "walk.avi")), tmp_path / "walk_frames"
+    done = pop.done("frames", video, "--count", "6")
+    assert done.out.splitlines()[-1] == f"next: pop train {folder}"
+    assert "of 80 frames" in done.out
+    says(pop("frames", video, "--count", "4"), str(folder))
+    pop.done("frames", video, "--count", "4", "--overwrite")
+    assert len(list_images(folder)) <= 4
+    (folder / "mine.jpg").write_bytes(b"mine")
+    assert pop("frames", video, "--overwrite").status == 2
+    assert (folder / "mine.jpg").read_bytes() == b"mine"
+
+
+def test_what_is_no_video_is_one_line_and_leaves_nothing(clip: Path, tmp_path: Path) -> None:
+    (tmp_path / "cut.avi").write_bytes(clip.read_bytes()[:2000])
+    (tmp_path / "text.mp4").write_text("no video")
+    with VideoFile(tmp_path / "still.avi", fps=10.0) as video:
+        for _ in range(12):
+            video.add(frame(2))
+    out = tmp_path / "out"
+    for name, message in (
+        *(("absent.mp4", "no such file"), ("text.mp4", "is no video that OpenCV can read")),
+        *(("still.avi", "nothing moves in it"), ("cut.avi", "")),
+    ):
+        assert_one_line(lambda name=name: take_frames(tmp_path / name, out, count=4), str(tmp_path / name), message)
+        assert not out.exists()
+    for wrong, message in (({"count": 1}, "count is 1"), ({"max_size": 8}, "max_size is 8")):
+        with pytest.raises(PopError, match=message):
+            take_frames(clip, out, **wrong)
+    # training on one says how to take photographs out of it
+    assert_one_line(lambda: load_capture(clip), "walk.avi: is a video; ", " pop frames")

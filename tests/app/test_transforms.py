@@ -1,4 +1,4 @@
-"""transforms.json of nerfstudio, instant-ngp and Blender."""
+"""Cameras in other files than COLMAP's: transforms.json of nerfstudio, instant-ngp and Blender, and other programs'."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from pop_fast.data import Capture, load_capture
-from pop_fast.data.exports import read_transforms
+from pop_fast.data.exports import read_metashape
 from pop_fast.data.sfm import photographs
 from pop_fast.errors import CaptureError
-from tests.app import exported
 from tests.app.captures import (
     HEIGHT,
     PINHOLE,
@@ -29,17 +28,25 @@ from tests.app.captures import (
     cloud,
     colmap_capture,
     edit_transforms,
+    metashape,
     opengl,
     photograph,
+    polycam,
+    raw,
+    realitycapture,
     ring,
     transforms_capture,
     write_photograph,
 )
 from tests.app.conftest import Pop
 
+Edit = Callable[[dict[str, Any]], object]
 
-def raw(root: Path, **options) -> Capture:
-    return load_capture(root, normalize=False, **options)
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A capture of four photographs that a test may change."""
+    return transforms_capture(tmp_path)
 
 
 def write_points(path: Path) -> None:
@@ -50,40 +57,63 @@ def write_points(path: Path) -> None:
     PlyData([PlyElement.describe(rows, "vertex")]).write(str(path))
 
 
-def test_poses_are_turned_from_opengl_camera_to_world_into_opencv_world_to_camera(tmp_path: Path) -> None:
-    capture = raw(transforms_capture(tmp_path))
-    fx, fy, cx, cy = PINHOLE
-    for i, (view, viewmat) in enumerate(zip(capture.views, ring(4), strict=True)):
-        assert view.name == f"images/{i:02d}.png"
-        assert np.allclose(view.viewmat, viewmat, atol=1e-12)
-        assert np.array_equal(view.K, [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        assert np.array_equal(view.image, photograph(i))
-
-
-def test_both_routes_give_the_same_views_of_the_same_scene(tmp_path: Path) -> None:
-    one = raw(transforms_capture(tmp_path / "a"))
-    other = raw(colmap_capture(tmp_path / "b"))
+@pytest.mark.parametrize("terms", [{}, {"k1": 0.05, "k2": -0.02, "p1": 0.001, "p2": -0.002}], ids=["", "distorted"])
+def test_the_views_are_those_of_the_same_scene_by_colmap(tmp_path: Path, terms: dict[str, float]) -> None:
+    one = raw(transforms_capture(tmp_path / "a", **terms))
+    cameras = [camera("OPENCV", (*PINHOLE, *terms.values())) if terms else camera()]
+    other = raw(colmap_capture(tmp_path / "b", cameras=cameras))
+    assert [view.name for view in one.views] == [f"images/{i:02d}.png" for i in range(4)]
     for a, b in zip(one.views, other.views, strict=True):
         assert np.allclose(a.viewmat, b.viewmat, atol=1e-12)
         assert np.array_equal(a.K, b.K)
         assert np.array_equal(a.image, b.image)
 
 
-def test_fields_of_a_frame_come_before_those_of_the_file(tmp_path: Path) -> None:
-    root = transforms_capture(tmp_path)
-    edit_transforms(root, lambda listing: listing["frames"][1].update(fl_x=50.0, cx=19.0, camera_model="PINHOLE"))
-    views = raw(root).views
-    assert views[1].K[0].tolist() == [50.0, 0.0, 19.0]
-    assert views[0].K[0].tolist() == [PINHOLE[0], 0.0, PINHOLE[2]]
+def K_of(root: Path, index: int = 0) -> list[float]:
+    """Read fx, fy, cx, cy of a view."""
+    K = raw(root).views[index].K
+    return [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
 
 
-def test_what_is_absent_follows_from_the_rest(tmp_path: Path) -> None:
-    view = raw(transforms_capture(tmp_path, fl_y=None, cx=None, cy=None)).views[0]
-    assert np.array_equal(view.K, [[PINHOLE[0], 0.0, WIDTH / 2], [0.0, PINHOLE[0], HEIGHT / 2], [0.0, 0.0, 1.0]])
-    angles = {"fl_x": None, "fl_y": None, "camera_angle_x": 1.0, "camera_angle_y": 0.8}
-    view = raw(transforms_capture(tmp_path, **angles)).views[0]
-    assert view.K[0, 0] == pytest.approx(0.5 * WIDTH / math.tan(0.5))
-    assert view.K[1, 1] == pytest.approx(0.5 * HEIGHT / math.tan(0.4))
+def focal(angle: float, size: int) -> float:
+    return 0.5 * size / math.tan(0.5 * angle)
+
+
+ANGLE = 1.2
+FOCAL = focal(ANGLE, WIDTH)
+
+
+@pytest.mark.parametrize(
+    ("fields", "want"),
+    [
+        ({"fl_y": None, "cx": None, "cy": None}, [PINHOLE[0], PINHOLE[0], WIDTH / 2, HEIGHT / 2]),
+        ({"fl_x": None, "fl_y": None, "camera_angle_x": ANGLE}, [FOCAL, FOCAL, *PINHOLE[2:]]),
+        (
+            {"fl_x": None, "fl_y": None, "camera_angle_x": 1.0, "camera_angle_y": 0.8},
+            [focal(1.0, WIDTH), focal(0.8, HEIGHT), *PINHOLE[2:]],
+        ),
+        # the listed size is what intrinsics are measured in
+        ({"w": 2 * WIDTH, "h": 2 * HEIGHT}, [number / 2 for number in PINHOLE]),
+    ],
+)
+def test_what_is_absent_follows_from_the_rest(tmp_path: Path, fields: dict[str, Any], want: list[float]) -> None:
+    assert K_of(transforms_capture(tmp_path, **fields)) == pytest.approx(want)
+
+
+@pytest.mark.parametrize(
+    ("own", "want"),
+    [
+        ({"fl_x": 50.0, "cx": 19.0, "camera_model": "PINHOLE"}, [50.0, 35.0, 19.0, PINHOLE[3]]),
+        ({"camera_angle_x": ANGLE}, [FOCAL, FOCAL]),
+        ({"camera_angle_x": ANGLE, "fl_y": 50.0}, [FOCAL, 50.0]),
+        ({"camera_angle_x": ANGLE, "fl_x": 50.0}, [50.0, 50.0]),
+        ({"camera_angle_y": ANGLE}, [PINHOLE[0], focal(ANGLE, HEIGHT)]),
+    ],
+)
+def test_fields_of_a_frame_count_before_those_of_the_file(root: Path, own: dict[str, Any], want: list[float]) -> None:
+    edit_transforms(root, lambda listing: listing["frames"][1].update(own))
+    assert K_of(root, 1) == pytest.approx([*want, *PINHOLE[len(want) :]])
+    assert K_of(root, 0) == pytest.approx(list(PINHOLE))
 
 
 @pytest.mark.parametrize(
@@ -97,32 +127,15 @@ def test_what_is_absent_follows_from_the_rest(tmp_path: Path) -> None:
         ({"camera_model": "PINHOLE", "k1": 0.1}, "PINHOLE", []),
     ],
 )
-def test_lenses_become_the_colmap_model_that_means_the_same(
-    tmp_path: Path, fields: dict[str, Any], model: str, terms: list[float]
-) -> None:
+def test_lenses_become_colmap_models(tmp_path: Path, fields: dict[str, Any], model: str, terms: list[float]) -> None:
     root = transforms_capture(tmp_path, **fields)
     (shot, *_), _ = read_transforms([root / "transforms.json"])
-    assert shot.camera is not None
     assert shot.camera.model_name == model
     assert shot.camera.params.tolist() == [*PINHOLE, *terms]
 
 
-def test_a_distorted_capture_gives_the_views_that_the_same_colmap_model_gives(tmp_path: Path) -> None:
-    terms = {"k1": 0.05, "k2": -0.02, "p1": 0.001, "p2": -0.002}
-    one = raw(transforms_capture(tmp_path / "a", **terms))
-    other = raw(colmap_capture(tmp_path / "b", cameras=[camera("OPENCV", (*PINHOLE, *terms.values()))]))
-    for a, b in zip(one.views, other.views, strict=True):
-        assert np.array_equal(a.image, b.image)
-        assert np.array_equal(a.K, b.K)
-
-
-def test_the_listed_size_is_what_intrinsics_are_measured_in(tmp_path: Path) -> None:
-    view = raw(transforms_capture(tmp_path, w=2 * WIDTH, h=2 * HEIGHT)).views[0]
-    assert np.allclose(view.K[0], np.array([PINHOLE[0], 0.0, PINHOLE[2]]) / 2.0)
-
-
 @pytest.mark.parametrize("name", ["sparse_pc.ply", "points3D.ply", "points3d.ply", "named.ply"])
-def test_points_beside_the_file_are_used(tmp_path: Path, name: str) -> None:
+def test_points_in_the_folder_are_used(tmp_path: Path, name: str) -> None:
     root = transforms_capture(tmp_path, ply_file_path="named.ply" if name == "named.ply" else None)
     write_points(root / name)
     capture = raw(root)
@@ -130,16 +143,11 @@ def test_points_beside_the_file_are_used(tmp_path: Path, name: str) -> None:
     assert np.array_equal(capture.points, xyz)
     assert np.array_equal(capture.points_rgb, rgb)
     assert capture.source == "transforms.json: 4 views, 20 points"
+    edit_transforms(root, lambda listing: listing.update(ply_file_path="absent.ply"))
+    assert_one_line(lambda: raw(root), "absent.ply", "absent;")
 
 
-def test_named_points_that_are_absent_are_an_error(tmp_path: Path) -> None:
-    root = transforms_capture(tmp_path, ply_file_path="named.ply")
-    write_points(root / "sparse_pc.ply")
-    assert_one_line(lambda: raw(root), "named.ply", "absent")
-
-
-def test_without_points_random_ones_are_made_where_two_cameras_look(tmp_path: Path) -> None:
-    root = transforms_capture(tmp_path)
+def test_without_points_random_ones_are_made_where_two_cameras_look(root: Path) -> None:
     capture = raw(root, points=500)
     assert capture.source == "transforms.json: 4 views, no points: 500 random ones (seed 0)"
     assert capture.points.shape == (500, 3)
@@ -155,11 +163,8 @@ def test_without_points_random_ones_are_made_where_two_cameras_look(tmp_path: Pa
     assert np.array_equal(raw(root, points=500).points, capture.points)
     assert not np.array_equal(raw(root, points=500, seed=1).points, capture.points)
 
-
-def test_cameras_that_share_no_view_cannot_get_random_points(tmp_path: Path) -> None:
-    root = transforms_capture(tmp_path, count=2)
-
     def turn_away(listing: dict[str, Any]) -> None:
+        listing["frames"] = listing["frames"][:2]
         for frame in listing["frames"]:
             frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ np.diag([-1.0, 1.0, -1.0, 1.0])).tolist()
 
@@ -167,89 +172,70 @@ def test_cameras_that_share_no_view_cannot_get_random_points(tmp_path: Path) -> 
     assert_one_line(lambda: raw(root), "transforms.json", "no two views look at")
 
 
-def names(views) -> list[str]:
-    return [Path(view.name).stem for view in views]
+def numbers(views) -> str:
+    return " ".join(str(int(Path(view.name).stem)) for view in views)
 
 
-def test_the_files_own_split_comes_before_every_eighth(tmp_path: Path) -> None:
-    listed = {f"{s}_filenames": [f"images/0{i}.png" for i in which] for s, which in
-              (("train", (0, 1, 4)), ("val", (2,)), ("test", (3,)))}  # fmt: skip
-    capture = raw(transforms_capture(tmp_path, count=6, **listed))
-    assert names(capture.train_views()) == ["00", "01", "04"]
-    assert names(capture.test_views()) == ["03"]
-    assert names(capture.views) == ["00", "01", "02", "03", "04"]
-
-
-def test_validation_views_are_tested_on_where_no_test_views_are_named(tmp_path: Path) -> None:
-    split = {"train_filenames": ["images/00.png", "images/01.png"], "val_filenames": ["./images/02.png"]}
-    capture = raw(transforms_capture(tmp_path, **split))
-    assert names(capture.test_views()) == ["02"]
-    assert names(capture.train_views()) == ["00", "01"]
-
-
-def test_with_training_views_alone_the_rest_is_tested_on(tmp_path: Path) -> None:
-    capture = raw(transforms_capture(tmp_path, train_filenames=["images/00.png", "images/03.png"]))
-    assert names(capture.test_views()) == ["01", "02"]
-
-
-def test_a_photograph_in_both_lists_is_never_trained_on(tmp_path: Path) -> None:
-    everything = [f"images/0{i}.png" for i in range(4)]
-    capture = raw(transforms_capture(tmp_path, train_filenames=everything, test_filenames=everything[:1]))
-    assert names(capture.test_views()) == ["00"]
-    assert names(capture.train_views()) == ["01", "02", "03"]
-
-
-def blender_capture(root: Path) -> Path:
-    for split, count in (("train", 3), ("val", 2), ("test", 2)):
-        frames = []
-        for i, viewmat in enumerate(ring(count)):
-            write_photograph(root / split / f"r_{i}.png", photograph(i, channels=4))
-            frames.append({"file_path": f"./{split}/r_{i}", "rotation": 0.1, "transform_matrix": opengl(viewmat)})
-        listing = {"camera_angle_x": 0.9, "frames": frames}
-        (root / f"transforms_{split}.json").write_text(json.dumps(listing))
-    return root
+@pytest.mark.parametrize(
+    ("listed", "train", "test"),
+    [
+        # its own split comes before every eighth
+        ({"train": (0, 1, 4), "val": (2,), "test": (3,)}, "0 1 4", "3"),
+        # validation views are tested on where no test views are named, and else the rest
+        ({"train": (0, 1), "val": (2,)}, "0 1", "2"),
+        ({"train": (0, 3)}, "0 3", "1 2 4 5"),
+        # a photograph in both lists is never trained on
+        ({"train": range(6), "test": (0,)}, "1 2 3 4 5", "0"),
+    ],
+)
+def test_the_files_own_split_is_kept(tmp_path: Path, listed: dict[str, Any], train: str, test: str) -> None:
+    split = {f"{s}_filenames": [f"{'./' * (s == 'val')}images/0{i}.png" for i in of] for s, of in listed.items()}
+    capture = raw(transforms_capture(tmp_path, count=6, **split))
+    assert numbers(capture.train_views()) == train
+    assert numbers(capture.test_views()) == test
+    assert len(capture.views) == len({i for of in listed.values() for i in of} | set(map(int, test.split())))
 
 
 def test_blender_captures_have_their_own_split_field_of_view_and_transparency(tmp_path: Path) -> None:
-    root = blender_capture(tmp_path)
-    capture = raw(root, background=(1.0, 1.0, 1.0))
+    for split, count in (("train", 3), ("val", 2), ("test", 2)):
+        frames = []
+        for i, viewmat in enumerate(ring(count)):
+            write_photograph(tmp_path / split / f"r_{i}.png", photograph(i, channels=4))
+            frames.append({"file_path": f"./{split}/r_{i}", "rotation": 0.1, "transform_matrix": opengl(viewmat)})
+        listing = {"camera_angle_x": 0.9, "frames": frames}
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps(listing))
+    capture = raw(tmp_path, background=(1.0, 1.0, 1.0))
     assert [view.name for view in capture.train_views()] == ["train/r_0", "train/r_1", "train/r_2"]
     assert [view.name for view in capture.test_views()] == ["test/r_0", "test/r_1"]
     assert len(capture.views) == 5
-    focal = 0.5 * WIDTH / math.tan(0.45)
-    assert np.allclose(capture.views[0].K, [[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
+    assert K_of(tmp_path) == pytest.approx([focal(0.9, WIDTH)] * 2 + [WIDTH / 2, HEIGHT / 2])
     assert capture.views[0].image.shape == (HEIGHT, WIDTH, 3)
-    assert not np.array_equal(capture.views[0].image, raw(root).views[0].image)
-    (root / "transforms_test.json").unlink()
-    assert [view.name for view in raw(root).test_views()] == ["val/r_0", "val/r_1"]
+    assert not np.array_equal(capture.views[0].image, raw(tmp_path).views[0].image)
+    (tmp_path / "transforms_test.json").unlink()
+    assert [view.name for view in raw(tmp_path).test_views()] == ["val/r_0", "val/r_1"]
 
 
-def test_masks_named_by_a_frame_are_read(tmp_path: Path) -> None:
-    root = transforms_capture(tmp_path)
+def test_masks_named_by_a_frame_are_read(root: Path) -> None:
     mask = np.zeros((HEIGHT, WIDTH), np.uint8)
     mask[:5] = 255
     write_photograph(root / "elsewhere" / "m.png", mask)
     write_photograph(root / "masks" / "01.png", 255 - mask)
     edit_transforms(root, lambda listing: listing["frames"][0].update(mask_path="elsewhere/m.png"))
     first, second, *_ = raw(root).views
-    assert first.mask is not None
-    assert second.mask is not None
     assert np.array_equal(first.mask, mask > 0)
     assert np.array_equal(second.mask, mask == 0)
     edit_transforms(root, lambda listing: listing["frames"][0].update(mask_path="elsewhere/absent.png"))
     assert_one_line(lambda: raw(root), "absent.png")
 
 
-def test_colmap_is_preferred_unless_the_other_is_asked_for(tmp_path: Path) -> None:
-    root = colmap_capture(transforms_capture(tmp_path))
-    assert raw(root).source.startswith("COLMAP model")
+def test_colmap_is_preferred_unless_the_other_is_asked_for(root: Path) -> None:
+    colmap_capture(root)
+    for options, source in (({}, "COLMAP model"), ({"source": "colmap"}, "COLMAP model")):
+        assert raw(root, **options).source.startswith(source)
     assert raw(root, source="transforms").source.startswith("transforms.json")
-    assert raw(root, source="colmap").source.startswith("COLMAP model")
 
 
-def test_rotations_rounded_by_the_file_are_made_rotations_again(tmp_path: Path) -> None:
-    root = transforms_capture(tmp_path)
-
+def test_rotations_rounded_by_the_file_are_made_rotations_again(root: Path) -> None:
     def rounded(listing: dict[str, Any]) -> None:
         for frame in listing["frames"]:
             frame["transform_matrix"] = np.round(frame["transform_matrix"], 4).tolist()
@@ -261,90 +247,143 @@ def test_rotations_rounded_by_the_file_are_made_rotations_again(tmp_path: Path) 
         assert np.abs(view.viewmat - viewmat).max() < 1e-3
 
 
-def test_points_without_a_coordinate_or_with_nan_are_named(tmp_path: Path) -> None:
-    root = transforms_capture(tmp_path)
-    header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n"
-    (root / "sparse_pc.ply").write_text(header + "end_header\n1 2\n3 4\n")
-    assert_one_line(lambda: load_capture(root), "sparse_pc.ply", "'z'")
-    (root / "sparse_pc.ply").write_text(header + "property float z\nend_header\n1 2 3\n3 nan 4\n")
-    assert_one_line(lambda: load_capture(root), "sparse_pc.ply", "vertex[1].y is nan")
-
-
-# Which of the intrinsics in transforms.json count: a frame's own before the file's, and all that is there.
-
-ANGLE = 1.2
-FOCAL = 0.5 * WIDTH / math.tan(0.5 * ANGLE)
-
-
-def K_of(root: Path, index: int) -> list[float]:
-    """Read fx, fy, cx, cy of a view."""
-    K = load_capture(root, normalize=False).views[index].K
-    return [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-
-
-@pytest.mark.parametrize(
-    ("own", "want"),
-    [
-        ({"camera_angle_x": ANGLE}, [FOCAL, FOCAL]),
-        ({"camera_angle_x": ANGLE, "fl_y": 50.0}, [FOCAL, 50.0]),
-        ({"camera_angle_x": ANGLE, "fl_x": 50.0}, [50.0, 50.0]),
-        ({"camera_angle_y": ANGLE}, [PINHOLE[0], 0.5 * HEIGHT / math.tan(0.5 * ANGLE)]),
-    ],
-)
-def test_a_frames_own_field_of_view_counts_before_the_files_focal_length(
-    tmp_path: Path, own: dict[str, Any], want: list[float]
-) -> None:
-    root = transforms_capture(tmp_path)
-    edit_transforms(root, lambda listing: listing["frames"][1].update(own))
-    assert K_of(root, 1) == pytest.approx([*want, *PINHOLE[2:]])
-    assert K_of(root, 0) == pytest.approx(list(PINHOLE))
-
-
-def test_a_principal_point_beside_a_field_of_view_counts_or_is_asked_to_be_complete(tmp_path: Path) -> None:
-    fields = {"fl_x": None, "fl_y": None, "camera_angle_x": ANGLE}
-    assert K_of(transforms_capture(tmp_path / "a", **fields), 0) == pytest.approx([FOCAL, FOCAL, *PINHOLE[2:]])
-    root = transforms_capture(tmp_path / "b", **fields, w=None, h=None)
-    assert_one_line(lambda: load_capture(root), "frames[0]", "w and h are absent", "measured in")
-
-
-def test_null_counts_as_absent(tmp_path: Path) -> None:
-    root = transforms_capture(tmp_path)
+def test_null_counts_as_absent_and_the_mark_that_some_editors_put_before_a_file_does_no_harm(root: Path) -> None:
     edit_transforms(root, lambda listing: listing.update(val_filenames=None, ply_file_path=None))
+    path = root / "transforms.json"
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     capture = load_capture(root, points=100)
     assert len(capture.views) == 4
     assert all(view.split is None for view in capture.views)
 
 
-def test_the_mark_that_some_editors_put_before_a_file_does_no_harm(tmp_path: Path) -> None:
-    path = transforms_capture(tmp_path) / "transforms.json"
-    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
-    assert len(load_capture(tmp_path, points=100).views) == 4
+# Whatever is wrong with it is said in one line that names the frame and the field.
+
+
+def frame(**fields: Any) -> Edit:
+    return lambda listing: listing["frames"][1].update(fields)
+
+
+def listed(**fields: Any) -> Edit:
+    return lambda listing: listing.update(fields)
+
+
+def without(*names: str, **fields: Any) -> Edit:
+    return lambda listing: ([listing.pop(name) for name in names], listing.update(fields))
+
+
+def matrix(change: Callable[[np.ndarray], Any]) -> Edit:
+    def edit(listing: dict[str, Any]) -> None:
+        m = change(np.array(listing["frames"][1]["transform_matrix"]))
+        listing["frames"][1]["transform_matrix"] = m.tolist() if isinstance(m, np.ndarray) else m
+
+    return edit
+
+
+def entry(row: int, column: int, value: float) -> Edit:
+    return lambda listing: listing["frames"][1]["transform_matrix"][row].__setitem__(column, value)
+
+
+INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
+BAD_FIELDS: dict[str, tuple[Edit, tuple[str, ...]]] = {
+    "no frames": (without("frames"), ("'frames'",)),
+    "frames is a number": (listed(frames=3), ("'frames'",)),
+    "a frame is a number": (lambda listing: listing["frames"].append(3), ("frames[4]", "file_path")),
+    "no file_path": (lambda listing: listing["frames"][1].pop("file_path"), ("frames[1]", "file_path")),
+    "no matrix": (lambda listing: listing["frames"][1].pop("transform_matrix"), ("frames[1]", "transform_matrix")),
+    "3x3 matrix": (matrix(lambda m: m[:3, :3]), ("frames[1]", "[3, 3]", "4x4")),
+    "ragged matrix": (matrix(lambda m: [[1.0], [1.0, 2.0]]), ("frames[1]", "4x4")),
+    "words for a matrix": (matrix(lambda m: [["a"] * 4] * 4), ("frames[1]", "4x4")),
+    "NaN": (entry(1, 3, np.nan), ("frames[1]", "transform_matrix", "[1][3] is nan", "finite")),
+    "Inf": (entry(0, 0, np.inf), ("frames[1]", "[0][0] is inf")),
+    "scaled": (matrix(lambda m: m * [[2.0], [2.0], [2.0], [1.0]]), ("frames[1]", "not rigid", "scales by 2")),
+    "sheared": (matrix(lambda m: m @ (np.eye(4) + 0.1 * np.eye(4, k=1))), ("frames[1]",)),
+    "mirrored": (matrix(lambda m: m @ np.diag([-1.0, 1.0, 1.0, 1.0])), ("frames[1]", "mirrors")),
+    "transposed": (matrix(lambda m: m.T), ("frames[1]", "last row")),
+    "zero": (matrix(lambda m: m * 0.0), ("frames[1]",)),
+    "no focal length": (without("fl_x"), ("frames[0]", "fl_x", "camera_angle_x")),
+    "focal length 0": (frame(fl_x=0.0), ("frames[1]", "focal length")),
+    "focal length -1": (frame(fl_y=-1), ("frames[1]", "focal length")),
+    "focal length NaN": (frame(fl_x=float("nan")), ("frames[1]", "fl_x is nan", "finite")),
+    "focal length a word": (frame(fl_x="long"), ("frames[1]", "fl_x is 'long'")),
+    "focal length true": (frame(fl_x=True), ("frames[1]", "fl_x is True")),
+    "angle 0": (without(*INTRINSICS, camera_angle_x=0.0), ("frames[0]", "camera_angle_x", "radians")),
+    "angle -1": (without(*INTRINSICS, camera_angle_x=-1.0), ("frames[0]", "camera_angle_x", "radians")),
+    "angle 4": (without(*INTRINSICS, camera_angle_x=4.0), ("frames[0]", "camera_angle_x", "radians")),
+    "principal point a list": (frame(cx=[1]), ("frames[1]", "cx is [1]")),
+    "principal point of no size": (
+        without("fl_x", "fl_y", "w", "h", camera_angle_x=ANGLE),
+        ("frames[0]", "w and h are absent", "measured in"),
+    ),
+    "width 0": (frame(w=0), ("frames[1]", "0 x 30")),
+    "no size": (without("w", "h"), ("frames[0]", "w and h are absent")),
+    "no height": (without("h"), ("frames[0]", "h is None")),
+    "unknown lens": (frame(camera_model="PANINI"), ("frames[1]", "camera_model is 'PANINI'", "OPENCV")),
+    "fourth radial term": (frame(k4=0.1), ("frames[1]", "k4 is 0.1")),
+    "focal length of 400 digits": (frame(fl_x=10**400), ("frames[1]", "fl_x is 1000", "finite")),
+    "matrix of 400 digits": (matrix(lambda m: [[10**400] * 4] * 4), ("frames[1]", "4x4")),
+    "camera beyond the stars": (entry(0, 3, 1e200), ("frames[1]", "[0][3] is 1e+200", "within")),
+    "width 1e300": (frame(w=1e300), ("frames[1]", "w x h", "at most")),
+    "split a number": (listed(val_filenames=5), ("val_filenames is 5", "list")),
+    "points a list": (listed(ply_file_path=[]), ("ply_file_path is []", "PLY")),
+    "listed twice": (lambda listing: listing["frames"].append(listing["frames"][0]), ("images/00.png twice",)),
+    "split of unknown": (listed(test_filenames=["no.png"]), ("test_filenames", "no.png")),
+}
+
+
+@pytest.mark.parametrize("what", BAD_FIELDS)
+def test_a_wrong_field_of_transforms_json_is_named(root: Path, what: str) -> None:
+    edit, words = BAD_FIELDS[what]
+    edit_transforms(root, edit)
+    assert_one_line(lambda: load_capture(root), str(root / "transforms.json"), *words)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b"[]", b"\xff\xfe\x00", b'{"frames": [}', b"[" * 99_999, b'{"w":' + b"1" * 9999]
+)
+def test_a_file_that_is_no_json_object_is_named(root: Path, content: bytes) -> None:
+    (root / "transforms.json").write_bytes(content)
+    assert_one_line(lambda: load_capture(root), str(root / "transforms.json"))
+
+
+XY = b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n1\n", ("truncated or corrupt",)),
+        (b"", ("truncated or corrupt",)),
+        (b"ply", ("truncated or corrupt",)),
+        (XY + b"end_header\n1 2\n3 4\n", ("'z'",)),
+        (XY + b"property float z\nend_header\n1 2 3\n3 nan 4\n", ("vertex[1].y is nan",)),
+    ],
+)
+def test_damaged_points_in_the_folder_are_named(root: Path, content: bytes, words: tuple[str, ...]) -> None:
+    (root / "sparse_pc.ply").write_bytes(content)
+    assert_one_line(lambda: load_capture(root), "sparse_pc.ply", *words)
 
 
 # Cameras of Polycam, Metashape and RealityCapture: those of the demo capture come back from each program's export.
 
-WRITERS: dict[str, Callable[..., Path]] = {
-    "polycam": exported.polycam,
-    "metashape": exported.metashape,
-    "realitycapture": exported.realitycapture,
-}
-FILES = {
-    "polycam": "keyframes/corrected_cameras/view_002.json",
-    "metashape": "cameras.xml",
-    "realitycapture": "cameras.csv",
+PROGRAMS: dict[str, tuple[str, Callable[..., Path], str]] = {
+    "polycam": ("Polycam", polycam, "keyframes/corrected_cameras/view_002.json"),
+    "metashape": ("Metashape", metashape, "cameras.xml"),
+    "realitycapture": ("RealityCapture", realitycapture, "cameras.csv"),
 }
 
 
 @pytest.fixture(scope="module")
 def original(shared_capture: Path) -> Capture:
-    return load_capture(shared_capture, normalize=False)
+    return raw(shared_capture)
 
 
-def write(program: str, original: Capture, shared_capture: Path, tmp_path: Path, **options: str) -> Path:
-    return WRITERS[program](original, shared_capture, tmp_path / "export", **options)
+@pytest.fixture
+def write(original: Capture, shared_capture: Path, tmp_path: Path) -> Callable[..., Path]:
+    """Export the demo capture as a program does, and return the folder."""
+    return lambda program, **options: PROGRAMS[program][1](original, shared_capture, tmp_path / program, **options)
 
 
-def same_cameras(found: Capture, expected: Capture) -> None:
+def assert_same_cameras(found: Capture, expected: Capture) -> None:
     assert [view.name for view in found.views] == [view.name for view in expected.views]
     for ours, theirs in zip(found.views, expected.views, strict=True):
         np.testing.assert_allclose(ours.viewmat, theirs.viewmat, rtol=0.0, atol=1e-6)
@@ -352,70 +391,54 @@ def same_cameras(found: Capture, expected: Capture) -> None:
         np.testing.assert_array_equal(ours.image, theirs.image)
 
 
-@pytest.mark.parametrize("program", WRITERS)
-@pytest.mark.parametrize("said", [True, False])
-def test_the_cameras_of_an_export_are_those_it_was_made_from(
-    program: str, said: bool, original: Capture, shared_capture: Path, tmp_path: Path
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_the_cameras_of_an_export_are_those_it_was_made_from_and_data_check_looks_it_over(
+    program: str, original: Capture, write: Callable[..., Path], pop: Pop
 ) -> None:
-    folder = write(program, original, shared_capture, tmp_path)
-    source = {"source": program} if said else {}
-    found = load_capture(folder, normalize=False, points=20, **source)
-    same_cameras(found, original)
-    assert found.source.startswith(
-        {"polycam": "Polycam", "metashape": "Metashape", "realitycapture": "RealityCapture"}[program]
-    )
-    assert any("not aligned and left out, first lost" in note for note in found.notes) == (program == "metashape")
+    folder = write(program)
+    for source in ({}, {"source": program}):
+        found = raw(folder, points=20, **source)
+        assert_same_cameras(found, original)
+        assert found.source.startswith(PROGRAMS[program][0])
+        assert any("not aligned and left out, first lost" in note for note in found.notes) == (program == "metashape")
+    said = pop.done("data", "check", folder).out
+    assert "8 views from the" in said
+    assert "8 of 40x32 px" in said
 
 
-def test_a_metashape_export_of_which_every_camera_is_aligned_is_read(
-    original: Capture, shared_capture: Path, tmp_path: Path
-) -> None:
-    folder = write("metashape", original, shared_capture, tmp_path)
-    (path,) = folder.glob("*.xml")
+def test_a_metashape_export_of_which_every_camera_is_aligned_is_read(original: Capture, write: Callable) -> None:
+    path = write("metashape") / "cameras.xml"
     tree = ET.parse(path)
-    for group in tree.iter("cameras"):
-        for entry in [entry for entry in group.iter("camera") if entry.find("transform") is None]:
-            next(parent for parent in tree.iter() if entry in list(parent)).remove(entry)
+    for parent in list(tree.iter()):
+        for entry in [entry for entry in parent.findall("camera") if entry.find("transform") is None]:
+            parent.remove(entry)
     tree.write(path)
-    found = load_capture(folder, normalize=False, points=20)
-    same_cameras(found, original)
+    found = raw(path.parent, points=20)
+    assert_same_cameras(found, original)
     assert not any("not aligned" in note for note in found.notes)
 
 
-def test_polycams_first_cameras_are_read_where_it_has_not_corrected_them(
-    original: Capture, shared_capture: Path, tmp_path: Path
-) -> None:
-    folder = write("polycam", original, shared_capture, tmp_path, kind="")
-    same_cameras(load_capture(folder, normalize=False, points=20), original)
-
-
-def test_structure_from_motion_takes_a_polycam_exports_photographs_and_nothing_else(
-    original: Capture, shared_capture: Path, tmp_path: Path
-) -> None:
-    folder = write("polycam", original, shared_capture, tmp_path)
-    exported.photographs(shared_capture, folder / "keyframes" / "images")
+def test_polycams_first_cameras_are_read_where_it_has_not_corrected_them(original: Capture, write: Callable) -> None:
+    folder = write("polycam", kind="")
+    assert_same_cameras(raw(folder, points=20), original)
+    # structure from motion takes its photographs and nothing else, the corrected ones where there are any
+    shutil.rmtree(folder)
+    write("polycam")
+    write_photograph(folder / "keyframes" / "images" / "view_000.png", photograph(0))
     assert [path.relative_to(folder).as_posix() for path in photographs(folder)] == [
         f"keyframes/corrected_images/view_{i:03d}.png" for i in range(8)
     ]
 
 
-def test_points_beside_an_export_are_read(original: Capture, shared_capture: Path, tmp_path: Path) -> None:
-    folder = write("realitycapture", original, shared_capture, tmp_path)
-    rows = "\n".join(f"{i} {2 * i} {i * i} 10 20 30" for i in range(12))
-    names = "".join(f"property float {axis}\n" for axis in "xyz") + "".join(
-        f"property uchar {color}\n" for color in ("red", "green", "blue")
-    )
-    (folder / "points3D.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 12\n{names}end_header\n{rows}\n")
-    assert len(load_capture(folder, normalize=False).points) == 12
+def test_points_in_the_folder_of_an_export_are_read(write: Callable[..., Path]) -> None:
+    folder = write("realitycapture")
+    write_points(folder / "points3D.ply")
+    assert len(raw(folder).points) == len(cloud()[0])
 
 
-def test_a_metashape_lens_is_opencvs_with_its_tangential_terms_exchanged(
-    original: Capture, shared_capture: Path, tmp_path: Path
-) -> None:
-    from pop_fast.data.exports import read_metashape
-
+def test_a_metashape_lens_is_opencvs_with_its_tangential_terms_exchanged(original: Capture, write: Callable) -> None:
     lens = "<k1>-0.1</k1><k2>0.02</k2><k3>0.003</k3><p1>0.004</p1><p2>-0.005</p2>"
-    folder = write("metashape", original, shared_capture, tmp_path, lens=lens)
+    folder = write("metashape", lens=lens)
     camera = read_metashape(folder / "cameras.xml", folder, "images")[0][0].camera
     x, y = 0.25, -0.125
     r2 = x * x + y * y
@@ -428,10 +451,8 @@ def test_a_metashape_lens_is_opencvs_with_its_tangential_terms_exchanged(
     np.testing.assert_allclose(camera.img_from_cam(np.array([[x, y, 1.0]]))[0], expected, rtol=0.0, atol=1e-9)
 
 
-def test_a_metashape_fisheye_is_opencvs(original: Capture, shared_capture: Path, tmp_path: Path) -> None:
-    from pop_fast.data.exports import read_metashape
-
-    folder = write("metashape", original, shared_capture, tmp_path, lens="<k1>0.1</k1><k4>0.01</k4>", kind="fisheye")
+def test_a_metashape_fisheye_is_opencvs(original: Capture, write: Callable[..., Path]) -> None:
+    folder = write("metashape", lens="<k1>0.1</k1><k4>0.01</k4>", kind="fisheye")
     camera = read_metashape(folder / "cameras.xml", folder, "images")[0][0].camera
     angle = 0.5
     distorted = angle * (1.0 + 0.1 * angle**2 + 0.01 * angle**8)
@@ -466,12 +487,10 @@ DAMAGED = {
 
 
 @pytest.mark.parametrize("case", DAMAGED)
-def test_a_damaged_export_is_one_line_that_names_file_and_field(
-    case: str, original: Capture, shared_capture: Path, tmp_path: Path
-) -> None:
+def test_a_damaged_export_is_one_line_that_names_file_and_field(case: str, write: Callable[..., Path]) -> None:
     program, pattern, instead, message = DAMAGED[case]
-    folder = write(program, original, shared_capture, tmp_path)
-    path = folder / FILES[program]
+    folder = write(program)
+    path = folder / PROGRAMS[program][2]
     text = path.read_text()
     changed = re.sub(pattern, instead, text, count=0 if program != "metashape" or "ameras>" in pattern else 1)
     assert changed != text
@@ -481,28 +500,12 @@ def test_a_damaged_export_is_one_line_that_names_file_and_field(
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("program", WRITERS)
-def test_a_source_that_is_not_there_is_said(program: str, shared_capture: Path) -> None:
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_an_absent_export_or_photograph_is_said(program: str, shared_capture: Path, write: Callable[..., Path]) -> None:
     with pytest.raises(CaptureError, match=r"toy: has no .*; export it there, or choose another --source"):
         load_capture(shared_capture, source=program)
-
-
-def test_a_photograph_that_an_export_lists_and_that_is_absent_can_be_skipped(
-    original: Capture, shared_capture: Path, tmp_path: Path
-) -> None:
-    for program in WRITERS:
-        folder = write(program, original, shared_capture, tmp_path / program)
-        next(path for path in folder.rglob("view_003.png") if "depth" not in path.parts).unlink()
-        with pytest.raises(CaptureError, match="1 of them absent"):
-            load_capture(folder)
-        assert len(load_capture(folder, missing="skip", points=20).views) == 7
-        shutil.rmtree(folder)
-
-
-@pytest.mark.parametrize("program", WRITERS)
-def test_data_check_looks_an_export_over(
-    program: str, original: Capture, shared_capture: Path, tmp_path: Path, pop: Pop
-) -> None:
-    found = pop.done("data", "check", write(program, original, shared_capture, tmp_path))
-    assert "8 views from the" in found.out
-    assert "8 of 40x32 px" in found.out
+    folder = write(program)
+    next(path for path in folder.rglob("view_003.png") if "depth" not in path.parts).unlink()
+    with pytest.raises(CaptureError, match="1 of them absent"):
+        load_capture(folder)
+    assert len(load_capture(folder, missing="skip", points=20).views) == 7

@@ -1,0 +1,200 @@
+"""Files of a result that no run has written so: checkpoints, PLY files, settings, statistics, records and arrays.
+
+Each is refused in one line that names the file, the entry and what to do, and never with a traceback."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from pop_fast.io.ply import load_ply
+from tests.app.conftest import Pop
+from tests.app.damage import says
+
+STATISTICS, RECORDS, SETTINGS = "stats/val_step0029.json", "metrics.jsonl", "cfg.json"
+NOT_JSON = [b"", b"{", b"\xff\xfe", b"[" * 5000, b"1" * 5000]
+NO_OBJECT = [b"[]", b"3", b"null", b'"text"']
+# every value under one key, and one value under every other
+NO_NUMBER = [*(("psnr", value) for value in ("text", [], {}, True, 10**400, 1e300))]
+NO_NUMBER += [(key, "text") for key in ("num_GS", "step", "seconds", "n_blended", "opacity_above_0.9")]
+NO_TEXT = [("machine", 3), ("backend", []), ("versions", "2"), ("method", {})]
+Damage = Callable[[bytes], bytes]
+
+
+def instead(data: bytes) -> Damage:
+    return lambda whole: data
+
+
+def with_fields(change: Callable[[dict[str, Any]], object]) -> Damage:
+    def damage(whole: bytes) -> bytes:
+        content = json.loads(whole)
+        change(content)
+        return json.dumps(content).encode()
+
+    return damage
+
+
+def under(key: str, value: Any, *inside: str) -> Damage:
+    """Put a value under a key of the file, or of an object within it."""
+    return with_fields(lambda content: (content[inside[0]] if inside else content).update({key: value}))
+
+
+# a file of a result, what is done to it, what reads it, and what is said; {} is its path and {n} its last line
+DAMAGED: list[tuple[str, Damage, str, tuple[str, ...]]] = [
+    *((STATISTICS, instead(data), "report compare", ("{}", "is not JSON", "pop eval")) for data in NOT_JSON),
+    *((STATISTICS, instead(data), "report compare", ("{}", "must be an object", "pop eval")) for data in NO_OBJECT),
+    *((STATISTICS, under(*odd), "report compare", (f"{{}}: {odd[0]} is ", "it must be a number")) for odd in NO_NUMBER),
+    *((STATISTICS, under(*odd), "compare", (f"{{}}: {odd[0]} is ",)) for odd in NO_TEXT),
+    *(
+        (
+            RECORDS,
+            lambda whole, data=data: whole + data + b"\n",
+            "report",
+            ("{}: line {n}", "remove the file, or train again"),
+        )
+        for data in [*NOT_JSON[1:], *NO_OBJECT, b"{}", b'{"step": "x"}', b'{"step": true}']
+    ),
+    *(
+        (SETTINGS, under(key, 10**400, "resolved"), "report", ("{}", f"config.{key} is a number beyond 2^53"))
+        for key in ("init_scale", "max_steps", "l2_stop_iter")
+    ),
+    (SETTINGS, under("colour", 1, "resolved"), "eval", ("config.colour", "not a setting")),
+    *(
+        (SETTINGS, instead(data), "eval compare report", ("{}", "repair the file"))
+        for data in (b"", b"{oops", b'{"max_steps": 0}', "{}".encode("utf-16"))
+    ),
+    (SETTINGS, instead(b"[" * 5000), "report", ("{}",)),
+    ("capture.json", instead(b"[" * 5000), "eval", ("{}",)),
+]
+
+
+@pytest.mark.parametrize(("file", "damage", "commands", "parts"), DAMAGED, ids=range(len(DAMAGED)))
+def test_a_file_of_a_result_that_is_damaged_is_named(
+    pop: Pop, result: Path, file: str, damage: Damage, commands: str, parts: tuple[str, ...]
+) -> None:
+    path = result / file
+    path.write_bytes(damage(path.read_bytes()))
+    last = str(len(path.read_bytes().splitlines()))
+    for command in commands.split():
+        says(pop(command, result), *(part.replace("{}", str(path)).replace("{n}", last) for part in parts))
+
+
+def test_a_record_cut_off_is_left_out_and_null_becomes_a_dash(pop: Pop, result: Path) -> None:
+    with open(result / RECORDS, "ab") as file:
+        file.write(b'{"step": 30, "view": "\xc3')
+    pop.done("report", result)
+    for path in (result / "stats").iterdir():
+        path.write_text(json.dumps(dict.fromkeys(json.loads(path.read_text()))))
+    pop.done("report", result)
+    assert "–" in pop("compare", result).out
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "short", "no zip", "flipped"])
+@pytest.mark.parametrize("stem", ["opacity_step-1", "val_step29_0000"])
+def test_arrays_that_are_damaged_are_named(pop: Pop, result: Path, stem: str, damage: str) -> None:
+    path = result / "report_data" / f"{stem}.npz"
+    data = path.read_bytes()
+    # in the array itself, behind the name that stands before it
+    place = data.index(b"counts.npy" if "opacity" in stem else b"render.npy") + 60
+    flipped = data[:place] + bytes([data[place] ^ 255]) + data[place + 1 :]
+    damaged = {"empty": b"", "cut": data[: len(data) // 2], "short": data[:-1], "no zip": b"text", "flipped": flipped}
+    path.write_bytes(damaged[damage])
+    says(pop("report", result), f"{path}: is damaged", "remove the file, or train again")
+
+
+@pytest.mark.parametrize(
+    ("stem", "name", "value"),
+    [
+        *(
+            ("opacity_step-1", "counts", value)
+            for value in (None, np.zeros(3, int), np.zeros((2, 2), int), np.zeros(0, int), np.array("x"))
+        ),
+        ("val_step29_0000", "render", None),
+        ("val_step29_0000", "render", np.zeros(3, np.uint8)),
+        ("val_step29_0000", "photo", np.zeros((4, 4, 3))),
+        ("val_step29_0000", "psnr", np.zeros(2)),
+        ("val_step29_0000", "ssim", np.array("x")),
+        ("val_step29_0000", "name", np.array(3)),
+        ("val_step29_0000", "dominant_ids", np.zeros((2, 2))),
+        ("val_step29_0000", "dominant_ids", np.zeros((2, 2, 2), np.int32)),
+    ],
+)
+def test_an_array_of_another_form_is_named(pop: Pop, result: Path, stem: str, name: str, value: Any) -> None:
+    path = result / "report_data" / f"{stem}.npz"
+    with np.load(path) as stored:
+        arrays = {key: stored[key] for key in stored.files} | {name: value}
+    np.savez(path, **{key: array for key, array in arrays.items() if array is not None})
+    says(pop("report", result), f"{path}: {name} ", "which no run writes")
+
+
+# Checkpoints, and a result without them.
+
+
+def at(index: tuple[int, ...], value: float) -> Callable[[torch.Tensor], torch.Tensor]:
+    def change(tensor: torch.Tensor) -> torch.Tensor:
+        changed = torch.zeros_like(tensor)
+        changed[index] = value
+        return changed
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "parts"),
+    [
+        ("scales", lambda x: None, ("no splats.scales",)),
+        ("means", at((4, 1), float("nan")), ("splats.means[4, 1] is nan",)),
+        ("sh0", at((0, 0, 2), float("inf")), ("splats.sh0[0, 0, 2] is inf",)),
+        ("quats", lambda x: x[:, :3].clone(), ("splats.quats has shape [461, 3]; it must be [461, 4]",)),
+        ("shN", lambda x: x[:, :7].clone(), ("splats.shN has shape", "or 0, 3 or 8")),
+        ("opacities", lambda x: x.long(), ("splats.opacities is torch.int64", "floats")),
+        ("means", lambda x: torch.zeros(()), ("splats.means has shape []",)),
+        ("means", lambda x: [1.0], ("splats.means is list",)),
+        ("quats", lambda x: x.index_fill(0, torch.tensor([2]), 0.0), ("quats[2", "norm > 0")),
+    ],
+)
+def test_every_defect_of_a_checkpoint_is_named_with_its_tensor_before_it_is_exported_or_drawn(
+    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path, name: str, change, parts
+) -> None:
+    params: dict[str, Any] = load_ply(shared_result / "ply" / "point_cloud_29.ply")
+    params[name] = change(params[name])
+    path = tmp_path / "broken.pt"
+    torch.save({"step": 29, "splats": {k: v for k, v in params.items() if v is not None}}, path)
+    # a zero quaternion is found when the splat is drawn or written, and the others when the file is read
+    parts = (*parts, *(["broken.pt"] if "splats." in parts[0] else []))
+    says(pop("export", path, "--out", tmp_path / "o.ply"), *parts)
+    says(pop("eval", path, "--capture", shared_capture), *parts)
+    assert not (tmp_path / "o.ply").exists()
+
+
+def test_an_unsaved_result_and_an_absent_capture_are_named(pop: Pop, capture: Path, result: Path) -> None:
+    gone, path = capture.parent / "gone", result / SETTINGS
+    path.write_bytes(under("data", str(gone), "resolved")(path.read_bytes()))
+    says(pop("eval", result), str(gone), "not there", "--capture DIR")
+    pop.done("eval", result, "--capture", capture)
+    for path in [*(result / "ckpts").iterdir(), *(result / "ply").iterdir()]:
+        path.unlink()
+    says(pop("eval", result), "no checkpoint and no PLY", "--resume")
+
+
+def test_held_out_views_too_small_to_be_measured_are_named(pop: Pop, shared_result: Path) -> None:
+    checkpoint = shared_result / "ckpts" / "ckpt_29_rank0.pt"
+    says(pop("eval", checkpoint, "--factor", "4"), "view_000.png is 10 x 8 px", "lower --factor")
+
+
+def test_endings_may_be_written_in_capitals(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
+    for source in (shared_result / "ply" / "point_cloud_29.ply", shared_result / "ckpts" / "ckpt_29_rank0.pt"):
+        loud = tmp_path / f"LOUD{source.suffix.upper()}"
+        loud.write_bytes(source.read_bytes())
+        pop.done("export", loud, "--out", tmp_path / f"{source.suffix[1:]}.splat")
+
+
+def test_renders_that_are_nested_beyond_reading_are_somebody_else_s(pop: Pop, shared_result: Path, tmp_path: Path):
+    (tmp_path / "renders.json").write_text("[" * 200_000)
+    says(pop("render", shared_result, "--out", tmp_path, "--overwrite"), "renders.json")
