@@ -16,8 +16,7 @@ import pytest
 from pop_fast.cli import main
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
-from tests.app.interruptions import run_until
-from tests.app.tiny import tiny_capture, tiny_config
+from tests.app.tiny import run_until, tiny_capture, tiny_config
 
 ROOT = Path(__file__).parents[2]
 

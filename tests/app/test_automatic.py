@@ -41,8 +41,7 @@ from pop_fast.view.paths import VideoFile
 from pop_fast.view.report.source import read_result
 from tests.app.conftest import ROOT, Pop
 from tests.app.damage import says
-from tests.app.interruptions import interrupt
-from tests.app.tiny import tiny_capture
+from tests.app.tiny import interrupt, tiny_capture
 
 SPEED = Speed(few=10_000, many=40_000, seconds_few=0.02, seconds_many=0.05, took=5.0)
 QUICKLY = ("--checkpoint-every", "50", "--skip-checks", "--skip-sizes", "--no-progress")
@@ -61,16 +60,21 @@ def test_photographs_are_shrunk_to_what_the_machine_trains_on(side: int, gpu: bo
 
 
 def test_the_schedule_fills_the_minutes_and_is_at_most_the_papers() -> None:
-    config = TrainConfig.of(preset="auto")
-    choices = [choose_length(config, SPEED, minutes, 1e5, 50, 7) for minutes in (3.0, 8.0, 15.0)]
+    def chosen(minutes: float) -> Choice:
+        return choose_length(TrainConfig.of(preset="auto"), SPEED, minutes, 1e5, 50, 7)
+
+    choices = [chosen(minutes) for minutes in (3.0, 8.0, 15.0)]
     for minutes, choice in zip((3.0, 8.0, 15.0), choices, strict=True):
         assert 0.97 * 60.0 * minutes <= choice.seconds <= 60.0 * minutes * 1.005
     assert choices[0].scaler < choices[1].scaler < choices[2].scaler < 1.0
-    assert choose_length(config, SPEED, 1e4, 1e5, 50, 7).scaler == 1.0
-    shortest = choose_length(config, SPEED, 0.01, 1e5, 50, 7)
+    assert chosen(1e4).scaler == 1.0
     # what does not fit is not said to
-    assert shortest.scaler == SHORTEST
-    assert shortest.seconds > 0.6
+    assert chosen(0.01).scaler == SHORTEST
+    assert chosen(0.01).seconds > 0.6
+    # no minute more makes it shorter
+    scalers = [chosen(minutes).scaler for minutes in np.linspace(0.2, 4.0, 60)]
+    assert scalers == sorted(scalers)
+    assert min(scalers) < QUICK_SCALER < max(scalers)
 
 
 def test_few_photographs_are_not_looked_at_for_as_long_as_the_minutes_allow() -> None:
@@ -92,17 +96,15 @@ def test_few_photographs_are_not_looked_at_for_as_long_as_the_minutes_allow() ->
 
 @pytest.mark.parametrize("method", ["pop", "gsplat", "3dgs"])
 def test_a_short_schedule_has_the_rates_and_the_coarse_photographs_of_quick(method: str) -> None:
-    quick = TrainConfig.of(method=method, preset="quick")
-    same = TrainConfig.of(method=method, preset="auto", steps_scaler=QUICK_SCALER)
-    assert replace(same, given=None) == replace(quick, given=None)
-    longer = TrainConfig.of(method=method, preset="auto", steps_scaler=1.01 * QUICK_SCALER)
-    assert longer.coarse_stop_iters == ()
-    shorter = TrainConfig.of(method=method, preset="auto", steps_scaler=SHORTEST)
+    def auto(scaler: float, **said: Any) -> TrainConfig:
+        return TrainConfig.of(method=method, preset="auto", steps_scaler=scaler, **said)
+
+    quick, shorter = TrainConfig.of(method=method, preset="quick"), auto(SHORTEST)
+    assert replace(auto(QUICK_SCALER), given=None) == replace(quick, given=None)
+    assert auto(1.01 * QUICK_SCALER).coarse_stop_iters == ()
     assert shorter.lr == quick.lr
     assert [stop / shorter.max_steps for stop in shorter.coarse_stop_iters] == pytest.approx([1 / 6, 1 / 3], rel=0.01)
-    said = TrainConfig.of(
-        method=method, preset="auto", steps_scaler=SHORTEST, **{"lr.sh0": 0.5, "coarse_stop_iters": ()}
-    )
+    said = auto(SHORTEST, **{"lr.sh0": 0.5, "coarse_stop_iters": ()})
     assert (said.lr.sh0, said.coarse_stop_iters) == (0.5, ())
 
 
@@ -129,13 +131,6 @@ def test_rates_go_from_those_of_quick_to_the_published_ones_and_no_length_jumps(
     assert ((decays == published.beta2) == (scalers >= QUICK_BETA2_UNTIL)).all()
 
 
-def test_no_minute_more_makes_a_schedule_shorter() -> None:
-    config = TrainConfig.of(preset="auto")
-    scalers = [choose_length(config, SPEED, minutes, 1e5, 50, 7).scaler for minutes in np.linspace(0.2, 4.0, 60)]
-    assert scalers == sorted(scalers)
-    assert min(scalers) < QUICK_SCALER < max(scalers)
-
-
 def test_a_step_with_more_gaussians_takes_longer_by_as_much_as_was_measured() -> None:
     assert SPEED.seconds_a_step(10_000) == pytest.approx(0.02)
     assert SPEED.seconds_a_step(25_000) == pytest.approx(0.035)
@@ -147,25 +142,23 @@ def test_a_step_with_more_gaussians_takes_longer_by_as_much_as_was_measured() ->
 
 # method, Gaussians at the start, px of a photograph, photographs, scaler, Gaussians at the end: of benchmarks/results,
 # paper_repro/results and runs of 11 photographs of a castle
-@pytest.mark.parametrize(
-    ("method", "first", "pixels", "photographs", "scaler", "ended"),
-    [
-        *(("pop", 2_903, 129_600, 8, 0.05, 9_640), ("pop", 9_293, 129_600, 25, 0.05, 16_220)),
-        *(("pop", 12_037, 129_600, 43, 0.1, 23_812), ("pop", 12_037, 129_600, 43, 1.0, 51_486)),
-        *(("pop", 34_174, 262_144, 84, 0.05, 50_269), ("pop", 34_174, 262_144, 84, 0.1, 57_520)),
-        *(("pop", 138_766, 262_144, 161, 0.05, 155_999), ("pop", 138_766, 262_144, 161, 0.1, 174_982)),
-        *(("pop", 109_926, 106_400, 255, 0.05, 124_785), ("pop", 109_926, 106_400, 255, 0.1, 128_315)),
-        ("pop", 8_381, 167_560, 9, 0.519, 40_437),
-        *(("gsplat", 12_037, 129_600, 43, 0.1, 108_258), ("gsplat", 34_174, 262_144, 84, 0.1, 380_025)),
-        *(("gsplat", 138_766, 262_144, 161, 0.1, 727_341), ("gsplat", 109_926, 106_400, 255, 0.1, 511_103)),
-        ("3dgs", 12_037, 129_600, 43, 1.0, 197_012),
-    ],
-)
-def test_gaussians_are_foretold_as_runs_had_them(
-    method: str, first: int, pixels: float, photographs: int, scaler: float, ended: int
-) -> None:
-    within = 0.1 if method == "pop" else 0.15
-    assert expected_gaussians(method, first, pixels, photographs, scaler)[0] == pytest.approx(ended, rel=within)
+ENDED = [
+    *(("pop", 2_903, 129_600, 8, 0.05, 9_640), ("pop", 9_293, 129_600, 25, 0.05, 16_220)),
+    *(("pop", 12_037, 129_600, 43, 0.1, 23_812), ("pop", 12_037, 129_600, 43, 1.0, 51_486)),
+    *(("pop", 34_174, 262_144, 84, 0.05, 50_269), ("pop", 34_174, 262_144, 84, 0.1, 57_520)),
+    *(("pop", 138_766, 262_144, 161, 0.05, 155_999), ("pop", 138_766, 262_144, 161, 0.1, 174_982)),
+    *(("pop", 109_926, 106_400, 255, 0.05, 124_785), ("pop", 109_926, 106_400, 255, 0.1, 128_315)),
+    ("pop", 8_381, 167_560, 9, 0.519, 40_437),
+    *(("gsplat", 12_037, 129_600, 43, 0.1, 108_258), ("gsplat", 34_174, 262_144, 84, 0.1, 380_025)),
+    *(("gsplat", 138_766, 262_144, 161, 0.1, 727_341), ("gsplat", 109_926, 106_400, 255, 0.1, 511_103)),
+    ("3dgs", 12_037, 129_600, 43, 1.0, 197_012),
+]
+
+
+def test_gaussians_are_foretold_as_runs_had_them() -> None:
+    for method, *run, ended in ENDED:
+        within = 0.1 if method == "pop" else 0.15
+        assert expected_gaussians(method, *run)[0] == pytest.approx(ended, rel=within), (method, run)
 
 
 @pytest.mark.parametrize(
@@ -208,8 +201,7 @@ def test_a_run_without_options_says_what_it_chose_keeps_it_and_resumes_to_the_sa
 
 def test_what_is_said_wins_over_what_is_chosen(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
     said = ("--factor", "2", "--pop.blur-min-pixels", "3", "--log-every", "50")
-    words = ("train", shared_capture, "--out", tmp_path / "r", "--minutes", "0.001", *said, *QUICKLY)
-    assert pop(*words).status == 0
+    pop.done("train", shared_capture, "--out", tmp_path / "r", "--minutes", "0.001", *said, *QUICKLY)
     resolved = json.loads((tmp_path / "r" / "cfg.json").read_text())["resolved"]
     assert (resolved["factor"], resolved["log_every"], resolved["strategy"]["blur_min_pixels"]) == (2, 50, 3.0)
 
@@ -249,9 +241,7 @@ def test_exposures_are_learned_where_cameras_noted_that_they_drift() -> None:
     assert chosen(capture, 2.0).settings == {"exposure": True}
     assert "2.0 stops apart" in chosen(capture, 2.0).why[0]
     assert chosen(capture, 1.0) == chosen(capture, 2.0, exposure=False) == chosen(capture, 2.0, batch_size=2) == Terms()
-
-
-def test_a_term_that_the_backend_does_not_know_is_not_chosen_and_that_is_said() -> None:
+    # a term that the backend does not know is not chosen, and that is said
     terms = chosen(tiny_capture(), 2.0, backend="cuda")
     assert terms.settings == {}
     assert ["depth_lambda" in why or "exposure" in why for why in terms.why] == [True, True]
@@ -303,51 +293,26 @@ def test_a_table_of_settings_compares_the_same_seeds_alone() -> None:
 
 
 def test_depth_that_no_track_tells_is_warned_of(pop: Pop, capture: Path, tmp_path: Path) -> None:
-    words = (
-        "train",
-        with_tracks(capture, 0),
-        "--max-steps",
-        "2",
-        "--out",
-        tmp_path / "r",
-        "--depth-lambda",
-        "0.01",
-        *QUICKLY,
-    )
-    outcome = pop(*words)
-    assert outcome.status == 0
-    assert "depth_lambda is 0.01, and the term does nothing" in outcome.err
+    words = ("--max-steps", "2", "--out", tmp_path / "r", "--depth-lambda", "0.01", *QUICKLY)
+    said = pop.done("train", with_tracks(capture, 0), *words).err
+    assert "depth_lambda is 0.01, and the term does nothing" in said
 
 
-def test_the_papers_preset_is_the_protocol_to_the_letter() -> None:
-    config = TrainConfig.of(preset="paper")
-    assert (config.max_steps, config.factor, config.strategy.blur_min_pixels) == (30_000, 1, 0.0)
-
-
-@pytest.mark.parametrize("words", [("--preset", "quick"), ("--max-steps", "9"), ("--steps-scaler", "0.1")])
-def test_minutes_and_a_schedule_exclude_each_other(
-    pop: Pop, shared_capture: Path, tmp_path: Path, words: tuple[str, ...]
-) -> None:
-    outcome = pop("train", shared_capture, "--out", tmp_path / "r", "--minutes", "5", *words)
-    says(outcome, "--minutes", "leave one of them out")
-    says(pop("train", shared_capture, "--out", tmp_path / "r", "--minutes", "-1"), "--minutes is -1.0")
-
-
-def archive(path: Path, capture: Path, top: str = "") -> Path:
-    with zipfile.ZipFile(path, "w") as file:
-        for part in sorted(capture.rglob("*")):
-            if part.is_file():
-                file.write(part, top + part.relative_to(capture).as_posix())
-        file.writestr("__MACOSX/._a.jpg", b"nothing")
-    return path
+def test_minutes_and_a_schedule_exclude_each_other(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
+    words = ("train", shared_capture, "--out", tmp_path / "r", "--minutes")
+    for schedule in (("--preset", "quick"), ("--max-steps", "9"), ("--steps-scaler", "0.1")):
+        says(pop(*words, "5", *schedule), "--minutes", "leave one of them out")
+    says(pop(*words, "-1"), "--minutes is -1.0")
 
 
 def test_an_archive_trains_without_a_second_command(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
-    packed = archive(tmp_path / "toy.zip", shared_capture, "walk/")
-    words = ("train", packed, "--out", tmp_path / "r", "--max-steps", "2", *QUICKLY)
-    outcome = pop(*words)
-    assert outcome.status == 0, outcome.err
-    assert "unpacked in" in outcome.out
+    packed = tmp_path / "toy.zip"
+    with zipfile.ZipFile(packed, "w") as file:
+        for part in filter(Path.is_file, shared_capture.rglob("*")):
+            file.write(part, f"walk/{part.relative_to(shared_capture).as_posix()}")
+        file.writestr("__MACOSX/._a.jpg", b"nothing")
+    said = pop.done("train", packed, "--out", tmp_path / "r", "--max-steps", "2", *QUICKLY).out
+    assert "unpacked in" in said
     folder = tmp_path / "toy_unpacked" / "walk"
     assert json.loads((tmp_path / "r" / "cfg.json").read_text())["resolved"]["data"] == str(folder)
     assert not (tmp_path / "toy_unpacked" / "__MACOSX").exists()

@@ -28,7 +28,7 @@ from pop_fast.train import TrainConfig
 from tests.app.captures import write_photograph
 from tests.app.conftest import ROOT, TRAIN, Pop
 from tests.app.damage import says
-from tests.app.interruptions import interrupt
+from tests.app.tiny import interrupt
 
 
 def test_the_overview_lists_every_subcommand_without_importing_torch() -> None:

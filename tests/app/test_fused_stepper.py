@@ -35,8 +35,7 @@ from pop_fast.train.steps import why_not_trained
 from pop_fast.train.torch_stepper import TorchStepper
 from pop_ref.settings import PARAMETERS
 from tests.app.drift import MOST, Drift, drift_engine
-from tests.app.interruptions import interrupted, run_until
-from tests.app.tiny import HEIGHT, N_POINTS, WIDTH, last_checkpoint, tiny_capture, tiny_config
+from tests.app.tiny import HEIGHT, N_POINTS, WIDTH, interrupted, last_checkpoint, run_until, tiny_capture, tiny_config
 
 CLOCKS = ("it_per_s", "seconds")
 

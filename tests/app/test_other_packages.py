@@ -27,9 +27,7 @@ from pop_fast.stages.backend import FAST
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from tests.app.conftest import TRAIN, Pop
-from tests.app.interruptions import run_until
-from tests.app.test_resume import assert_same_run
-from tests.app.tiny import tiny_capture, tiny_config
+from tests.app.tiny import assert_same_run, run_until, tiny_capture, tiny_config
 from tests.fast.test_rasterization import cameras, scene
 
 ROOT = Path(__file__).resolve().parents[2]

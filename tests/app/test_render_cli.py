@@ -37,7 +37,7 @@ from tests.app.captures import (
 from tests.app.conftest import Pop
 from tests.app.damage import contents, says
 from tests.app.test_blocks import in_this_process
-from tests.app.test_methods import engine_or_skip, tiny_method
+from tests.app.test_strategies import engine_or_skip, tiny_method
 from tests.app.tiny import tiny_capture
 
 

@@ -1,4 +1,6 @@
-"""report.html: what it shows, what it is made from, and that it needs nothing but itself."""
+"""report.html: what it shows, what it is made from, and that it needs nothing but itself.
+
+A small result folder as `pop train` leaves it, made without training."""
 
 from __future__ import annotations
 
@@ -9,6 +11,7 @@ from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,6 +28,7 @@ from pop_fast.io import pictures
 from pop_fast.io.frame import Frame
 from pop_fast.io.pictures import colormap_table
 from pop_fast.io.ply import save_ply
+from pop_fast.train.config import TrainConfig
 from pop_fast.train.gpu_proxy import renderer
 from pop_fast.train.load_result import load_splat
 from pop_fast.view.paths import frames_in
@@ -46,7 +50,6 @@ from pop_fast.view.report.source import read_result, running_mean, thin_out
 from tests.app.browser import browser
 from tests.app.conftest import TRAIN, TRAIN_AND_CHECK, Pop
 from tests.app.damage import says
-from tests.app.result_folder import VIEWS, write_result
 from tests.app.test_paths import ring
 from tests.app.tiny import tiny_capture
 
@@ -528,3 +531,51 @@ def test_the_report_of_a_folder_without_pictures_of_depth_is_whole(tmp_path: Pat
 def test_a_frame_of_the_orbit_shows_the_scene(shared_result: Path) -> None:
     video = cv2.VideoCapture(str(shared_result / "videos" / "orbit_step29.webm"))
     assert video.read()[1].std() > 5.0
+
+
+VIEWS = ("a.png", "b.png")
+
+
+def write_result(folder: Path, method: str = "pop", steps: int = 300, **stats: Any) -> Path:
+    """Write cfg.json, metrics.jsonl, stats and report_data of a made-up run of `steps` steps; returns the folder."""
+    config = TrainConfig.of(data="captures/toy", method=method, steps_scaler=steps / 30_000)
+    for name in ("stats", "report_data"):
+        (folder / name).mkdir(parents=True)
+    (folder / "cfg.json").write_text(config.to_json())
+    rng = np.random.default_rng(0)
+    with open(folder / "metrics.jsonl", "w") as file:
+        for step in range(0, steps, 10):
+            file.write(json.dumps(_record(step, steps, rng)) + "\n")
+    measured = {"psnr": 24.5, "ssim": 0.81, "lpips": None, "lpips_reason": "no weights were given", **stats}
+    last = steps - 1
+    base = {"step": last, "num_GS": 1200, "num_GS_above_floor": 1100, "seconds": 30.0, "machine": "a machine"}
+    opacity = {"opacity_below_0.1": 0.25, "opacity_above_0.9": 0.5}
+    (folder / "stats" / f"train_step{last:04d}.json").write_text(json.dumps({**base, **opacity}))
+    (folder / "stats" / f"val_step{last:04d}.json").write_text(json.dumps({**base, **opacity, **measured}))
+    edges = np.linspace(0.0, 1.0, 101)
+    for step, sample in ((-1, np.full(50, 0.1)), (69, rng.beta(1, 1, 500)), (last, rng.beta(0.3, 0.3, 500))):
+        counts = np.histogram(sample, edges)[0]
+        np.savez(folder / "report_data" / f"opacity_step{step}.npz", step=step, counts=counts, edges=edges)
+    for i, name in enumerate(VIEWS):
+        photo = rng.integers(0, 255, (24, 32, 3), dtype=np.uint8)
+        render = np.clip(photo.astype(int) + rng.integers(-9, 9, photo.shape), 0, 255).astype(np.uint8)
+        ids = rng.integers(-1, 40, (24, 32)).astype(np.int32)
+        arrays = {"name": name, "render": render, "photo": photo, "dominant_ids": ids, "psnr": 24.0 + i, "ssim": 0.8}
+        np.savez(folder / "report_data" / f"val_step{last}_{i}.npz", **arrays)
+    return folder
+
+
+def _record(step: int, steps: int, rng: np.random.Generator) -> dict[str, Any]:
+    record: dict[str, Any] = {
+        "step": step,
+        "loss": 0.1 / (1 + step / 50) + 0.001 * float(rng.random()),
+        "psnr": 15.0 + 10.0 * step / steps,
+        "num_gaussians": 1000 + step,
+        "n_blended": 20.0 - step / steps,
+        "n_traversed": 40.0 - step / steps,
+    }
+    if step in (20, 40):
+        record |= {"cloned": 5, "split": 3, "pruned": 2}
+    if step == 40:
+        record["reset"] = True
+    return record

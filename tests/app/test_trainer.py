@@ -6,6 +6,7 @@ import io
 import json
 import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,11 +35,7 @@ from pop_fast.train.views import ViewTensors, render_view
 from pop_ref.settings import Objective
 from tests.app.captures import assert_one_line, cloud, photograph, ring
 from tests.app.conftest import TRAIN, Pop
-from tests.app.tiny import HEIGHT, WIDTH, tiny_capture, tiny_config
-
-
-def records(folder):
-    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+from tests.app.tiny import HEIGHT, WIDTH, records, tiny_capture, tiny_config
 
 
 @pytest.fixture(scope="module", params=["pop", "gsplat", "3dgs"])
@@ -67,18 +64,14 @@ def test_what_a_run_starts_from_stays_the_callers(tmp_path):
     assert not torch.equal(run.params["means"], before["means"])
 
 
-def test_the_number_of_gaussians_changes_when_the_schedule_says(finished):
-    trainer, _, folder = finished
+def test_the_number_of_gaussians_changes_when_the_schedule_says_and_adds_up(finished):
+    trainer, stats, folder = finished
     changed = [record for record in records(folder) if "cloned" in record]
     changes = [record["step"] for record in changed if not record.get("reset") or record["step"] % 4 == 0]
     assert changes == [4, 8, 12, 16, 20]
     resets = [record["step"] for record in changed if record.get("reset")]
     assert resets == ([] if trainer.config.method == "pop" else [12])
     assert sum(record["cloned"] + record["split"] for record in changed) > 0
-
-
-def test_numbers_of_gaussians_add_up(finished):
-    _, stats, folder = finished
     n = len(tiny_capture().points)
     for record in records(folder):
         n += record.get("cloned", 0) + record.get("split", 0) - record.get("pruned", 0)
@@ -86,26 +79,17 @@ def test_numbers_of_gaussians_add_up(finished):
     assert stats["num_GS"] == n
 
 
-def test_the_pop_term_is_logged_while_it_is_on(finished):
+def test_a_record_is_written_every_other_step_and_its_loss_is_the_sum_of_its_terms(finished):
     trainer, _, folder = finished
-    with_term = [record["step"] for record in records(folder) if "pop" in record]
-    assert with_term == (list(range(0, 24, 2)) if trainer.config.method == "pop" else [])
-
-
-def test_the_loss_is_the_sum_of_its_terms(finished):
-    trainer, _, folder = finished
-    weight = trainer.config.objective_at(0).lambda_ssim
+    pop, weight = trainer.config.method == "pop", trainer.config.objective_at(0).lambda_ssim
+    assert [record["step"] for record in records(folder)] == list(range(0, 30, 2))
+    assert [record["step"] for record in records(folder) if "pop" in record] == (list(range(0, 24, 2)) if pop else [])
+    needed = {"view", "n_blended", "n_traversed", "sh_degree", "lr_means", "it_per_s", "seconds", "num_gaussians"}
     for record in records(folder):
-        pixelwise = record["l2" if trainer.config.method == "pop" else "l1"]
+        assert needed <= set(record)
+        pixelwise = record["l2" if pop else "l1"]
         total = (1 - weight) * pixelwise + weight * record["d_ssim"] + record.get("pop", 0.0)
         assert record["loss"] == pytest.approx(total, rel=1e-5)
-
-
-def test_a_record_is_written_every_other_step_and_at_changes(finished):
-    _, _, folder = finished
-    assert [record["step"] for record in records(folder)] == list(range(0, 30, 2))
-    needed = {"view", "n_blended", "n_traversed", "sh_degree", "lr_means", "it_per_s", "seconds", "num_gaussians"}
-    assert all(needed <= set(record) for record in records(folder))
 
 
 def test_the_folder_holds_what_its_docstring_lists(finished):
@@ -142,26 +126,19 @@ def test_statistics_are_complete(finished):
     assert list(stats["per_view"]) == ["00.png"]
 
 
-def test_the_ply_holds_the_last_parameters(finished):
+def test_the_ply_the_pictures_and_the_checkpoint_are_of_the_last_parameters(finished):
     trainer, _, folder = finished
     loaded = load_ply(folder / "ply" / "point_cloud_29.ply")
-    for key in KEYS:
-        assert torch.equal(loaded[key], trainer.params[key].detach())
-
-
-def test_pictures_keep_size_and_ids(finished):
-    trainer, _, folder = finished
-    with np.load(folder / "report_data" / "val_step29_0000.npz") as arrays:
-        assert arrays["render"].shape == arrays["photo"].shape == (HEIGHT, WIDTH, 3)
-        assert -1 <= arrays["dominant_ids"].min() <= arrays["dominant_ids"].max() < len(trainer.params["means"])
-
-
-def test_gsplat_can_read_the_checkpoint(finished):
-    trainer, _, folder = finished
+    # as gsplat reads it
     content = torch.load(folder / "ckpts" / "ckpt_29_rank0.pt", weights_only=True)
     assert content["step"] == 29
     assert list(content["splats"]) == list(KEYS)
-    assert all(torch.equal(content["splats"][key], trainer.params[key]) for key in KEYS)
+    for key in KEYS:
+        assert torch.equal(loaded[key], trainer.params[key].detach())
+        assert torch.equal(content["splats"][key], trainer.params[key])
+    with np.load(folder / "report_data" / "val_step29_0000.npz") as arrays:
+        assert arrays["render"].shape == arrays["photo"].shape == (HEIGHT, WIDTH, 3)
+        assert -1 <= arrays["dominant_ids"].min() <= arrays["dominant_ids"].max() < len(trainer.params["means"])
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_does_not(finished, tmp_path):
@@ -236,15 +213,14 @@ def test_the_target_cache_changes_no_bit(tmp_path):
     assert losses[0] == losses[1]
 
 
-def test_an_existing_folder_is_not_touched_without_leave(tmp_path):
+def test_a_folder_is_not_touched_without_leave_and_overwriting_removes_results_and_nothing_else(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     for kind in ({}, {"overwrite": True}, {"resume": True}):
         with pytest.raises(PopError, match=r"choose another|another result folder"):
             TrainingRun(tiny_config(tmp_path), tiny_capture(), **kind).run()
+    with pytest.raises(PopError, match="is a file"):
+        TrainingRun(tiny_config(tmp_path / "notes.txt"), tiny_capture()).run()
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
-
-
-def test_overwriting_removes_results_and_nothing_else(tmp_path):
     folder = tmp_path / "run"
     TrainingRun(tiny_config(folder, max_steps=6), tiny_capture()).run()
     (folder / "notes.txt").write_text("mine")
@@ -253,17 +229,6 @@ def test_overwriting_removes_results_and_nothing_else(tmp_path):
     TrainingRun(tiny_config(folder, max_steps=4), tiny_capture(), overwrite=True).run()
     assert (folder / "notes.txt").read_text() == "mine"
     assert [path.name for path in (folder / "ckpts").iterdir()] == ["ckpt_3_rank0.pt"]
-
-
-def test_a_result_folder_that_is_a_file_is_refused(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(PopError, match="is a file"):
-        TrainingRun(tiny_config(tmp_path / "file"), tiny_capture()).run()
-
-
-def test_no_view_to_train_on_is_said(tmp_path):
-    with pytest.raises(PopError, match="no view to train on"):
-        TrainingRun(tiny_config(tmp_path, test_every=1), tiny_capture())
 
 
 @pytest.mark.parametrize("key", ["means", "opacities", "shN"])
@@ -339,25 +304,24 @@ def test_rotations_are_uniform_in_the_unit_cube_and_follow_the_seed() -> None:
     assert torch.allclose(first.mean(dim=0), torch.tensor(0.5), atol=0.03)
 
 
-def test_points_that_coincide_and_single_points_get_a_finite_size() -> None:
+def test_points_that_coincide_and_few_points_get_a_finite_size() -> None:
     same = some_capture(np.zeros((5, 3)))
     floor = math.log(math.sqrt(1e-7) * same.scene_scale())
     for capture in (same, some_capture(np.zeros((1, 3)))):
-        assert initialize_params(capture)["scales"].flatten().tolist() == pytest.approx(
-            [floor] * (3 * len(capture.points)), rel=1e-6
-        )
-
-
-def test_fewer_than_four_points_use_the_neighbours_there_are() -> None:
+        found = initialize_params(capture)["scales"].flatten().tolist()
+        assert found == pytest.approx([floor] * (3 * len(capture.points)), rel=1e-6)
+    # fewer than four use the neighbours there are
     params = initialize_params(some_capture(np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])), dtype=torch.float64)
     assert params["scales"].exp().flatten().tolist() == pytest.approx([2.0] * 6)
 
 
-def test_a_capture_without_points_and_an_impossible_opacity_are_refused() -> None:
+def test_a_capture_without_points_or_views_and_an_impossible_opacity_are_refused(tmp_path) -> None:
     capture = some_capture(cloud(4)[0])
     empty = replace(capture, points=np.zeros((0, 3)), points_rgb=np.zeros((0, 3), np.uint8))
     assert_one_line(lambda: initialize_params(empty), "scene", "no points")
     assert_one_line(lambda: initialize_params(capture, init_opacity=1.0), "init_opacity", "between 0 and 1")
+    all_held_out = tiny_config(tmp_path, test_every=1)
+    assert_one_line(lambda: TrainingRun(all_held_out, tiny_capture()), "no view to train on")
 
 
 # What is measured: PSNR, SSIM, counts of the Gaussians, and averages.
@@ -369,37 +333,18 @@ def pictures(seed=0, height=40, width=30):
     return (target + 0.2 * torch.randn(height, width, 3, generator=g)), target
 
 
-def test_psnr_is_scikit_images_on_the_clamped_render():
+def test_psnr_and_ssim_are_scikit_images_on_the_clamped_render_and_ssim_over_whole_windows():
     # here, since it takes seconds to import and every worker imports every module
-    from skimage.metrics import peak_signal_noise_ratio
+    from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
     image, target = pictures()
-    want = peak_signal_noise_ratio(target.double().numpy(), image.clamp(0, 1).double().numpy(), data_range=1.0)
-    assert psnr(image, target) == pytest.approx(want, rel=1e-6)
-
-
-def test_psnr_of_equal_pictures_is_infinite_and_of_black_on_white_zero():
-    white = torch.ones(4, 4, 3)
-    assert psnr(white, white) == math.inf
-    assert psnr(torch.zeros(4, 4, 3), white) == 0.0
-
-
-def test_ssim_is_scikit_images_over_whole_windows():
-    from skimage.metrics import structural_similarity
-
-    image, target = pictures()
-    clamped = image.clamp(0, 1)
-    _, full = structural_similarity(
-        target.double().numpy(),
-        clamped.double().numpy(),
-        data_range=1.0,
-        channel_axis=2,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        full=True,
-    )
+    given = (target.double().numpy(), image.clamp(0, 1).double().numpy())
+    assert psnr(image, target) == pytest.approx(peak_signal_noise_ratio(*given, data_range=1.0), rel=1e-6)
+    windows = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    _, full = structural_similarity(*given, data_range=1.0, channel_axis=2, full=True, **windows)
     assert measure(image, target).ssim == pytest.approx(full[5:-5, 5:-5].mean(), rel=1e-5)
+    white = torch.ones(4, 4, 3)
+    assert (psnr(white, white), psnr(torch.zeros(4, 4, 3), white)) == (math.inf, 0.0)
 
 
 def test_masked_pixels_do_not_count():
@@ -430,14 +375,16 @@ def test_the_population_is_counted_at_both_poles_and_at_the_floor():
 # Where nobody sees a bar, what is being done is told line by line.
 
 
-def wait_for_a_line(capsys: pytest.CaptureFixture[str]) -> str:
-    end = time.monotonic() + 60.0
-    while time.monotonic() < end:
-        told = capsys.readouterr().err
-        if told:
-            return told.splitlines()[0]
+def wait_for(found: Callable[[], str | bool]) -> str:
+    end = time.perf_counter() + 60.0
+    while not (told := found()):
+        assert time.perf_counter() < end, "nothing is told"
         time.sleep(0.005)
-    raise AssertionError("nothing is told")
+    return str(told)
+
+
+def wait_for_a_line(capsys: pytest.CaptureFixture[str]) -> str:
+    return wait_for(lambda: capsys.readouterr().err).splitlines()[0]
 
 
 def test_a_line_comes_by_itself_from_within_a_long_computation(capsys: pytest.CaptureFixture[str]) -> None:
@@ -469,20 +416,15 @@ def test_the_time_that_is_left_is_told(capsys: pytest.CaptureFixture[str], monke
         report("matching pairs of photographs", 0, 300)
         clock[0] += 60.0
         report("matching pairs of photographs", 100, 300)
-        end = time.perf_counter() + 60.0
-        told = ""
-        while " left" not in told and time.perf_counter() < end:
-            told = capsys.readouterr().err
+        told = wait_for(lambda: told if " left" in (told := capsys.readouterr().err) else "")
     assert "pop: matching pairs of photographs: 100 of 300, 2 min 0 s left (" in told
 
 
 def test_a_training_whose_steps_are_all_taken_says_what_it_does_then() -> None:
-    assert (
-        heartbeat.so_far(100, 400, 50, 20.0, "") == "step 100 of 400, 50 Gaussians, 5.0 steps a second, 1 min 0 s left"
-    )
-    assert heartbeat.so_far(400, 400, 50, 80.0, ", PSNR 21.00") == (
-        "step 400 of 400, 50 Gaussians, PSNR 21.00, measuring and writing"
-    )
+    left = "step 100 of 400, 50 Gaussians, 5.0 steps a second, 1 min 0 s left"
+    assert heartbeat.so_far(100, 400, 50, 20.0, "") == left
+    done = "step 400 of 400, 50 Gaussians, PSNR 21.00, measuring and writing"
+    assert heartbeat.so_far(400, 400, 50, 80.0, ", PSNR 21.00") == done
 
 
 @pytest.mark.parametrize("quiet", [True, False])
@@ -495,33 +437,21 @@ def test_a_terminal_and_a_quiet_run_are_told_nothing(monkeypatch: pytest.MonkeyP
     assert stream.getvalue() == ""
 
 
-def test_the_bar_of_a_long_stage_is_drawn_anew_in_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bars_of_long_stages_and_of_steps_that_take_long_are_drawn_anew_in_a_terminal(
+    pop: Pop, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("sys.stderr", stream := Terminal())
     monkeypatch.setattr(heartbeat, "TICK", 0.01)
     with bars() as report:
         report("reading photographs", 3, 10)
-        drawn_anew(stream, "3/10")
+        wait_for(lambda: stream.getvalue().count("3/10") >= 4)
     assert "pop: " not in stream.getvalue()
-
-
-def drawn_anew(stream: io.StringIO, words: str) -> None:
-    end = time.monotonic() + 60.0
-    while stream.getvalue().count(words) < 4:
-        assert time.monotonic() < end, stream.getvalue()
-        time.sleep(0.01)
-
-
-def test_the_bar_of_a_step_that_takes_long_is_drawn_anew_in_a_terminal(
-    pop: Pop, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     took = TrainingRun.take_steps
 
     def slowly(training: TrainingRun, last: int) -> Any:
-        drawn_anew(stream, "0/1 [")
+        wait_for(lambda: stream.getvalue().count("0/1 [") >= 4)
         return took(training, last)
 
-    monkeypatch.setattr(heartbeat, "TICK", 0.01)
-    monkeypatch.setattr("sys.stderr", stream := Terminal())
     monkeypatch.setattr(TrainingRun, "take_steps", slowly)
     words = ("--out", tmp_path / "r", "--max-steps", "1", "--skip-checks", "--skip-sizes")
     assert pop("train", shared_capture, *words).status == 0

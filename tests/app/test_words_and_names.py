@@ -35,7 +35,7 @@ from tests.app.captures import (
 )
 from tests.app.conftest import TRAIN, Pop
 from tests.app.damage import photo, says
-from tests.app.interruptions import interrupt
+from tests.app.tiny import interrupt
 
 
 @pytest.mark.parametrize("name", ["a=b", "x y", "--", "-s"])
