@@ -1,6 +1,4 @@
-"""The report's verdict: its numbers, no contradictions, and commands that ask for the run that was judged.
-
-What the report says to type next helps: commands are taken from reports and typed, and the results are measured."""
+"""The report's verdict: its numbers, no contradictions, and commands that ask for the run that was judged and help."""
 
 from __future__ import annotations
 
@@ -37,6 +35,14 @@ GOOD = Checks(
 )
 
 
+ONE = {"a": 0.3}
+SIX_APART = {"train_psnr": 24.8, "held_out_psnr": 18.6}
+
+
+def orbit(shares: list[float]) -> dict[str, float]:
+    return {f"frame {i}": share for i, share in enumerate(shares)}
+
+
 @pytest.mark.parametrize(
     ("about", "changes", "kind", "words"),
     [
@@ -60,22 +66,12 @@ GOOD = Checks(
         ("Floaters", {"floaters": {"a": 0.0, "b": 0.015}}, "look", "worst b, 1.5 %"),
         ("Floaters", {"floaters": {"a": 0.1, "b": 0.3}}, "bad", "20.0 % of the pixels"),
         # frames of the orbit vanish, and no photograph's view shows anything
+        ("Floaters", {"orbit_floaters": orbit(53 * [0.0] + 7 * [0.8])}, "bad", "hides much of 7 views"),
+        ("Floaters", {"orbit_floaters": orbit(60 * [0.001])}, "good", "2 photographs' views and 60"),
+        ("Floaters", {"floaters": ONE, "without_floaters": 29.45}, "bad", "29.45 dB instead of 29.50"),
         (
             "Floaters",
-            {"orbit_floaters": {f"frame {i}": 0.8 * (i > 52) for i in range(60)}},
-            "bad",
-            "hides much of 7 views",
-        ),
-        (
-            "Floaters",
-            {"orbit_floaters": {f"frame {i}": 0.001 for i in range(60)}},
-            "good",
-            "2 photographs' views and 60",
-        ),
-        ("Floaters", {"floaters": {"a": 0.3}, "without_floaters": 29.45}, "bad", "29.45 dB instead of 29.50"),
-        (
-            "Floaters",
-            {"floaters": {"a": 0.3}, "without_floaters": 28.0},
+            {"floaters": ONE, "without_floaters": 28.0},
             "look",
             "without them held-out views have 28.00",
         ),
@@ -86,12 +82,7 @@ GOOD = Checks(
         ("Fit", {"train_psnr": 18.09, "held_out_psnr": 17.0, "steps": 90}, "bad", "few steps"),
         ("Overfitting", {"train_psnr": 18.09, "held_out_psnr": 17.0}, "look", "both low"),
         # as close as these are, 6.2 dB say that they are not close enough
-        (
-            "Photographs",
-            {"train_psnr": 24.8, "held_out_psnr": 18.6},
-            "bad",
-            "not enough for what this subject takes, as the 6.2 dB",
-        ),
+        ("Photographs", SIX_APART, "bad", "not enough for what this subject takes, as the 6.2 dB"),
         # hardly a drift, but 1.1 dB
         ("Exposure", {"matched_psnr": 30.6}, "look", "30.60 dB instead of 29.50"),
     ],
@@ -147,9 +138,9 @@ def test_no_verdict_contradicts_another_and_each_fault_ends_in_a_command(
     [(31.0, "good", "very close"), (26.0, "good", "close"), (22.0, "look", "recognisable"), (12.0, "bad", "far from")],
 )
 def test_the_verdict_says_how_close_the_renders_are(psnr: float, kind: str, words: str) -> None:
-    quality = verdict({"psnr": psnr}, None, None)
-    assert [(f.about, f.kind) for f in quality] == [("Quality", kind)]
-    assert words in quality[0].text
+    (quality,) = verdict({"psnr": psnr}, None, None)
+    assert (quality.about, quality.kind) == ("Quality", kind)
+    assert words in quality.text
 
 
 @pytest.mark.parametrize(
@@ -166,12 +157,11 @@ def test_views_that_few_steps_left_as_they_are_ask_for_more_steps(train: float, 
 
 
 def test_a_view_that_spoils_the_mean_is_named() -> None:
-    views = {"edge": 8.05, "a": 19.8, "b": 20.0}
-    (quality, *_) = verdict({}, replace(GOOD, held_out=views, held_out_psnr=15.95), None)
-    assert "edge is the worst, 8.05 dB; the mean without it is 19.90 dB." in quality.text
-    even = {"edge": 19.5, "a": 19.8, "b": 20.0}
-    (quality, *_) = verdict({}, replace(GOOD, held_out=even, held_out_psnr=19.77), None)
-    assert "worst" not in quality.text
+    for edge, mean, named in ((8.05, 15.95, True), (19.5, 19.77, False)):
+        views = {"edge": edge, "a": 19.8, "b": 20.0}
+        (quality, *_) = verdict({}, replace(GOOD, held_out=views, held_out_psnr=mean), None)
+        said = f"edge is the worst, {edge:.2f} dB; the mean without it is 19.90 dB."
+        assert (said in quality.text, "worst" in quality.text) == (named, named)
 
 
 def test_a_run_whose_held_out_views_got_worse_is_told_when_that_began() -> None:
@@ -244,21 +234,17 @@ def test_another_training_is_asked_for_as_the_judged_one_was(name: str, words: t
     again, options = train_arguments(line[1:])
     assert (again.data, again.result_dir) == ("my scene", "out/a_next")
     assert options.minutes == (240.0 if "--minutes" in words else None)
-    assert (again.method, again.seed, again.factor, again.background) == (
-        *(run.method, run.seed, run.factor),
-        run.background,
-    )
-    kept = {"exposure", "depth_lambda", "test_every", "normalize"} - changes
-    assert {key: getattr(again, key) for key in kept} == {key: getattr(run, key) for key in kept}
+    kept = {"method", "seed", "factor", "background", "exposure", "depth_lambda", "test_every", "normalize"} - changes
     if "steps" not in changes:
-        assert (again.max_steps, again.strategy, again.lr) == (run.max_steps, run.strategy, run.lr)
-    elif "--steps-scaler" in words:
+        kept |= {"max_steps", "strategy", "lr"}
+    assert {key: getattr(again, key) for key in kept} == {key: getattr(run, key) for key in kept}
+    if "--steps-scaler" in words:
         assert again.max_steps == 3_600
         assert again.strategy.lambda_pop == run.strategy.lambda_pop
     assert "--preset" not in line or "--minutes" not in words
 
 
-pytestmark = pytest.mark.slow
+# What the report says to type next helps: commands are taken from reports and typed, and the results are measured.
 
 
 @pytest.fixture(scope="module")
@@ -288,6 +274,7 @@ def edited(demo: Path, folder: Path, change: Callable[[int, np.ndarray], np.ndar
     return folder
 
 
+@pytest.mark.slow
 def test_more_steps_help_where_few_left_all_views_far_off_and_fewer_where_it_learned_them_by_heart(
     pop: Pop, demo: Path, tmp_path: Path
 ) -> None:
@@ -308,6 +295,7 @@ def test_more_steps_help_where_few_left_all_views_far_off_and_fewer_where_it_lea
     assert "Course" not in told
 
 
+@pytest.mark.slow
 def test_exposures_that_drift_are_learned(pop: Pop, demo: Path, tmp_path: Path) -> None:
     gains = 0.8 * np.exp2(np.random.default_rng(0).normal(0.0, 0.4, 20))
     drifting = edited(demo, tmp_path / "drifting", lambda number, image: image * gains[number])
@@ -321,6 +309,7 @@ def test_exposures_that_drift_are_learned(pop: Pop, demo: Path, tmp_path: Path) 
     assert told["Exposure"].kind == "good"
 
 
+@pytest.mark.slow
 def test_views_are_held_out_where_none_were(pop: Pop, demo: Path, tmp_path: Path) -> None:
     words = ["train", demo, "--out", tmp_path / "run", "--steps-scaler", "0.01", "--test-every", "0"]
     before, told = trained(pop, words)
@@ -331,6 +320,7 @@ def test_views_are_held_out_where_none_were(pop: Pop, demo: Path, tmp_path: Path
     assert "held-out views" in told["Overfitting"].text
 
 
+@pytest.mark.slow
 def test_photographs_that_are_far_apart_are_looked_over_and_the_gaps_named(
     pop: Pop, demo: Path, tmp_path: Path
 ) -> None:
@@ -341,6 +331,7 @@ def test_photographs_that_are_far_apart_are_looked_over_and_the_gaps_named(
     assert "photographs between these would help most" in line
 
 
+@pytest.mark.slow
 def test_what_moved_is_left_out_by_the_masks_that_the_report_asks_for(pop: Pop, demo: Path, tmp_path: Path) -> None:
     def place(number: int) -> tuple[slice, slice]:
         return slice(18, 34), slice(4 + 2 * number, 18 + 2 * number)
