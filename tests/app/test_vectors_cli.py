@@ -1,8 +1,4 @@
-"""`pop vectors`: what it writes is enough for a port without Python, and what it is given is answered in one line.
-
-A renderer as somebody would port it: written from what `index.json` says, with json and numpy alone, in float32.
-
-It draws what it can (no square extents, harmonics to degree 1, no gradients) and judges itself by the index."""
+"""`pop vectors`: what it writes is enough for a port without Python, and what it is given is answered in one line."""
 
 from __future__ import annotations
 
@@ -48,7 +44,9 @@ def port(shared_vectors: Path, made_once: Callable[..., Path]) -> Path:
     return made_once("port", make) / "results"
 
 
-def test_a_port_written_from_the_index_passes_in_npz(pop: Pop, shared_vectors: Path, port: Path) -> None:
+def test_a_port_written_from_the_index_passes_in_npz_and_in_json(
+    pop: Pop, shared_vectors: Path, port: Path, tmp_path: Path
+) -> None:
     outcome = pop("vectors", "check", shared_vectors, port)
     drawn = len(list(port.iterdir()))
     assert outcome.status == 0, outcome.out
@@ -57,14 +55,11 @@ def test_a_port_written_from_the_index_passes_in_npz(pop: Pop, shared_vectors: P
     assert "not there, not judged: depths, means2d, conics" in outcome.out
     assert "no result for, not judged: harmonics_of_degree_three, inria" in outcome.out
     assert outcome.out.endswith("all that is there passes\n")
-
-
-def test_results_may_be_json(pop: Pop, shared_vectors: Path, port: Path, tmp_path: Path) -> None:
     for path in port.iterdir():
         with np.load(path) as stored:
             text = json.dumps({name: stored[name].tolist() for name in stored.files})
         (tmp_path / f"{path.stem}.json").write_text(text)
-    assert pop("vectors", "check", shared_vectors, tmp_path).status == 0
+    pop.done("vectors", "check", shared_vectors, tmp_path)
 
 
 def test_a_broken_port_is_told_which_array_of_which_vector_and_where(
@@ -94,10 +89,16 @@ def _split(text: str) -> list:
     return parts
 
 
-def test_one_wrong_entry_is_found_and_named(pop: Pop, shared_vectors: Path, port: Path, tmp_path: Path) -> None:
+def test_one_wrong_entry_is_found_and_what_the_index_does_not_know_is_said(
+    pop: Pop, shared_vectors: Path, port: Path, tmp_path: Path
+) -> None:
     results = shutil.copytree(port, tmp_path / "results")
+    (results / "notes.txt").write_text("mine")
     with np.load(results / "golden.npz") as stored:
-        arrays = dict(stored)
+        arrays = {**stored, "v_mean": np.zeros(3)}
+    np.savez(results / "golden.npz", **arrays)
+    outcome = pop.done("vectors", "check", shared_vectors, results)
+    assert "unknown, not judged: notes.txt, golden.npz: v_mean" in outcome.out
     arrays["image"][3, 5, 1] += 1e-3
     np.savez(results / "golden.npz", **arrays)
     outcome = pop("vectors", "check", shared_vectors, results)
@@ -105,15 +106,11 @@ def test_one_wrong_entry_is_found_and_named(pop: Pop, shared_vectors: Path, port
     (line,) = (line for line in outcome.out.splitlines() if "golden: off by" in line)
     assert re.search(r"off by \S+ of its error_bound, allowed \S+; ", line), line
     assert "at [3, 5, 1]: got " in outcome.out
-
-
-def test_what_the_index_does_not_know_is_said(pop: Pop, shared_vectors: Path, port: Path, tmp_path: Path) -> None:
-    results = shutil.copytree(port, tmp_path / "results")
-    (results / "notes.txt").write_text("mine")
-    with np.load(results / "golden.npz") as stored:
-        np.savez(results / "golden.npz", **{**stored, "v_mean": np.zeros(3)})
-    outcome = pop.done("vectors", "check", shared_vectors, results)
-    assert "unknown, not judged: notes.txt, golden.npz: v_mean" in outcome.out
+    # what is not finite never passes
+    np.savez(results / "golden.npz", T_final=np.full_like(arrays["T_final"], np.nan))
+    outcome = pop("vectors", "check", shared_vectors, results)
+    assert outcome.status == 1
+    assert "golden: off by inf" in outcome.out
 
 
 @pytest.mark.slow  # it makes every vector
@@ -227,18 +224,13 @@ def test_results_that_cannot_be_read_are_refused_by_one_line(
     says(pop("vectors", "check", shared_vectors, results), *parts)
 
 
-def test_what_is_not_finite_never_passes(pop: Pop, shared_vectors: Path, tmp_path: Path) -> None:
-    with np.load(shared_vectors / "golden.npz") as stored:
-        np.savez(tmp_path / "golden.npz", T_final=np.full_like(stored["T_final"], np.nan))
-    outcome = pop("vectors", "check", shared_vectors, tmp_path)
-    assert outcome.status == 1
-    assert "golden: off by inf" in outcome.out
-
-
 @pytest.mark.parametrize("words", [(), ("judge",), ("check", "a"), ("check", "a", "b", "--dtype", "half")])
 def test_bad_usage_has_status_two(pop: Pop, words: tuple[str, ...]) -> None:
     assert pop("vectors", *words).status == 2
 
+
+# A renderer as somebody would port it: written from what `index.json` says, with json and numpy alone, in float32. It
+# draws what it can (no square extents, harmonics to degree 1, no gradients) and judges itself by the index.
 
 Real = np.float32
 Arrays = dict[str, np.ndarray]
@@ -330,7 +322,7 @@ def judge(index: dict, wanted: Arrays, name: str, result: np.ndarray) -> bool:
     return bool(np.all(good | ~mask))
 
 
-def run(vectors: Path, results: Path, shift: float = 0.5, as_json: bool = False) -> set[tuple[str, str]]:
+def run(vectors: Path, results: Path, shift: float = 0.5) -> set[tuple[str, str]]:
     """Draw every vector within reach, write the results, and return which arrays of which vectors fail."""
     index = json.loads((vectors / "index.json").read_text())
     results.mkdir()
@@ -340,13 +332,9 @@ def run(vectors: Path, results: Path, shift: float = 0.5, as_json: bool = False)
             continue
         with np.load(vectors / vector["file"]) as stored:
             wanted = {key: stored[key] for key in stored.files}
-        inputs = {
-            key: value for key, value in wanted.items() if index["kinds"]["render"]["arrays"][key]["role"] == "input"
-        }
+        arrays = index["kinds"]["render"]["arrays"]
+        inputs = {key: value for key, value in wanted.items() if arrays[key]["role"] == "input"}
         drawn = draw(inputs, vector["options"], shift)
-        if as_json:
-            (results / f"{name}.json").write_text(json.dumps({key: value.tolist() for key, value in drawn.items()}))
-        else:
-            np.savez(results / f"{name}.npz", **drawn)  # type: ignore[arg-type]
+        np.savez(results / f"{name}.npz", **drawn)  # type: ignore[arg-type]
         failed |= {(name, key) for key, value in drawn.items() if not judge(index, wanted, key, value)}
     return failed
