@@ -25,19 +25,15 @@ from pop_fast.errors import PopError
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.model import KEYS
 from pop_fast.train.presets import METHODS
-from pop_ref import fisher, mini_splatting, selection, taming
-from pop_ref.chord import dominant_points
+from pop_ref import mini_splatting, selection, taming
 from pop_ref.contributions import contributions
-from pop_ref.density import average_grads
 from pop_ref.recipes import RECIPES
 from pop_ref.records import Camera
 from pop_ref.render import render
-from pop_ref.sensitivity import sensitivities
 from pop_ref.settings import PopTerm
 from pop_ref.training import gaussians_from_params
 from tests.app.populations import densified_at, make, make_info
 from tests.app.tiny import tiny_capture, tiny_config
-from tests.train.oracle_steps import state_of
 
 
 def test_gsplat_attribute_names_exist_with_gsplat_numbers():
@@ -307,202 +303,52 @@ def test_a_run_that_is_stopped_anywhere_goes_on_to_the_same_bits(method: str, ba
         assert all(torch.equal(again.params[key], whole.params[key]) for key in KEYS), f"after step {step}"
 
 
-class Recorded:
-    """Draws from one list of numbers, so that an oracle can be given the same."""
-
-    def __init__(self, seed: int = 5) -> None:
-        self.generator = np.random.default_rng(seed)
-        self.drawn: list[np.ndarray] = []
-
-    def draws(self) -> Draws:
-        return Draws(lambda n: torch.tensor(self.generator.standard_normal((2, n, 3))), self.uniforms)
-
-    def uniforms(self, n: int) -> Tensor:
-        self.drawn.append(self.generator.random(n))
-        return torch.tensor(self.drawn[-1])
-
-
-def in_double(folder: Any, method: str, before: int, **plan: Any) -> tuple[TrainingRun, Recorded]:
-    """Take a run in double precision to a step, with settings of its own; its draws are recorded from there on."""
-    config = tiny_method(folder, method)
+def test_a_method_that_looks_at_the_views_sees_those_of_the_run_as_they_are_drawn(tmp_path: Any) -> None:
+    # what each method makes of what it sees the laws of training say, and what a pass sees `tests/fast/test_passes.py`
+    config = tiny_method(tmp_path, "mini-splatting")
     start = TrainingRun(config, tiny_capture())
+    assert start.state["first_count"] == len(start.params["means"])
     initial = {key: value.detach().double() for key, value in start.params.items()}
-    run, recorded = TrainingRun(config, tiny_capture(), initial=initial), Recorded()
-    run.draws = recorded.draws()
-    run.strategy = replace(run.strategy, **plan)
-    stopped_before(run, before)
-    recorded.drawn.clear()
-    return run, recorded
-
-
-def stopped_before(run: TrainingRun, step: int) -> None:
-    while run.step < step:
-        run.take_steps(run.step + 1)
-
-
-def cameras_of(run: TrainingRun) -> list[tuple[Camera, np.ndarray]]:
-    return [
-        (Camera(view.viewmat[0].numpy(), view.K[0].numpy(), view.width, view.height), view.photo.numpy())
-        for view in run._train
-    ]
-
-
-def drawn_views(run: TrainingRun, params: dict[str, np.ndarray], **how: Any) -> Iterator[Any]:
-    """Yield what the oracle renders of each training view, its camera, its photograph, and what a pass is given."""
-    gaussians, profile = gaussians_from_params(params), METHODS[run.config.method].recipe.profile
-    for camera, photo in cameras_of(run):
-        drawn = render(gaussians, camera, profile=profile, **how)
-        yield drawn, camera, photo, (drawn.splats, drawn.tile_lists, camera.width, camera.height, profile.tile_size)
-
-
-def assert_removed(gone: np.ndarray, before: dict[str, np.ndarray], after: dict[str, np.ndarray], change: Any) -> None:
-    assert 0 < change.pruned == gone.sum() < len(gone)
-    for key in KEYS:
-        np.testing.assert_array_equal(after[key], before[key][~gone])
-
-
-def hold_change(run: TrainingRun, step: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], Any]:
-    """Hold density control after a step by itself, and return the parameters before and after it."""
-
-    def arrays() -> dict[str, np.ndarray]:
-        return {key: value.detach().numpy().copy() for key, value in run.params.items()}
-
-    before, change = arrays(), run._change(step)
-    return before, arrays(), change
-
-
-def test_speedy_splat_removes_who_the_oracle_says(tmp_path: Any) -> None:
-    run, _ = in_double(tmp_path, "speedy-splat", 25)
-    with pytest.raises(ValueError, match="this strategy looks at the training views"):
-        run.strategy.change(run.params, run.optimizers, run.state, 25)
-    before, after, change = hold_change(run, 25)
-    profile = METHODS["speedy-splat"].recipe.profile
-    scores = sum(sensitivities(*given, None, profile) for *_, given in drawn_views(run, before))
-    assert_removed(selection.lowest_share(scores, 0.3), before, after, change)
-
-
-def test_pup_removes_who_the_oracle_says_and_forgets_all_moments(tmp_path: Any) -> None:
-    run, _ = in_double(tmp_path, "pup", 20)
-    before, after, change = hold_change(run, 20)
-    gaussians, profile = gaussians_from_params(before), METHODS["pup"].recipe.profile
-    blocks = np.zeros((len(gaussians), 6, 6))
-    for whole, _ in cameras_of(run):
-        width, height = -(-whole.width // 4), -(-whole.height // 4)
-        K = whole.K * np.array([[width / whole.width], [height / whole.height], [1.0]])
-        camera = Camera(whole.viewmat, K, width, height)
-        drawn = render(gaussians, camera, profile=profile)
-        size = (width, height, profile.tile_size)
-        moments = fisher.screen_moments(drawn.splats, drawn.tile_lists, *size, None, profile)
-        blocks += fisher.fisher_blocks(gaussians, camera, moments, None, profile)
-    assert_removed(selection.lowest_share(fisher.log_det_scores(blocks), 0.5), before, after, change)
-    for key in KEYS:
-        assert not any(value.any() for value in run.optimizers[key].state[run.params[key]].values())
-
-
-def test_mini_splatting_sets_points_where_the_oracle_does(tmp_path: Any) -> None:
-    run, recorded = in_double(tmp_path, "mini-splatting", 7)
-    before, after, change = hold_change(run, 7)
-    gaussians, profile = gaussians_from_params(before), METHODS["mini-splatting"].recipe.profile
-    views, points, colors = list(drawn_views(run, before, sh_degree=0)), [], []
-    for (drawn, camera, photo, _), uniforms in zip(views, recorded.drawn, strict=True):
-        found = dominant_points(drawn.splats, drawn.tile_lists, gaussians, camera, profile.tile_size, profile)
-        weights = np.where(found.ids >= 0, 1.0 - found.T_final, 0.0).ravel()
-        wanted = mini_splatting.samples_per_view(len(views), camera.width, camera.height, 240)
-        chosen = selection.sample_without_replacement(weights, min(wanted, int(np.sum(weights > 0))), uniforms)
-        points.append(found.points.reshape(-1, 3)[chosen])
-        colors.append(photo.reshape(-1, 3)[chosen] / 255.0)
-    assert change.replaced == len(after["means"]) == sum(map(len, points)) > 100
-    np.testing.assert_allclose(after["means"], np.concatenate(points), atol=1e-9)
-    rgb = after["sh0"][:, 0] * 0.28209479177387814 + 0.5
-    np.testing.assert_allclose(rgb, np.concatenate(colors), atol=1e-12)
-    np.testing.assert_allclose(after["scales"], mini_splatting.nearest_log_scales(after["means"]), atol=1e-9)
-    np.testing.assert_allclose(after["opacities"], np.log(0.1 / 0.9), rtol=1e-12)
-    assert not after["shN"].any()
-    np.testing.assert_array_equal(after["quats"], np.tile([1.0, 0.0, 0.0, 0.0], (change.replaced, 1)))
-
-
-@pytest.mark.parametrize("importance", ["indoor", "outdoor"])
-def test_mini_splatting_draws_and_prunes_by_the_oracles_importance(importance: str, tmp_path: Any) -> None:
-    run, recorded = in_double(tmp_path, "mini-splatting", 18, importance=importance)
+    run, drawn, generator = TrainingRun(config, tiny_capture(), initial=initial), [], np.random.default_rng(5)
     profile = METHODS["mini-splatting"].recipe.profile
 
-    def oracles(params: dict[str, np.ndarray], degree: int) -> np.ndarray:
-        seen = [
-            (contributions(*given, None, profile), drawn.dominant_counts)
-            for drawn, _, _, given in drawn_views(run, params, sh_degree=degree)
-        ]
-        return mini_splatting.scene_importance(seen, importance == "outdoor")
+    def uniforms(n: int) -> Tensor:
+        drawn.append(generator.random(n))
+        return torch.tensor(drawn[-1])
 
-    before, after, change = hold_change(run, 18)
-    weights = oracles(before, 1)
+    def importance(means: dict[str, np.ndarray], degree: int) -> np.ndarray:
+        seen = []
+        for view in run._train:
+            camera = Camera(view.viewmat[0].numpy(), view.K[0].numpy(), view.width, view.height)
+            found = render(gaussians_from_params(means), camera, sh_degree=degree, profile=profile)
+            size = (camera.width, camera.height, profile.tile_size)
+            weights = contributions(found.splats, found.tile_lists, *size, None, profile)
+            seen.append((weights, found.dominant_counts))
+        return mini_splatting.scene_importance(seen, False)
+
+    def changed(step: int) -> tuple[dict[str, np.ndarray], Any]:
+        """Hold density control after a step by itself; return the parameters before it."""
+        while run.step < step:
+            run.take_steps(run.step + 1)
+        before = {key: value.detach().numpy().copy() for key, value in run.params.items()}
+        if step == 18:
+            with pytest.raises(ValueError, match="this strategy looks at the training views"):
+                run.strategy.change(run.params, run.optimizers, run.state, step)
+        return before, run._change(step)
+
+    run.draws = Draws(lambda n: torch.tensor(generator.standard_normal((2, n, 3))), uniforms)
+    before, change = changed(18)
+    weights = importance(before, 1)
     wanted = int(0.5 * np.sum(weights > 0))
-    chosen = selection.sample_without_replacement(weights, wanted, recorded.drawn[0])
+    chosen = selection.sample_without_replacement(weights, wanted, drawn[-1])
     assert change.replaced == wanted > 20
     for key in ("means", "sh0"):
-        np.testing.assert_array_equal(after[key], before[key][chosen])
+        np.testing.assert_array_equal(run.params[key].detach().numpy(), before[key][chosen])
     run.step = 19
-    stopped_before(run, 24)
-    before, after, change = hold_change(run, 24)
-    assert_removed(selection.least_mass(oracles(before, 2), 0.05), before, after, change)
-
-
-@pytest.mark.parametrize("misaligned", [False, True])
-def test_taming_grows_and_prunes_who_the_oracle_draws(misaligned: bool, tmp_path: Any) -> None:
-    rules = {"misaligned_prune_weights": misaligned, "grow_grad2d": 1e-4, "prune_opa": 0.6}
-    run, recorded = in_double(tmp_path, "taming", 16, **rules)
-    plan: Any = run.strategy
-    # statistics of the window belong to the step before it
-    state, draws = state_of(run), recorded.drawn
-    before, after, change = hold_change(run, 16)
-    views, gaussians = cameras_of(run), gaussians_from_params(before)
-    chosen = [views[i] for i in np.argsort(draws[0], kind="stable")[:3]]
-    grads = average_grads(state.statistics, plan)
-    scores = taming.taming_scores(gaussians, chosen, grads, None, 2, METHODS["taming"].recipe.profile)
-    small = gaussians.scales.max(1) <= plan.grow_scale3d * run.state["scene_scale"]
-    candidates = grads >= plan.grow_grad2d
-    budget = taming.budget_at(plan.densification_at(16), plan.n_densifications, 60, plan.target(60))
-    quotas = taming.quotas(budget, len(grads), int((candidates & small).sum()), int((candidates & ~small).sum()))
-    sampled = []
-    for mask, quota, uniforms in zip((candidates & small, candidates & ~small), quotas, draws[1:3], strict=True):
-        weights = np.where(mask, scores, 0.0)
-        sampled.append(selection.sample_without_replacement(weights, min(quota, int(np.sum(weights > 0))), uniforms))
-    assert (change.cloned, change.split) == tuple(map(len, sampled))
-    assert change.cloned + change.split > 0
-    kept = np.setdiff1d(np.arange(len(grads)), sampled[1])
-    inverse = 1.0 / (1e-6 + scores)
-    chances = np.zeros(len(draws[3]))
-    first = inverse if misaligned else inverse[kept]
-    chances[: len(first)] = first[: len(chances)]
-    grown = np.concatenate([before["opacities"][kept], before["opacities"][sampled[0]]])
-    grown = np.concatenate([grown, np.tile(before["opacities"][sampled[1]], 2)])
-    faint = 1.0 / (1.0 + np.exp(-grown)) < plan.prune_opa
-    drawn = selection.sample_without_replacement(chances, int(faint.sum()) // 2, draws[3])
-    gone = faint & np.isin(np.arange(len(grown)), drawn)
-    assert change.pruned == gone.sum() > 0
-    np.testing.assert_array_equal(after["opacities"], grown[~gone])
-
-
-def test_the_last_densification_step_of_taming_prunes_nothing(tmp_path: Any) -> None:
-    last: Any = tiny_method(tmp_path, "taming").strategy
-    rules = {"prune_opa": 0.6, "sampled_prunes": last.densification_at(16) - 1}
-    run, _ = in_double(tmp_path, "taming", 16, **rules)
-    faint = (torch.sigmoid(run.params["opacities"].detach()) < 0.6).sum()
-    assert hold_change(run, 16)[2].pruned == 0 < faint
-
-
-def test_mini_splatting_splits_who_was_blurred_in_any_view_since_the_last_densification_step(tmp_path: Any) -> None:
-    default = METHODS["mini-splatting"].strategy().blur_window
-    windows = (default, "own_view")
-    runs = {window: in_double(tmp_path, "mini-splatting", 0, blur_window=window)[0] for window in windows}
-    flags: dict[str, list[Tensor]] = {window: [] for window in runs}
-    # the first densification step comes after step 4: until then both runs have the same Gaussians
-    for step in range(1, 5):
-        for window, run in runs.items():
-            run.take_steps(step)
-            flags[window].append(run.state["blurred"].bool().clone())
-    of_own_views = torch.stack(flags["own_view"])
-    assert torch.equal(flags[default][-1], of_own_views.any(0))
-    assert not torch.equal(of_own_views.any(0), of_own_views[-1])
+    before, change = changed(24)
+    gone = selection.least_mass(importance(before, 2), 0.05)
+    assert 0 < change.pruned == gone.sum() < len(gone)
+    np.testing.assert_array_equal(run.params["means"].detach().numpy(), before["means"][~gone])
 
 
 @pytest.mark.parametrize(
