@@ -275,26 +275,18 @@ def test_sizes_are_the_root_mean_square_distance_to_the_three_nearest_neighbours
     assert torch.allclose(wider["scales"], params["scales"] + math.log(2.0))
 
 
-def test_colours_places_and_opacities_are_those_of_the_points() -> None:
+def test_colours_places_and_opacities_are_those_of_the_points_and_rotations_are_drawn() -> None:
     points, rgb = cloud(10)
     params = initialize_params(some_capture(points, rgb), init_opacity=0.25)
-    assert {name: tuple(value.shape) for name, value in params.items()} == {
-        "means": (10, 3),
-        "scales": (10, 3),
-        "quats": (10, 4),
-        "opacities": (10,),
-        "sh0": (10, 1, 3),
-        "shN": (10, 15, 3),
-    }
+    shapes = [(10, 3), (10, 3), (10, 4), (10,), (10, 1, 3), (10, 15, 3)]
+    assert {name: tuple(value.shape) for name, value in params.items()} == dict(zip(KEYS, shapes, strict=True))
     assert all(value.dtype == torch.float32 for value in params.values())
     assert np.allclose(params["means"].numpy(), points, atol=1e-6)
     assert torch.allclose(torch.sigmoid(params["opacities"]), torch.tensor(0.25))
     shown = 0.5 + 0.28209479177387814 * params["sh0"][:, 0]
     assert np.allclose(shown.numpy() * 255.0, rgb, atol=1e-3)
     assert not params["shN"].any()
-
-
-def test_rotations_are_uniform_in_the_unit_cube_and_follow_the_seed() -> None:
+    # rotations are uniform in the unit cube and follow the seed
     capture = some_capture(cloud(2000)[0])
     first, again, other = (initialize_params(capture, seed)["quats"] for seed in (0, 0, 1))
     assert torch.equal(first, again)
@@ -347,7 +339,7 @@ def test_psnr_and_ssim_are_scikit_images_on_the_clamped_render_and_ssim_over_who
     assert (psnr(white, white), psnr(torch.zeros(4, 4, 3), white)) == (math.inf, 0.0)
 
 
-def test_masked_pixels_do_not_count():
+def test_masked_pixels_do_not_count_and_averages_are_over_views():
     image, target = pictures()
     mask = torch.ones(40, 30, dtype=torch.bool)
     mask[:, 20:] = False
@@ -355,9 +347,7 @@ def test_masked_pixels_do_not_count():
     spoiled[:, 20:] = 1.0 - target[:, 20:].round()
     assert measure(spoiled, target, mask) == measure(image, target, mask)
     assert measure(spoiled, target, mask).psnr == pytest.approx(psnr(image[:, :20], target[:, :20]), rel=1e-6)
-
-
-def test_averages_are_over_views_and_no_view_gives_null():
+    # averages are over views, and no view gives null
     measured = [measure(*pictures(seed)) for seed in (0, 1)]
     means = average(measured, [])
     assert means["psnr"] == pytest.approx(np.mean([m.psnr for m in measured]))
@@ -396,20 +386,18 @@ def test_a_line_comes_by_itself_from_within_a_long_computation(capsys: pytest.Ca
     assert capsys.readouterr().err == ""
 
 
-def test_stages_that_report_are_told(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(heartbeat, "PERIOD", 0.01)
-    with bars() as report:
-        report("matching photographs", 64, 1225)
-        assert wait_for_a_line(capsys).startswith("pop: matching photographs: 64 of 1,225 (")
-
-
 class Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True
 
 
-def test_the_time_that_is_left_is_told(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stages_that_report_are_told_with_the_time_that_is_left(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(heartbeat, "PERIOD", 0.01)
+    with bars() as report:
+        report("matching photographs", 64, 1225)
+        assert wait_for_a_line(capsys).startswith("pop: matching photographs: 64 of 1,225 (")
     clock = [100.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: clock[0])
     with bars() as report:
@@ -469,9 +457,6 @@ def test_training_tells_how_far_it_is(
     assert pop("train", shared_capture, "--out", tmp_path / "q", *TRAIN).err == ""
 
 
-@pytest.mark.parametrize(
-    ("seconds", "words"),
-    [(0.4, "0 s"), (59.4, "59 s"), (59.6, "1 min 0 s"), (3599, "59 min 59 s"), (7860, "2 h 11 min")],
-)
-def test_times_are_written_as_people_say_them(seconds: float, words: str) -> None:
-    assert duration(seconds) == words
+def test_times_are_written_as_people_say_them() -> None:
+    said = {0.4: "0 s", 59.4: "59 s", 59.6: "1 min 0 s", 3599: "59 min 59 s", 7860: "2 h 11 min"}
+    assert {seconds: duration(seconds) for seconds in said} == said

@@ -69,12 +69,7 @@ def orbit(shares: list[float]) -> dict[str, float]:
         ("Floaters", {"orbit_floaters": orbit(53 * [0.0] + 7 * [0.8])}, "bad", "hides much of 7 views"),
         ("Floaters", {"orbit_floaters": orbit(60 * [0.001])}, "good", "2 photographs' views and 60"),
         ("Floaters", {"floaters": ONE, "without_floaters": 29.45}, "bad", "29.45 dB instead of 29.50"),
-        (
-            "Floaters",
-            {"floaters": ONE, "without_floaters": 28.0},
-            "look",
-            "without them held-out views have 28.00",
-        ),
+        ("Floaters", {"floaters": ONE, "without_floaters": 28.0}, "look", "without them held-out views have 28.00"),
         ("Fit", {}, "good", "reach 31.00 dB"),
         ("Fit", {"misfits": {"a": 0.02, "b": 0.05}}, "look", "3.5 % of a photograph is far from its render"),
         ("Fit", {"train_psnr": 21.0, "held_out_psnr": 19.0}, "look", "cameras that are wrong"),
