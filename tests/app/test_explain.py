@@ -286,26 +286,22 @@ def test_a_pixel_is_explained_in_every_profile_and_its_view_may_be_named(explain
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        (["--view", "0", "--pixel", "40,3"], "pixel x is 40; view view_000.png is 40 x 32 px, so x must lie in 0..39"),
-        (["--view", "0", "--pixel", "4,-1"], "pixel y is -1;"),
-        (["--view", "0", "--pixel", "four"], "pixel is 'four'; give column and row"),
-        (["--view", "0"], "pixel is not given; say which with --pixel X,Y"),
-        (["--view", "8", "--pixel", "1,1"], "view is 8; toy has views 0 (view_000.png) to 7 (view_007.png)"),
-        (["--view", "cat.jpg", "--pixel", "1,1"], "view 'cat.jpg' is no view of toy; give a file name"),
-        (["--view", "0", "--pixel", "1,1", "--capture", "nowhere"], "nowhere: no such folder"),
-        (["--view", "0", "--pixel", "1,1", "--diff", "paper", "mine"], "'mine', which is neither a profile"),
-        (
-            ["--view", "0", "--pixel", "1,1", "--profile", "mine"],
-            "profile is 'mine'; it must be one of paper, gsplat_1_5",
-        ),
+        ("--view 0 --pixel 40,3", "pixel x is 40; view view_000.png is 40 x 32 px, so x must lie in 0..39"),
+        ("--view 0 --pixel 4,-1", "pixel y is -1;"),
+        ("--view 0 --pixel four", "pixel is 'four'; give column and row"),
+        ("--view 0", "pixel is not given; say which with --pixel X,Y"),
+        ("--view 8 --pixel 1,1", "view is 8; toy has views 0 (view_000.png) to 7 (view_007.png)"),
+        ("--view cat.jpg --pixel 1,1", "view 'cat.jpg' is no view of toy; give a file name"),
+        ("--view 0 --pixel 1,1 --capture nowhere", "nowhere: no such folder"),
+        ("--view 0 --pixel 1,1 --diff paper mine", "'mine', which is neither a profile"),
+        ("--view 0 --pixel 1,1 --profile mine", "profile is 'mine'; it must be one of paper, gsplat_1_5"),
     ],
-    ids=["x", "y", "no numbers", "no pixel", "view", "name", "capture", "diff", "profile"],
 )
 def test_bad_words_are_answered_by_one_line_that_names_field_and_fix(
-    pop: Pop, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], part: str
+    pop: Pop, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, part: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    says(pop("explain", shared_result, *words), part)
+    says(pop("explain", shared_result, *words.split()), part)
 
 
 # `pop explain` told which loss, which view and which two renderers: the words that choose are obeyed.

@@ -88,12 +88,6 @@ def test_a_request_to_stop_while_photographs_are_hashed_is_heard_at_once(tmp_pat
     assert not list((tmp_path / "r").rglob("*"))
 
 
-def test_resuming_where_nothing_was_trained_starts(tmp_path):
-    trainer = TrainingRun(tiny_config(tmp_path / "new", max_steps=2), tiny_capture(), resume=True)
-    trainer.run()
-    assert trainer.step == 2
-
-
 def test_ctrl_c_writes_a_checkpoint_of_the_step_it_came_at(tmp_path):
     trainer = TrainingRun(tiny_config(tmp_path, checkpoint_every=0, save_steps=()), tiny_capture())
     take_steps = trainer.take_steps

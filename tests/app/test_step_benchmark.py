@@ -54,6 +54,7 @@ def results() -> dict[str, Any]:
     beside = {"alone_ms": 10.0, "beside_ms": 60.0, "of_fair_share": 1.2}
     memory = {"width": 64, "height": 32, "n": 100, "before_gib": 0.5, "peak_gib": 0.75}
     busy = {"name": "64x32-100", "processes": 8, "threads": 2, "cores": 2, "fair_factor": 5.0}
+    commands = {"pop --help": {"wall_s": 0.2, "cpu_s": 0.1}}
     first_step = {"capture": "fox", "factor": 4, "wall_s": 1.75, "step_s": 0.02}
     even = {"1": {"even share": 12.0, "handing over": 0.0}, "16": {"even share": 0.75, "handing over": 0.25}}
     return {
@@ -62,11 +63,7 @@ def results() -> dict[str, Any]:
             "cases": [case("64x32-100"), case("fox", degree=0, target_ms=None)],
         },
         "busy": [{**busy, "engines": {"compiled": beside, "native": beside}}],
-        "first-step": {
-            "repeats": 5,
-            "commands": {"pop --help": {"wall_s": 0.2, "cpu_s": 0.1}},
-            "first_step": first_step,
-        },
+        "first-step": {"repeats": 5, "commands": commands, "first_step": first_step},
         "cores": [{"name": "64x32-100", "num_gaussians": 100, "width": 64, "height": 32, "machines": even}],
         "memory": [
             {"what": "render", "by": "fast", **memory},

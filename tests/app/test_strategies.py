@@ -357,11 +357,7 @@ def test_a_method_that_looks_at_the_views_sees_those_of_the_run_as_they_are_draw
         ("speedy-splat", {"hard_prune_share": 1.5}, "speedy-splat.hard_prune_share is 1.5; it must lie in [0, 1]"),
         ("pup", {"prune_shares": (0.5, -0.1)}, "pup.prune_shares is -0.1; it must lie in [0, 1]"),
         ("pup", {"score_divisor": 0}, "pup.score_divisor is 0; it must be at least 1"),
-        (
-            "mini-splatting",
-            {"reinit_opacity": 1.0},
-            "mini-splatting.reinit_opacity is 1.0; it must lie between 0 and 1",
-        ),
+        ("mini-splatting", {"reinit_opacity": 1}, "mini-splatting.reinit_opacity is 1.0; it must lie between 0 and 1"),
         ("taming", {"sh_rest_every": 0}, "taming.sh_rest_every is 0; it must be at least 1"),
         ("taming", {"budget_multiplier": -2.0}, "taming.budget_multiplier is -2.0; it must be >= 0 and finite"),
         ("pop", {"refine_every": 0}, "pop.refine_every is 0; it must be at least 1"),
