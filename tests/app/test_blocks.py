@@ -732,7 +732,7 @@ def counted(said: str) -> dict[str, int]:
 
 
 @with_snakemake
-def test_what_is_not_done_is_done_the_merge_last(divided, tmp_path):
+def test_the_workflow_does_what_is_not_done_the_merge_last(divided, tmp_path):
     assert counted(workflow(divided, tmp_path)) == {**TRAININGS, "merge": 1}
     plan = (divided / "blocks" / "plan.json").rename(tmp_path / "plan.json")
     assert counted(workflow(divided, tmp_path)) == {"partition": 1, **TRAININGS, "merge": 1}
@@ -749,7 +749,7 @@ def with_rounds(folder: Path, rounds: int) -> Path:
 
 
 @with_snakemake
-def test_a_round_waits_for_the_merge_before_it_and_its_merge_for_all_its_blocks(divided, tmp_path):
+def test_a_round_of_the_workflow_waits_for_the_merge_before_it_and_its_merge_for_all_its_blocks(divided, tmp_path):
     order = re.findall(r"^(?:local)?rule (\w+):", workflow(with_rounds(divided, 2), tmp_path), re.MULTILINE)
     for wave in (
         {"block_0_0", "block_1_0"},
@@ -765,7 +765,7 @@ def test_a_round_waits_for_the_merge_before_it_and_its_merge_for_all_its_blocks(
 
 
 @with_snakemake
-def test_rounds_that_are_added_to_a_run_do_its_merge_again_and_divide_and_train_nothing_anew(divided, tmp_path):
+def test_rounds_that_are_added_to_a_workflow_do_its_merge_again_and_divide_and_train_nothing_anew(divided, tmp_path):
     for name in NAMES:
         (divided / "blocks" / name / "trained").touch()
     rounds = {"round_0_merge": 1, "round_1_block_0_0": 1, "round_1_block_1_0": 1}
@@ -773,14 +773,14 @@ def test_rounds_that_are_added_to_a_run_do_its_merge_again_and_divide_and_train_
 
 
 @with_snakemake
-def test_the_slurm_profile_is_read(begun, tmp_path):
+def test_the_workflow_reads_the_slurm_profile(begun, tmp_path):
     pytest.importorskip("snakemake_executor_plugin_slurm", reason="snakemake-executor-plugin-slurm is not installed")
     assert counted(workflow(begun, tmp_path, jobs.profile_folder("slurm"))) == {**TRAININGS, "merge": 1}
 
 
 @with_snakemake
 @pytest.mark.processes
-def test_a_profile_that_is_none_is_refused(train: Train):
+def test_a_profile_of_the_workflow_that_is_none_is_refused(train: Train):
     says(train(*BLOCKS, "--blocks-profile", "nowhere"), "is neither one of slurm nor a folder with a config.yaml")
 
 
