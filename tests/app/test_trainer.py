@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import torch
 
-from pop_fast.api.registry import get_backend
 from pop_fast.cli import progress
 from pop_fast.cli.progress import bars
 from pop_fast.data import Capture, View
@@ -31,7 +30,7 @@ from pop_fast.train.evaluate import average, measure, population, psnr
 from pop_fast.train.model import KEYS, adam_step, first_non_finite, make_optimizers
 from pop_fast.train.schedule import steady_updates
 from pop_fast.train.torch_stepper import PhotoLoss
-from pop_fast.train.views import ViewTensors, render_view
+from pop_fast.train.views import ViewTensors
 from pop_ref.settings import Objective
 from tests.app.captures import assert_one_line, cloud, photograph, ring
 from tests.app.conftest import TRAIN, Pop
@@ -187,18 +186,6 @@ def test_masked_pixels_have_no_say(tmp_path):
         runs.append((trainer.params, stats["psnr"]))
     assert all(torch.equal(runs[0][0][key], runs[1][0][key]) for key in KEYS)
     assert runs[0][1] == runs[1][1]
-
-
-def test_dominant_counts_of_a_masked_view_are_those_inside_the_mask(tmp_path):
-    mask = np.zeros((HEIGHT, WIDTH), dtype=bool)
-    mask[5:15, 3:20] = True
-    trainer = TrainingRun(tiny_config(tmp_path), tiny_capture(mask=mask))
-    view = trainer._train[0]
-    rendered = render_view(get_backend("fast"), trainer.params, view, trainer.config, 0, dominance=True)
-    ids = rendered.info["dominant_ids"][0][view.mask]
-    want = torch.bincount(ids[ids >= 0], minlength=len(trainer.params["means"]))
-    assert torch.equal(rendered.info["dominant_counts"][0], want)
-    assert want.sum() > 0
 
 
 def test_the_target_cache_changes_no_bit(tmp_path):
