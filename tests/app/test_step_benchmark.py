@@ -1,4 +1,4 @@
-"""`benchmarks/run.py`'s training steps: tables from results, floors from counts, busy processes that end."""
+"""`benchmarks/`: tables from results, floors of training steps from counts, busy processes that end, pairs of runs."""
 
 from __future__ import annotations
 
@@ -14,12 +14,20 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
+from benchmarks import estimates
+from benchmarks.few_photographs import left_of, table_of
 from pop_fast import compiled
+from pop_fast.io.heartbeat import duration
+from pop_fast.train import TrainConfig, automatic
+from pop_fast.train.automatic import Choice
+from tests.app.conftest import ROOT
+from tests.app.tiny import tiny_capture
 
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+BENCHMARKS = ROOT / "benchmarks"
 PARTS = ("project", "list", "blend", "loss", "image_gradient", "transpose", "update")
 COUNTS = {"visible": 90, "entries": 640, "walked": 600, "chunks": 40, "pairs": 4096, "marked": 128, "reached": 64}
 
@@ -317,3 +325,52 @@ def test_the_tables_of_quick_are_means_of_the_seeds_that_have_both(script: Any) 
     assert row.startswith("| toy |  /  |")
     # after half of the time one seed of quick has ended: there is no mean
     assert "| 29.00 /  |" in row
+
+
+# Settings for few photographs, and what was foretold of runs that choose for themselves.
+
+
+def test_few_photographs_are_left_evenly_with_the_points_that_two_of_them_see() -> None:
+    capture = tiny_capture(n_views=17)
+    left = left_of(capture, 4)
+    assert [view.name for view in left.test_views()] == [view.name for view in capture.test_views()]
+    assert [view.name for view in left.train_views()] == ["01.png", "05.png", "11.png", "15.png"]
+    assert 0 < len(left.points) < len(capture.points)
+    seen = np.bincount(np.concatenate([view.seen for view in left.train_views()]), minlength=len(left.points))
+    assert seen.min() >= 2
+    was = {view.name: {*map(tuple, capture.points[view.seen])} for view in capture.views}
+    assert all({*map(tuple, left.points[view.seen])} <= was[view.name] for view in left.views)
+
+
+def test_a_table_of_settings_compares_the_same_seeds_alone() -> None:
+    rows = {
+        "a / 2, 8 photographs, 9 steps, seed 1: plain": {"psnr": 20.0, "ssim": 0.5},
+        "a / 2, 8 photographs, 9 steps, seed 2: plain": {"psnr": 30.0, "ssim": 0.7},
+        "a / 2, 8 photographs, 9 steps, seed 2: --x": {"psnr": 31.0, "ssim": 0.6},
+    }
+    last = table_of({"machine": {}, **rows}).splitlines()[-1]
+    assert last == "| a / 2, 8 photographs, 9 steps | 25.00 / 0.600 (2) | +1.00 / -0.100 (1) |"
+
+
+def test_the_line_before_the_first_step_is_read_back_for_the_table_of_estimates() -> None:
+    choice = Choice(scaler=0.01, gaussians=34_900.0, seconds=3_725.0, memory_bytes=1.27e9)
+    config = TrainConfig.of(preset="auto", steps_scaler=0.01, factor=2, backend="fast")
+    row = estimates.foretold(f"before\n{automatic.line_of(choice, config, (256, 512))}\n")
+    foretold = {"gaussians": 35_000, "seconds": 3_720.0, "memory": 1.3}
+    assert row == {"size": "256x512", "steps": 300, "foretold": foretold}
+    assert estimates.seconds_of(duration(62.0)) == 62.0
+    came = {"gaussians": 40_000, "seconds": 1_860.0, "memory": 1.21}
+    table = estimates.table_of({"machine": {}, "toy, 60": {**row, "minutes": 60.0, "came": came}})
+    assert table.splitlines()[2:] == ["| toy, 60 | 256x512, 300 | 3720 s, 1860 s | 0.50 | 35,000, 40,000 | 1.3, 1.2 |"]
+    with pytest.raises(ValueError, match="no line says"):
+        estimates.foretold("trained")
+
+
+def test_what_was_foretold_of_four_captures_came_within_thirty_percent() -> None:
+    known = json.loads((ROOT / "benchmarks" / "results" / "estimates.json").read_text(encoding="utf-8"))
+    rows = [row for name, row in known.items() if name != "machine"]
+    assert len(rows) == 4
+    for row in rows:
+        for name, said in row["foretold"].items():
+            assert said / 1.3 < row["came"][name] < 1.3 * said, (row, name)
+    assert "What was foretold came within 30 % on the four captures" in (ROOT / "docs" / "guide.md").read_text()
