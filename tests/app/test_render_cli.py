@@ -42,6 +42,7 @@ from tests.app.test_strategies import engine_or_skip, tiny_method
 from tests.app.tiny import tiny_capture
 
 Render = Callable[..., Outcome]
+PATHS = "views, orbit, ellipse, interpolate"
 
 
 def read(path: Path) -> np.ndarray:
@@ -95,7 +96,7 @@ def test_a_path_gives_as_many_pictures_and_frames_as_asked(
         ("--out r --path orbit --frames 0", "frames is 0; give --frames 1 or more"),
         ("--out r --test-every 0", "holds no view out"),
         ("--out r --path orbit --test-every 1", "needs 1 or more training views and there are 0"),
-        ("--out r --path spiral", "one of views, orbit, ellipse, interpolate, or a file that 'pop view' saved"),
+        ("--out r --path spiral", f"give --path one of {PATHS}, or a file that 'pop view' saved"),
         ("--out .", "the folder that this command runs in; choose another output folder"),
     ],
 )
