@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from pop_fast.api.rasterize import rasterization
 from pop_fast.api.registry import BACKENDS
 from pop_fast.density import DensificationStep, POPStrategy
 from pop_fast.errors import PopError
-from pop_fast.stages.backend import FAST
+from pop_fast.stages.backend import FAST, TorchBackend
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from tests.app.conftest import ROOT, TRAIN, Pop
@@ -123,22 +124,17 @@ ENTRIES = "".join(f"[pop_splatting.{kind}]\nmine = {NAME}:{value}\n" for kind, v
 ENTRIES += f"[pop_splatting.losses]\nhuber = {NAME}:LOSS\n[pop_splatting.formats]\nnumbers = {NAME}:FORMAT\n"
 
 
-def installed_in(site: Path, name: str, module: str, entries: str) -> Path:
-    """Make a folder what pip leaves where a package of one module is installed."""
-    (site / f"{name}.py").write_text(module)
-    about = site / f"{name}-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text(entries)
-    return site
-
-
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder where that package is installed."""
+    """A folder as pip leaves it where that package is installed."""
     site = tmp_path_factory.mktemp("site")
+    (site / f"{NAME}.py").write_text(MODULE)
     (site / "row.toml").write_text(ROW)
-    return installed_in(site, NAME, MODULE, ENTRIES)
+    about = site / f"{NAME}-1.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {NAME}\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text(ENTRIES)
+    return site
 
 
 def call(site: Path, module: str, *words: object, status: int = 0) -> str:
@@ -299,29 +295,16 @@ def test_our_own_strategies_follow_the_protocol_too(tmp_path, monkeypatch):
 
 # Backends of other packages: found under their entry point, they draw, train, save, resume and are measured.
 
-BACKEND_MODULE = """
-from dataclasses import dataclass
-
-from pop_fast.stages.backend import TorchBackend
-
-
-@dataclass(frozen=True)
-class MadeUp(TorchBackend):
-    pass
-
-
-MINE = MadeUp("mine", "cpu", ("float32", "float64"), speed=None)
-"""
-BACKEND_ENTRIES = f"[{BACKENDS.group}]\nmine = made_up_backend:MINE\nbroken = no_such_package:BACKEND\n"
+MINE = TorchBackend("mine", "cpu", ("float32", "float64"), speed=None)
 
 
 @pytest.fixture
-def installed(tmp_path: Path) -> Iterator[pytest.MonkeyPatch]:
-    """As where another distribution has registered two backends, one of which is not there; undoing it removes it."""
-    (tmp_path / "site").mkdir()
-    site = installed_in(tmp_path / "site", "made_up_backend", BACKEND_MODULE, BACKEND_ENTRIES)
+def installed() -> Iterator[pytest.MonkeyPatch]:
+    """As where other distributions have registered two backends, one of which is not there; undoing it removes both."""
+    places = {"mine": f"{__name__}:MINE", "broken": "no_such_package:BACKEND"}
+    found = [EntryPoint(name, place, BACKENDS.group) for name, place in places.items()]
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(site))
+        patch.setattr("importlib.metadata.entry_points", lambda group: found if group == BACKENDS.group else [])
         BACKENDS.look_again()
         yield patch
     BACKENDS.look_again()
