@@ -13,7 +13,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -46,7 +45,7 @@ from pop_fast.train.model import KEYS
 from pop_fast.train.results import ResultFolder, read_config
 from pop_fast.train.views import ViewTensors
 from tests.app.captures import assert_one_line, write_photograph
-from tests.app.conftest import TRAIN, Outcome, Pop
+from tests.app.conftest import TRAIN, Outcome, Pop, done, wait_until
 from tests.app.damage import says
 from tests.app.tiny import interrupt, tiny_capture
 
@@ -113,11 +112,6 @@ def rounds(shared_rounds: Path, tmp_path: Path) -> Path:
 def train(pop: Pop, shared_capture: Path, tmp_path: Path) -> Train:
     """`pop train` on the tiny capture, into a folder that is not there yet where none is named."""
     return lambda *words, out=tmp_path / "out": pop("train", shared_capture, "--out", out, *words)
-
-
-def done(outcome: Outcome) -> str:
-    assert outcome.status == 0, outcome
-    return outcome.out
 
 
 def splats(folder: Path) -> dict[str, torch.Tensor]:
@@ -365,10 +359,7 @@ def test_parts_are_processes_of_their_own_and_are_stopped_by_sigterm(shared_capt
     alone += "from pop_fast.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", alone, "train", str(shared_capture), "--out", str(folder), *BLOCKS, *long]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        deadline = time.monotonic() + 120.0
-        while not list(folder.glob("blocks/0_0/result/ckpts/*")) and time.monotonic() < deadline:
-            assert process.poll() is None
-            time.sleep(0.1)
+        wait_until(lambda: list(folder.glob("blocks/0_0/result/ckpts/*")), process)
         process.send_signal(signal.SIGTERM)
         out, err = process.communicate(timeout=60.0)
     assert process.returncode == 130, err

@@ -39,7 +39,7 @@ from pop_fast.train.checkpoint import load_splats
 from pop_fast.view.live.draw import scene_of
 from pop_fast.view.live.guard import MOST_VIEWS, Guard, interval, listen, number, one_of, passed_on
 from pop_fast.view.live.server import LiveViewer
-from tests.app.conftest import TRAIN, Outcome, Pop
+from tests.app.conftest import TRAIN, Outcome, Pop, wait_until
 from tests.app.damage import says
 from tests.app.tiny import tiny_capture, tiny_config
 
@@ -289,10 +289,8 @@ def test_an_error_in_a_view_closes_that_view_with_one_line(
     good, bad = Client(viewer.url), Client(viewer.url)
     good.say(CAMERA)
     bad.say(CAMERA | {"image_height": 31})
-    until = time.monotonic() + 20.0
-    while len(viewer._views) < 2 and time.monotonic() < until:
-        time.sleep(0.01)
-    drawn = 0
+    wait_until(lambda: len(viewer._views) == 2)
+    until, drawn = time.monotonic() + 20.0, 0
     while (drawn < 1 or len(viewer._views) > 1) and time.monotonic() < until:
         viewer.wait(0.05)
         drawn += viewer.draw_due()

@@ -29,7 +29,7 @@ from pop_fast.train.batch_stepper import check_batch
 from pop_fast.train.ranks import ALONE, Ranks, join
 from pop_fast.train.signals import stop_requests
 from tests.app.captures import PINHOLE, camera, photograph, ring, write_model, write_photograph
-from tests.app.conftest import ROOT, TRAIN, in_a_child, launched
+from tests.app.conftest import ROOT, TRAIN, in_a_child, launched, wait_until
 from tests.app.damage import contents
 from tests.app.tiny import assert_same_run, interrupt, last_checkpoint, run_until, tiny_capture, tiny_config
 
@@ -292,14 +292,6 @@ def start(tmp_path: Path, *words: object, script: str = _HEEDING + _POP) -> subp
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(scratch), "OMP_NUM_THREADS": "1"}
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return subprocess.Popen([sys.executable, "-c", script, *map(str, words)], env=environment, cwd=ROOT, **pipes)
-
-
-def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str] | None = None) -> None:
-    end = time.monotonic() + 300.0
-    while not condition():
-        assert process is None or process.poll() is None, process.communicate()
-        assert time.monotonic() < end, "it does not come to that"
-        time.sleep(0.005)
 
 
 @pytest.mark.slow  # a training that is begun many times

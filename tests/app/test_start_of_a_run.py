@@ -29,7 +29,7 @@ from pop_fast.train import TrainingRun
 from pop_fast.train.results import ResultFolder
 from tests.app.browser import browser
 from tests.app.captures import photograph, write_photograph
-from tests.app.conftest import TRAIN, Outcome, Pop
+from tests.app.conftest import TRAIN, Outcome, Pop, done
 from tests.app.damage import contents, says
 from tests.app.test_resume import run_to
 from tests.app.tiny import Killed, assert_same_run, interrupt, killed_after, tiny_capture, tiny_config
@@ -218,11 +218,6 @@ def test_results_that_a_kill_left_aside_come_back_with_a_note(train: Callable[..
     assert "an --overwrite was cut short; the results that it had set aside are back" in said
     assert "continuing from step 30" in said
     assert kept() == before
-
-
-def done(outcome: Outcome) -> str:
-    assert outcome.status == 0, outcome
-    return outcome.out
 
 
 def test_a_run_that_is_cut_off_can_be_looked_at_and_gone_on_with_in_few_words(

@@ -6,7 +6,6 @@ import io
 import json
 import math
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,7 +32,7 @@ from pop_fast.train.torch_stepper import PhotoLoss
 from pop_fast.train.views import ViewTensors
 from pop_ref.settings import Objective
 from tests.app.captures import assert_one_line, cloud, photograph, ring
-from tests.app.conftest import TRAIN, Pop
+from tests.app.conftest import TRAIN, Pop, wait_until
 from tests.app.tiny import HEIGHT, WIDTH, records, tiny_capture, tiny_config
 
 
@@ -352,16 +351,8 @@ def test_the_population_is_counted_at_both_poles_and_at_the_floor():
 # Where nobody sees a bar, what is being done is told line by line.
 
 
-def wait_for(found: Callable[[], str | bool]) -> str:
-    end = time.perf_counter() + 60.0
-    while not (told := found()):
-        assert time.perf_counter() < end, "nothing is told"
-        time.sleep(0.005)
-    return str(told)
-
-
 def wait_for_a_line(capsys: pytest.CaptureFixture[str]) -> str:
-    return wait_for(lambda: capsys.readouterr().err).splitlines()[0]
+    return wait_until(lambda: capsys.readouterr().err).splitlines()[0]
 
 
 def test_a_line_comes_by_itself_from_within_a_long_computation(capsys: pytest.CaptureFixture[str]) -> None:
@@ -391,7 +382,7 @@ def test_stages_that_report_are_told_with_the_time_that_is_left(
         report("matching pairs of photographs", 0, 300)
         clock[0] += 60.0
         report("matching pairs of photographs", 100, 300)
-        told = wait_for(lambda: told if " left" in (told := capsys.readouterr().err) else "")
+        told = wait_until(lambda: told if " left" in (told := capsys.readouterr().err) else "")
     assert "pop: matching pairs of photographs: 100 of 300, 2 min 0 s left (" in told
 
 
@@ -419,12 +410,12 @@ def test_bars_of_long_stages_and_of_steps_that_take_long_are_drawn_anew_in_a_ter
     monkeypatch.setattr(heartbeat, "TICK", 0.01)
     with bars() as report:
         report("reading photographs", 3, 10)
-        wait_for(lambda: stream.getvalue().count("3/10") >= 4)
+        wait_until(lambda: stream.getvalue().count("3/10") >= 4)
     assert "pop: " not in stream.getvalue()
     took = TrainingRun.take_steps
 
     def slowly(training: TrainingRun, last: int) -> Any:
-        wait_for(lambda: stream.getvalue().count("0/1 [") >= 4)
+        wait_until(lambda: stream.getvalue().count("0/1 [") >= 4)
         return took(training, last)
 
     monkeypatch.setattr(TrainingRun, "take_steps", slowly)
