@@ -20,6 +20,7 @@ from pop_fast.api.rasterize import rasterization
 from pop_fast.api.registry import get_backend
 from pop_fast.density import DensityControl, GsplatStrategy, InriaStrategy, POPStrategy, Strategy
 from pop_fast.density.control import SHORTEST_REFINE_EVERY
+from pop_fast.density.passes import Passes
 from pop_fast.density.protocol import Draws
 from pop_fast.errors import PopError
 from pop_fast.train import TrainConfig, TrainingRun
@@ -303,14 +304,20 @@ def test_a_run_that_is_stopped_anywhere_goes_on_to_the_same_bits(method: str, ba
         assert all(torch.equal(again.params[key], whole.params[key]) for key in KEYS), f"after step {step}"
 
 
-def test_a_method_that_looks_at_the_views_sees_those_of_the_run_as_they_are_drawn(tmp_path: Any) -> None:
+def test_a_method_that_looks_at_the_views_sees_those_of_the_run_as_they_are_drawn(
+    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     # what each method makes of what it sees the laws of training say, and what a pass sees `tests/fast/test_passes.py`
     config = tiny_method(tmp_path, "mini-splatting")
     start = TrainingRun(config, tiny_capture())
     assert start.state["first_count"] == len(start.params["means"])
     initial = {key: value.detach().double() for key, value in start.params.items()}
     run, drawn, generator = TrainingRun(config, tiny_capture(), initial=initial), [], np.random.default_rng(5)
-    profile = METHODS["mini-splatting"].recipe.profile
+    profile, degrees, passed = METHODS["mini-splatting"].recipe.profile, [], Passes.contributions
+
+    def noted(passes: Passes, params: Any, index: int, sh_degree: int) -> Any:
+        degrees.append(sh_degree)
+        return passed(passes, params, index, sh_degree)
 
     def uniforms(n: int) -> Tensor:
         drawn.append(generator.random(n))
@@ -336,6 +343,7 @@ def test_a_method_that_looks_at_the_views_sees_those_of_the_run_as_they_are_draw
                 run.strategy.change(run.params, run.optimizers, run.state, step)
         return before, run._change(step)
 
+    monkeypatch.setattr(Passes, "contributions", noted)
     run.draws = Draws(lambda n: torch.tensor(generator.standard_normal((2, n, 3))), uniforms)
     before, change = changed(18)
     weights = importance(before, 1)
@@ -349,6 +357,7 @@ def test_a_method_that_looks_at_the_views_sees_those_of_the_run_as_they_are_draw
     gone = selection.least_mass(importance(before, 2), 0.05)
     assert 0 < change.pruned == gone.sum() < len(gone)
     np.testing.assert_array_equal(run.params["means"].detach().numpy(), before["means"][~gone])
+    assert degrees == [1] * len(run._train) + [2] * len(run._train)
 
 
 @pytest.mark.parametrize(
