@@ -7,17 +7,18 @@ import shutil
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from pop_fast.cli import main
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
-from tests.app.interruptions import run_until
-from tests.app.tiny import tiny_capture, tiny_config
+from tests.app.tiny import run_until, tiny_capture, tiny_config
 
 ROOT = Path(__file__).parents[2]
 
@@ -55,6 +56,23 @@ class Pop:
         outcome = self(*words)
         assert outcome.status == 0, outcome
         return outcome
+
+
+def done(outcome: Outcome) -> str:
+    """Return what a call has printed that must have succeeded."""
+    assert outcome.status == 0, outcome
+    return outcome.out
+
+
+def wait_until(found: Callable[[], Any], process: subprocess.Popen[str] | None = None) -> Any:
+    """Wait until something is found, and return it; a process has to live so long."""
+    # not the clock that tests set
+    end = time.perf_counter() + 300.0
+    while not (value := found()):
+        assert process is None or process.poll() is None, process.communicate()
+        assert time.perf_counter() < end, "it does not come to that"
+        time.sleep(0.005)
+    return value
 
 
 @pytest.fixture

@@ -22,8 +22,7 @@ from pop_fast.train.results import ResultFolder
 from tests.app.captures import assert_one_line
 from tests.app.conftest import TRAIN, Pop, in_a_child
 from tests.app.damage import contents, says
-from tests.app.interruptions import Killed, killed_after, run_until
-from tests.app.tiny import tiny_capture, tiny_config
+from tests.app.tiny import Killed, killed_after, run_until, tiny_capture, tiny_config
 
 needs_posix = pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX limits, signals and locks")
 needs_links = pytest.mark.skipif(os.name == "nt", reason="links need a privilege there")

@@ -21,10 +21,10 @@ from pop_fast.errors import PopError
 from pop_fast.io.ply import load_ply, read_points, save_ply
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
-from tests.app.conftest import Outcome, Pop, in_a_child, pop_in_a_child
+from tests.app.conftest import Pop, in_a_child, pop_in_a_child
 from tests.app.damage import FORGED, INF, Content, contents, forge, latest, says, to
 from tests.app.drift import drift_engine
-from tests.app.tiny import tiny_capture, tiny_config
+from tests.app.tiny import assert_same_run, tiny_capture, tiny_config
 
 
 def resume(folder, capture=None, **changes):
@@ -38,6 +38,10 @@ def resume(folder, capture=None, **changes):
         ({"max_steps": 40}, r"max_steps = 30, but this run has max_steps = 40"),
         ({"method": "gsplat"}, r"method = pop, but this run has method = gsplat"),
         ({"threads": 2}, r"threads = 1, but this run has threads = 2"),
+        (
+            {"strategy": replace(tiny_config("x").strategy, theta_blur=0.5)},
+            r"pop\.theta_blur = 0\.02, but this run has pop\.theta_blur = 0\.5",
+        ),
     ],
 )
 def test_other_settings_are_refused_by_name(stopped, changes, message):
@@ -47,28 +51,20 @@ def test_other_settings_are_refused_by_name(stopped, changes, message):
     assert contents(stopped) == before
 
 
-def test_another_nested_setting_is_refused_by_name(stopped):
-    config = tiny_config(stopped)
-    with pytest.raises(PopError, match=r"pop\.theta_blur = 0\.02, but this run has pop\.theta_blur = 0\.5"):
-        resume(stopped, strategy=replace(config.strategy, theta_blur=0.5))
-
-
 def _changed(what: str) -> Capture:
     capture = tiny_capture()
-    views = list(capture.views)
-    if what == "view names":
-        views[1] = replace(views[1], name="01b.png")
-    elif what == "photographs":
-        image = views[1].image.copy()
-        image[0, 0, 0] ^= 1
-        views[1] = replace(views[1], image=image)
-    elif what == "masks":
-        views[1] = replace(views[1], mask=np.ones(views[1].image.shape[:2], dtype=bool))
-    elif what == "cameras":
-        views[1] = replace(views[1], K=views[1].K + np.diag([1e-9, 0, 0]))
-    else:
+    view = capture.views[1]
+    image = view.image.copy()
+    image[0, 0, 0] ^= 1
+    changes: dict[str, dict[str, Any]] = {
+        "view names": {"name": "01b.png"},
+        "photographs": {"image": image},
+        "masks": {"mask": np.ones(image.shape[:2], dtype=bool)},
+        "cameras": {"K": view.K + np.diag([1e-9, 0, 0])},
+    }
+    if what not in changes:
         return replace(capture, points=capture.points + 1e-12)
-    return replace(capture, views=tuple(views))
+    return replace(capture, views=(capture.views[0], replace(view, **changes[what]), *capture.views[2:]))
 
 
 @pytest.mark.parametrize("what", ["view names", "photographs", "masks", "cameras", "sparse points"])
@@ -86,21 +82,38 @@ def test_held_out_views_are_not_part_of_the_fingerprint():
     assert ckpt.capture_fingerprint(capture, 0) != ckpt.capture_fingerprint(other, 0)
 
 
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut off", b"plain text"])
-def test_a_damaged_checkpoint_is_named(tmp_path, content):
-    path = tmp_path / "ckpt_4_rank0.pt"
-    path.write_bytes(content)
-    with pytest.raises(PopError, match=r"ckpt_4_rank0\.pt: cannot be read as a checkpoint; remove it"):
-        ckpt.load_checkpoint(path)
+CUT_OFF = r"x\.pt: cannot be read as a checkpoint; remove it"
+NO_FORMAT = r"x\.pt: has no 'format', so it is not a checkpoint"
 
 
-def test_what_is_not_a_checkpoint_of_ours_is_named(tmp_path):
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", CUT_OFF),
+        (b"PK\x03\x04 cut off", CUT_OFF),
+        (b"plain text", CUT_OFF),
+        ({"step": 1, "splats": {}}, NO_FORMAT),
+        *((content, NO_FORMAT) for content in (None, [], "text", 3, torch.zeros(3))),
+    ],
+    ids=repr,
+)
+def test_what_is_not_a_checkpoint_of_ours_is_named(tmp_path, content, message):
     path = tmp_path / "x.pt"
     with pytest.raises(PopError, match="there is no such checkpoint"):
         ckpt.load_checkpoint(path)
-    torch.save({"step": 1, "splats": {}}, path)
-    with pytest.raises(PopError, match="has no 'format'"):
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        torch.save(content, path)
+    with pytest.raises(PopError, match=message):
         ckpt.load_checkpoint(path)
+
+
+def test_a_newer_format_is_named(stopped, tmp_path):
+    content = ckpt.load_checkpoint(ckpt.list_checkpoints(stopped)[-1][1])
+    torch.save({**content, "format": 99}, tmp_path / "x.pt")
+    with pytest.raises(PopError, match="has format 99; this version reads format 1"):
+        ckpt.load_checkpoint(tmp_path / "x.pt")
 
 
 def test_a_checkpoint_cannot_run_code(tmp_path):
@@ -112,14 +125,6 @@ def test_a_checkpoint_cannot_run_code(tmp_path):
     with pytest.raises(PopError, match="cannot be read"):
         ckpt.load_checkpoint(tmp_path / "x.pt")
     assert not (tmp_path / "boom").exists()
-
-
-def test_a_newer_format_is_named(stopped, tmp_path):
-    content = ckpt.load_checkpoint(ckpt.list_checkpoints(stopped)[-1][1])
-    path = tmp_path / "x.pt"
-    torch.save({**content, "format": 99}, path)
-    with pytest.raises(PopError, match="has format 99; this version reads format 1"):
-        ckpt.load_checkpoint(path)
 
 
 def test_a_failed_write_leaves_the_old_checkpoint(tmp_path):
@@ -174,14 +179,10 @@ def test_the_last_few_and_the_milestones_are_kept(tmp_path):
     assert (tmp_path / "ckpts" / "notes.txt").exists()
 
 
-def test_metrics_that_the_checkpoint_vouches_for_must_be_there(stopped, tmp_path):
-    (tmp_path / "ckpts").mkdir()
-    for _, path in ckpt.list_checkpoints(stopped):
-        (tmp_path / "ckpts" / path.name).write_bytes(path.read_bytes())
-    (tmp_path / "cfg.json").write_bytes((stopped / "cfg.json").read_bytes())
-    (tmp_path / "metrics.jsonl").write_text("{}\n")
+def test_metrics_that_the_checkpoint_vouches_for_must_be_there(forged):
+    (forged / "metrics.jsonl").write_text("{}\n")
     with pytest.raises(PopError, match=r"metrics\.jsonl: has 3 bytes, fewer than"):
-        resume(tmp_path)
+        resume(forged)
 
 
 def test_processor_time_goes_on_from_a_checkpoint_and_is_not_told_where_a_part_was_not_counted(stopped, tmp_path):
@@ -206,21 +207,7 @@ def test_processor_time_goes_on_from_a_checkpoint_and_is_not_told_where_a_part_w
 @pytest.fixture
 def forged(stopped: Path, tmp_path: Path) -> Path:
     """A copy of the run that a test may damage."""
-    for path, data in contents(stopped).items():
-        copy = tmp_path / "run" / path.relative_to(stopped)
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        copy.write_bytes(data)
-    return tmp_path / "run"
-
-
-def on_cpu(folder: Path) -> TrainingRun:
-    return TrainingRun(tiny_config(folder), tiny_capture(), resume=True)
-
-
-def on_device(folder: Path) -> TrainingRun:
-    # as a checkpoint of the CPU is read
-    forge(folder, to("config.backend", "cuda"))
-    return TrainingRun(tiny_config(folder), tiny_capture(), engine=drift_engine(), resume=True)
+    return Path(shutil.copytree(stopped, tmp_path / "run"))
 
 
 @pytest.fixture
@@ -240,7 +227,7 @@ def test_what_no_run_can_have_written_is_refused_and_named(case: str, forged: Pa
     forge(forged, change)
     before = contents(forged)
     with pytest.raises(PopError) as caught:
-        on_cpu(forged).run()
+        resume(forged)
     message = str(caught.value)
     for part in parts:
         assert part in message, message
@@ -258,7 +245,9 @@ def test_what_no_run_can_have_written_is_refused_and_named(case: str, forged: Pa
 )
 def test_a_run_on_a_device_refuses_it_likewise(case: str, forged: Path) -> None:
     change, parts = FORGED[case]
-    trainer = on_device(forged)
+    # as a checkpoint of the CPU is read
+    forge(forged, to("config.backend", "cuda"))
+    trainer = TrainingRun(tiny_config(forged), tiny_capture(), engine=drift_engine(), resume=True)
     forge(forged, change)
     with pytest.raises(PopError) as caught:
         trainer.run()
@@ -266,21 +255,8 @@ def test_a_run_on_a_device_refuses_it_likewise(case: str, forged: Path) -> None:
         assert part in str(caught.value)
 
 
-@pytest.mark.parametrize("content", [None, [], "text", 3, torch.zeros(3)], ids=lambda value: type(value).__name__)
-def test_what_is_no_dict_is_refused(content: Any, tmp_path: Path) -> None:
-    torch.save(content, tmp_path / "x.pt")
-    with pytest.raises(PopError, match=r"x\.pt: has no 'format', so it is not a checkpoint"):
-        ckpt.load_checkpoint(tmp_path / "x.pt")
-
-
-def test_a_checkpoint_under_another_ones_name_is_refused(forged: Path) -> None:
-    latest(forged).write_bytes(ckpt.checkpoint_path(forged, 4).read_bytes())
-    with pytest.raises(PopError, match=r"step is 4; it must be 9, as the file's name says; remove it to continue from"):
-        ckpt.load_checkpoint(latest(forged))
-
-
 @pytest.mark.usefixtures("no_steps")
-def test_a_step_after_the_last_is_refused(forged: Path) -> None:
+def test_a_checkpoint_under_another_ones_name_or_of_a_step_after_the_last_is_refused(forged: Path) -> None:
     def later(content: Content) -> None:
         content["step"] = 99
         for moments in content["optimizers"].values():
@@ -289,7 +265,10 @@ def test_a_step_after_the_last_is_refused(forged: Path) -> None:
     forge(forged, later)
     latest(forged).rename(ckpt.checkpoint_path(forged, 99))
     with pytest.raises(PopError, match=r"ckpt_99_rank0\.pt: step is 99; it must be at most 29, the run's last"):
-        on_cpu(forged).run()
+        resume(forged)
+    ckpt.checkpoint_path(forged, 9).write_bytes(ckpt.checkpoint_path(forged, 4).read_bytes())
+    with pytest.raises(PopError, match=r"step is 4; it must be 9, as the file's name says; remove it to continue from"):
+        ckpt.load_checkpoint(ckpt.checkpoint_path(forged, 9))
 
 
 def test_what_a_run_can_come_to_is_accepted(forged: Path) -> None:
@@ -304,36 +283,29 @@ def test_what_a_run_can_come_to_is_accepted(forged: Path) -> None:
     content = ckpt.load_checkpoint(latest(forged))
     assert "colour" not in content["splats"]
     assert all(value.is_contiguous() for value in content["splats"].values())
-    on_cpu(forged).run()
+    resume(forged)
     assert ckpt.list_checkpoints(forged)[-1][0] == 29
 
 
-def test_going_on_from_the_checkpoint_before_ends_in_the_same_bits(forged: Path, stopped: Path, tmp_path: Path) -> None:
+def test_going_on_from_the_checkpoint_before_ends_in_the_same_bits(forged: Path, tmp_path: Path) -> None:
     forge(forged, FORGED["m of another shape"][0])
     with pytest.raises(PopError, match=r"remove it to continue from ckpt_4_rank0\.pt"):
         ckpt.load_checkpoint(latest(forged))
     latest(forged).unlink()
-    on_cpu(forged).run()
+    resume(forged)
     TrainingRun(tiny_config(tmp_path / "whole"), tiny_capture()).run()
-    ours, theirs = (ckpt.load_checkpoint(ckpt.checkpoint_path(f, 29)) for f in (forged, tmp_path / "whole"))
-    assert all(torch.equal(ours["splats"][key], theirs["splats"][key]) for key in theirs["splats"])
+    assert_same_run(forged, tmp_path / "whole")
 
 
-@pytest.fixture
-def unfinished(result: Path) -> Path:
-    """A result whose last checkpoint is of the seventh of thirty steps."""
+def test_pop_train_refuses_a_moment_of_another_shape_and_lives(result: Path, shared_capture: Path) -> None:
     ckpt.checkpoint_path(result, 29).unlink()
-    assert [step for step, _ in ckpt.list_checkpoints(result)] == [6]
-    return result
-
-
-def test_pop_train_refuses_a_moment_of_another_shape_and_lives(unfinished: Path, shared_capture: Path) -> None:
-    path = ckpt.checkpoint_path(unfinished, 6)
+    ((step, path),) = ckpt.list_checkpoints(result)
+    assert step == 6
     content = torch.load(path, weights_only=True)
     content["optimizers"]["means"]["exp_avg"] = torch.zeros(3, 3)
     torch.save(content, path)
     words = ("--steps-scaler", "0.001", "--quiet", "--pop.grow-grad2d", "1e-6", "--resume")
-    outcome = pop_in_a_child("train", shared_capture, "--out", unfinished, *words)
+    outcome = pop_in_a_child("train", shared_capture, "--out", result, *words)
     says(outcome, "ckpt_6_rank0.pt: optimizers.means.exp_avg has shape [3, 3]; it must be [", "remove it")
 
 
@@ -446,13 +418,14 @@ def mutated(data: bytes, seed: int, times: int) -> Iterator[bytes]:
 CHILDREN = {"flip": flip_a_checkpoint, "mutate": mutate_a_ply}
 
 
-def counts(outcome: Outcome) -> dict[str, int]:
+def counts(*words: object) -> dict[str, int]:
+    outcome = in_a_child(CHILD, *words)
     assert outcome.status == 0, (outcome.status, outcome.err[-3000:])
     return json.loads(outcome.out)
 
 
 def test_no_flipped_bit_of_a_checkpoint_is_read_as_another_number(stopped: Path, tmp_path: Path) -> None:
-    found = counts(in_a_child(CHILD, "flip", ckpt.checkpoint_path(stopped, 9), tmp_path))
+    found = counts("flip", ckpt.checkpoint_path(stopped, 9), tmp_path)
     assert found["different"] == 0
     assert found["refused"] + found["same"] == 600
     # and nearly all are seen; what is not lies between the members of the zip
@@ -460,7 +433,7 @@ def test_no_flipped_bit_of_a_checkpoint_is_read_as_another_number(stopped: Path,
 
 
 def test_no_header_of_a_ply_ends_the_interpreter(tmp_path: Path) -> None:
-    found = counts(in_a_child(CHILD, "mutate", tmp_path))
+    found = counts("mutate", tmp_path)
     assert found["named"] == found["refused"] > 700
     assert found["same"] + found["different"] > 20
     # names exchanged are another splat, but never one with a number that is none

@@ -17,7 +17,7 @@ import torch
 import cuda_ext
 import pop_fast
 from pop_fast.api.backend import BACKENDS, get_backend
-from pop_fast.api.backends import FAST, TorchBackend
+from pop_fast.api.rasterize import rasterization
 from pop_fast.cli.explain import chosen_view
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
@@ -26,11 +26,11 @@ from pop_fast.train.config import TrainConfig
 from pop_fast.view.explain import ExplainedView, explain_pixel, explain_view
 from pop_fast.view.explain.diff import difference, first_flip
 from pop_fast.view.explain.pixel import WIDTH, candidates, oracle_splats, table, walk
-from pop_fast.view.explain.scene import termination_depths, with_objective
+from pop_fast.view.explain.scene import settings_of, termination_depths, with_objective
 from pop_ref.constants import PAPER, PROFILES, Profile
 from pop_ref.records import Splats
 from tests.app.browser import browser
-from tests.app.conftest import Pop
+from tests.app.conftest import Outcome, Pop
 from tests.app.damage import says
 from tests.app.tiny import tiny_capture
 
@@ -77,7 +77,10 @@ def test_the_oracle_on_a_few_gaussians_agrees_with_rasterization_of_all(changes:
     assert statuses == {"blended", "skipped", "stopped", "hidden", "clamped"}
 
 
-def test_weights_and_what_is_left_sum_to_one_and_the_sums_end_at_the_colour(scene: ExplainedView) -> None:
+def test_weights_and_what_is_left_sum_to_one_and_rays_end_at_the_depth_of_who_stopped_them(
+    scene: ExplainedView,
+) -> None:
+    depths, ended = termination_depths(scene), []
     for x, y in PIXELS:
         e = explain_pixel(scene, x, y)
         assert sum(row.weight for row in e.rows) + e.T_final == pytest.approx(1.0, abs=1e-12)
@@ -85,6 +88,9 @@ def test_weights_and_what_is_left_sum_to_one_and_the_sums_end_at_the_colour(scen
         np.testing.assert_allclose(e.rows[-1].cumulative + behind, e.color, rtol=0, atol=1e-12)
         heaviest = max(e.blended, key=lambda row: row.weight)
         assert [row.id for row in e.rows if row.dominant] == [heaviest.id] == [e.dominant_id]
+        ended.append(np.nan if e.stopped_by is None else e.stopped_by.depth)
+    np.testing.assert_allclose([depths[y, x] for x, y in PIXELS], ended, rtol=1e-12)
+    assert 0 < np.isfinite(ended).sum() < len(ended)
 
 
 def test_listed_derivatives_are_those_of_autograd(scene: ExplainedView) -> None:
@@ -111,10 +117,12 @@ def test_derivatives_through_single_pixels_sum_to_the_views() -> None:
 
 def test_the_views_derivatives_are_those_of_the_loss_that_is_trained(scene: ExplainedView) -> None:
     opacities = scene.gaussians["opacities"].clone().requires_grad_(True)
-    again = replace(scene, gaussians={**scene.gaussians, "opacities": opacities})
+    given = {**scene.gaussians, "opacities": opacities, "colors": scene.gaussians["sh"]}
+    del given["sh"]
+    settings = settings_of(scene.view, scene.config, torch.float64)
     target = torch.from_numpy(VIEW.image).double() / 255.0
     with torch.enable_grad():
-        image = rendered(again)
+        image = rasterization(**given, **settings, sh_degree=3, backgrounds=scene.background[None])[0][0]
         prior = POPStrategy().regularizer(opacities, {"dominant_sum": None}, 0, {"dominant_counts": scene.counts[None]})
         assert prior is not None
         (v,) = torch.autograd.grad(photometric_pop(image, target) + prior, opacities)
@@ -124,24 +132,6 @@ def test_the_views_derivatives_are_those_of_the_loss_that_is_trained(scene: Expl
         assert row.v_opacity_view + row.v_opacity_pop == pytest.approx(float(v[i]), rel=1e-9, abs=1e-16)
         assert row.pop == ("up" if row.pixels_dominated > 0 else "down")
         assert row.net == ("up" if v[i] < 0 else "down")
-
-
-def rendered(view: ExplainedView) -> torch.Tensor:
-    from pop_fast.api.rasterize import rasterization
-    from pop_fast.view.explain.scene import settings_of
-
-    given = {**view.gaussians, "colors": view.gaussians["sh"]}
-    del given["sh"]
-    settings = settings_of(view.view, view.config, torch.float64)
-    return rasterization(**given, **settings, sh_degree=3, backgrounds=view.background[None])[0][0]
-
-
-def test_rays_end_at_the_depth_of_the_splat_that_stopped_them(scene: ExplainedView) -> None:
-    depths = termination_depths(scene)
-    ended = [explain_pixel(scene, x, y).stopped_by for x, y in PIXELS]
-    expected = [np.nan if row is None else row.depth for row in ended]
-    np.testing.assert_allclose([depths[y, x] for x, y in PIXELS], expected, rtol=1e-12)
-    assert 0 < np.isfinite(expected).sum() < len(expected)
 
 
 def test_the_table_fits_a_terminal_and_shows_every_entry_when_asked(scene: ExplainedView) -> None:
@@ -170,10 +160,10 @@ def test_json_holds_every_number(scene: ExplainedView) -> None:
     e = explain_pixel(scene, 16, 12)
     plain = json.loads(e.to_json())
     assert plain["format"] == "pop-explain/1"
-    assert plain["rows"][2].pop("pop") == e.rows[2].pop
-    assert plain["rows"][2].pop("net") == e.rows[2].net
-    assert plain["rows"][2] == json.loads(json.dumps(asdict(e.rows[2])))
     assert len(plain["rows"]) == len(e.rows)
+    row = plain["rows"][2]
+    assert (row.pop("pop"), row.pop("net")) == (e.rows[2].pop, e.rows[2].net)
+    assert row == json.loads(json.dumps(asdict(e.rows[2])))
 
 
 def flipped(scene: ExplainedView, profile: Profile, change: dict[str, np.ndarray] | None = None) -> str | None:
@@ -199,14 +189,11 @@ def test_the_decision_that_flipped_is_named() -> None:
     e = explain_pixel(scene, 16, 12)
     assert [row.status for row in e.rows] == ["blended", "blended", "stopped", "hidden"]
     splats = oracle_splats(scene, candidates(scene.info, 16, 12), PAPER)
-    behind = replace(PAPER, near_plane=float(splats.depths[0]) + 0.1)
+    small, away = splats.radii.copy(), splats.means2d.copy()
+    small[0], away[0] = 0, away[0] + 40.0
     assert flipped(scene, PAPER) is None
-    assert flipped(scene, behind) == "D1"
-    small = splats.radii.copy()
-    small[0] = 0
+    assert flipped(scene, replace(PAPER, near_plane=float(splats.depths[0]) + 0.1)) == "D1"
     assert flipped(scene, PAPER, {"radii": small}) == "D2"
-    away = splats.means2d.copy()
-    away[0] += 40.0
     assert flipped(scene, PAPER, {"means2d": away}) == "D3"
     assert flipped(scene, PAPER, {"depths": splats.depths[[1, 0, 2, 3]]}) == "D4"
     assert flipped(scene, PAPER, {"opacities": splats.opacities * [0.01, 1.0, 1.0, 1.0]}) == "D5"
@@ -232,12 +219,16 @@ def test_profiles_are_compared_over_the_view_and_the_oracle_over_the_tile(scene:
         difference(scene, "paper", "nonsense", 16, 12)
 
 
-def test_one_command_writes_table_json_page_and_maps(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
+@pytest.fixture
+def explain(pop: Pop, shared_result: Path) -> Callable[..., Outcome]:
+    """`pop explain` at one pixel of the tiny result."""
+    return lambda *words, view="3": pop("explain", shared_result, "--view", view, "--pixel", "20,16", *words)
+
+
+def test_one_command_writes_table_json_page_and_maps(explain: Callable[..., Outcome], tmp_path: Path) -> None:
     files = {"--json": "why.json", "--html": "why.html", "--maps": "maps"}
     words = [word for flag, name in files.items() for word in (flag, tmp_path / name)]
-    outcome = pop.done(
-        "explain", shared_result, "--view", "3", "--pixel", "20,16", *words, "--diff", "paper", "gsplat_1_6"
-    )
+    outcome = explain(*words, "--diff", "paper", "gsplat_1_6")
     assert "pixel (20, 16)" in outcome.out
     assert "paper | gsplat_1_6" in outcome.out
     plain = json.loads((tmp_path / "why.json").read_text())
@@ -257,8 +248,8 @@ def test_one_command_writes_table_json_page_and_maps(pop: Pop, shared_result: Pa
     assert legend["pop_pull.png"]["scale"] == {"colors": "coolwarm", "low": -1.0, "top": 1.0}
 
 
-def test_the_page_runs_its_own_script_and_no_other(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
-    pop.done("explain", shared_result, "--view", "3", "--pixel", "20,16", "--html", tmp_path / "why.html")
+def test_the_page_runs_its_own_script_and_no_other(explain: Callable[..., Outcome], tmp_path: Path) -> None:
+    assert explain("--html", tmp_path / "why.html").status == 0
     html = (tmp_path / "why.html").read_text()
     assert html.index("Content-Security-Policy") < html.index("<title>")
     # as a name in a capture that was not escaped would do it
@@ -281,35 +272,33 @@ def test_no_page_makes_html_of_text() -> None:
         assert not re.search(r"innerHTML|outerHTML|AdjacentHTML|document\.write|eval\(", script.read_text()), script
 
 
-@pytest.mark.parametrize("profile", PROFILES)
-def test_a_pixel_is_explained_in_every_profile(pop: Pop, shared_result: Path, profile: str) -> None:
-    outcome = pop.done("explain", shared_result, "--view", "3", "--pixel", "20,16", "--profile", profile)
-    assert f"profile {profile}" in outcome.out
+def test_a_pixel_is_explained_in_every_profile_and_its_view_may_be_named(explain: Callable[..., Outcome]) -> None:
+    for profile in PROFILES:
+        assert f"profile {profile}" in explain("--profile", profile).out
+    by_place = explain().out
+    assert "view_003.png" in by_place
+    assert [explain(view=name).out for name in ("view_003.png", "view_003")] == [by_place] * 2
 
 
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        (["--view", "0", "--pixel", "40,3"], "pixel x is 40; view view_000.png is 40 x 32 px, so x must lie in 0..39"),
-        (["--view", "0", "--pixel", "4,-1"], "pixel y is -1;"),
-        (["--view", "0", "--pixel", "four"], "pixel is 'four'; give column and row"),
-        (["--view", "0"], "pixel is not given; say which with --pixel X,Y"),
-        (["--view", "8", "--pixel", "1,1"], "view is 8; toy has views 0 (view_000.png) to 7 (view_007.png)"),
-        (["--view", "cat.jpg", "--pixel", "1,1"], "view 'cat.jpg' is no view of toy; give a file name"),
-        (["--view", "0", "--pixel", "1,1", "--capture", "nowhere"], "nowhere: no such folder"),
-        (["--view", "0", "--pixel", "1,1", "--diff", "paper", "mine"], "'mine', which is neither a profile"),
-        (
-            ["--view", "0", "--pixel", "1,1", "--profile", "mine"],
-            "profile is 'mine'; it must be one of paper, gsplat_1_5",
-        ),
+        ("--view 0 --pixel 40,3", "pixel x is 40; view view_000.png is 40 x 32 px, so x must lie in 0..39"),
+        ("--view 0 --pixel 4,-1", "pixel y is -1;"),
+        ("--view 0 --pixel four", "pixel is 'four'; give column and row"),
+        ("--view 0", "pixel is not given; say which with --pixel X,Y"),
+        ("--view 8 --pixel 1,1", "view is 8; toy has views 0 (view_000.png) to 7 (view_007.png)"),
+        ("--view cat.jpg --pixel 1,1", "view 'cat.jpg' is no view of toy; give a file name"),
+        ("--view 0 --pixel 1,1 --capture nowhere", "nowhere: no such folder"),
+        ("--view 0 --pixel 1,1 --diff paper mine", "'mine', which is neither a profile"),
+        ("--view 0 --pixel 1,1 --profile mine", "profile is 'mine'; it must be one of paper, gsplat_1_5"),
     ],
-    ids=["x", "y", "no numbers", "no pixel", "view", "name", "capture", "diff", "profile"],
 )
 def test_bad_words_are_answered_by_one_line_that_names_field_and_fix(
-    pop: Pop, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], part: str
+    pop: Pop, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, part: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    says(pop("explain", shared_result, *words), part)
+    says(pop("explain", shared_result, *words.split()), part)
 
 
 # `pop explain` told which loss, which view and which two renderers: the words that choose are obeyed.
@@ -335,21 +324,22 @@ def test_an_objective_is_the_papers_whatever_the_run_was_trained_with(equation: 
 
 
 def test_the_objective_of_the_command_line_changes_the_pull_and_not_the_picture(
-    pop: Pop, shared_result: Path, tmp_path: Path
+    explain: Callable[..., Outcome], tmp_path: Path
 ) -> None:
     told = {}
     for objective in ("run", "pop", "3dgs"):
-        files = ("--json", tmp_path / f"{objective}.json", "--html", tmp_path / f"{objective}.html")
-        words = ("explain", shared_result, "--view", "3", "--pixel", "20,16", *files)
-        outcome = pop.done(*words, *(() if objective == "run" else ("--objective", objective)))
-        told[objective] = json.loads((tmp_path / f"{objective}.json").read_text())
+        plain, page = (tmp_path / f"{objective}.{kind}" for kind in ("json", "html"))
+        words = () if objective == "run" else ("--objective", objective)
+        outcome = explain("--json", plain, "--html", page, *words)
+        told[objective] = json.loads(plain.read_text())
         # nothing is said of a term that the objective has not, but that it has none
         said = outcome.out.partition("this objective has no POP term")
         assert (said[1] == "") == (objective != "3dgs")
         assert ("POP" in said[0]) == (objective != "3dgs")
-        page = re.sub(r"<script>.*|<style>.*?</style>", "", (tmp_path / f"{objective}.html").read_text(), flags=re.S)
-        page = page.replace("this objective has no POP term", "").replace("This objective has no POP term", "")
-        assert ("POP" in page) == (objective != "3dgs")
+        html = re.sub(
+            r"<script>.*|<style>.*?</style>|[tT]his objective has no POP term", "", page.read_text(), flags=re.S
+        )
+        assert ("POP" in html) == (objective != "3dgs")
     # the run was trained with POP's objective
     assert told["run"] == told["pop"]
     assert told["3dgs"]["lambda_pop"] == 0.0
@@ -357,14 +347,6 @@ def test_the_objective_of_the_command_line_changes_the_pull_and_not_the_picture(
     assert told["3dgs"]["v_color"] != told["pop"]["v_color"]
     assert {row["pop"] for row in told["3dgs"]["rows"]} == {"none"}
     assert {row["pop"] for row in told["pop"]["rows"]} <= {"up", "down"}
-
-
-@pytest.mark.parametrize("name", ["view_003.png", "view_003"])
-def test_a_view_may_be_named(pop: Pop, shared_result: Path, name: str) -> None:
-    by_place = pop("explain", shared_result, "--view", "3", "--pixel", "20,16")
-    by_name = pop.done("explain", shared_result, "--view", name, "--pixel", "20,16")
-    assert "view_003.png" in by_name.out
-    assert by_name.out == by_place.out
 
 
 def test_a_name_that_two_views_bear_is_refused_and_a_number_may_be_a_name() -> None:
@@ -380,12 +362,9 @@ def test_a_name_that_two_views_bear_is_refused_and_a_number_may_be_a_name() -> N
 
 
 @pytest.mark.skipif(cuda_ext.available(), reason="the CUDA backend can run here")
-def test_without_a_gpu_one_sentence_says_why_and_what_to_do(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
-    words = ("--view", "3", "--pixel", "20,16", "--json", tmp_path / "why.json", "--diff", "fast", "cuda")
-    outcome = pop("explain", shared_result, *words)
-    reason = cuda_ext.why_not()
-    assert reason is not None
-    says(outcome, "backend 'cuda' cannot run: ", reason)
+def test_without_a_gpu_one_sentence_says_why_and_what_to_do(explain: Callable[..., Outcome], tmp_path: Path) -> None:
+    outcome = explain("--json", tmp_path / "why.json", "--diff", "fast", "cuda")
+    says(outcome, "backend 'cuda' cannot run: ", str(cuda_ext.why_not()))
     # refused before anything is told or written
     assert outcome.out == ""
     assert not (tmp_path / "why.json").exists()
@@ -415,7 +394,7 @@ def instead_of_cuda(monkeypatch: pytest.MonkeyPatch) -> Callable[[Change], None]
     return put
 
 
-def fainter(gaussian: int, alpha: float, falloff: float) -> Callable[[dict[str, Any]], dict[str, Any]]:
+def fainter(gaussian: int, alpha: float, falloff: float) -> Change:
     """Give a Gaussian the opacity that makes its alpha what is asked for where its falloff is known."""
 
     def change(given: dict[str, Any]) -> dict[str, Any]:
@@ -429,13 +408,10 @@ def fainter(gaussian: int, alpha: float, falloff: float) -> Callable[[dict[str, 
 def test_a_backend_that_skips_a_splat_is_shown_with_the_decision_that_flipped(
     scene: ExplainedView, instead_of_cuda: Callable[[Change], None]
 ) -> None:
-    x, y = 16, 12
-    row = explain_pixel(scene, x, y).blended[1]
-    floor = PAPER.alpha_floor
+    row, floor = explain_pixel(scene, 16, 12).blended[1], PAPER.alpha_floor
     instead_of_cuda(fainter(row.id, 0.999 * floor, row.falloff))
-    found = difference(scene, "fast", "cuda", x, y)
-    assert found.names == ("fast", "cuda")
-    assert found.at == (x, y)
+    found = difference(scene, "fast", "cuda", 16, 12)
+    assert (found.names, found.at) == (("fast", "cuda"), (16, 12))
     assert found.region == (0, 0, VIEW.width, VIEW.height)
     assert found.flip is not None
     assert (found.flip.decision, found.flip.gaussian) == ("D5", row.id)
@@ -462,19 +438,16 @@ def test_a_backend_with_another_ceiling_parts_by_d6_and_the_worst_pixel_is_looke
 
 
 def test_the_command_line_shows_where_two_backends_part(
-    pop: Pop, shared_result: Path, tmp_path: Path, instead_of_cuda: Callable[[Change], None]
+    explain: Callable[..., Outcome], tmp_path: Path, instead_of_cuda: Callable[[Change], None]
 ) -> None:
-    words = ("explain", shared_result, "--view", "3", "--pixel", "20,16")
-    assert pop(*words, "--json", tmp_path / "own.json").status == 0
+    assert explain("--json", tmp_path / "own.json").status == 0
     rows = json.loads((tmp_path / "own.json").read_text())["rows"]
     # away from its centre a splat may be too faint at the pixel and still be visible elsewhere
     row = next(row for row in rows if row["status"] == "blended" and row["falloff"] < 0.5)
-    faint = fainter(row["id"], 0.99 * PAPER.alpha_floor, row["falloff"])
-    instead_of_cuda(faint)
-    outcome = pop.done(*words, "--json", tmp_path / "why.json", "--diff", "fast", "cuda")
+    instead_of_cuda(fainter(row["id"], 0.99 * PAPER.alpha_floor, row["falloff"]))
+    outcome = explain("--json", tmp_path / "why.json", "--diff", "fast", "cuda")
     assert f"D5 falls otherwise first, at Gaussian {row['id']}" in outcome.out
     assert "fast | cuda, 40 x 32 px from (0, 0):" in outcome.out
     flip = json.loads((tmp_path / "why.json").read_text())["difference"]["flip"]
-    assert flip["decision"] == "D5"
-    assert flip["gaussian"] == row["id"]
+    assert (flip["decision"], flip["gaussian"]) == ("D5", row["id"])
     assert "skips it" in flip["second"]

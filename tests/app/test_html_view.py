@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,10 +36,19 @@ def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
         yield opened
 
 
+K = np.array([[180.0, 0.0, 93.0], [0.0, 170.0, 80.0], [0.0, 0.0, 1.0]])
+
+
 def a_view(position: tuple[float, float, float] = (0.5, -1.0, -6.0)) -> ViewTensors:
-    K = torch.tensor([[180.0, 0.0, 93.0], [0.0, 170.0, 80.0], [0.0, 0.0, 1.0]])
     viewmat = torch.from_numpy(look_at(np.array(position))).float()
-    return ViewTensors("a view", torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8), None, viewmat[None], K[None])
+    photo = torch.zeros(HEIGHT, WIDTH, 3, dtype=torch.uint8)
+    return ViewTensors("a view", photo, None, viewmat[None], torch.from_numpy(K).float()[None])
+
+
+def page_in(folder: Path, n: int, *cameras: PageCamera, title: str = "x", **settings: Any) -> Path:
+    page = folder / f"{n}.html"
+    page.write_bytes(page_of(many(n), list(cameras), TrainConfig(**settings), 3, title))
+    return page
 
 
 def camera_of(view: ViewTensors) -> PageCamera:
@@ -91,7 +101,7 @@ def test_a_browser_draws_what_is_rendered(
 
 
 def test_a_page_of_a_result_starts_at_a_training_camera_and_asks_for_nothing(
-    tab: Browser, pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path
+    tab: Browser, pop: Pop, shared_result: Path, tmp_path: Path
 ) -> None:
     pop.done("export", shared_result, "--out", tmp_path / "x.html")
     tab.requests.clear()
@@ -107,59 +117,43 @@ def test_a_page_of_a_result_starts_at_a_training_camera_and_asks_for_nothing(
     assert files == {(tmp_path / "x.html").as_uri()}
     # besides what the browser changes, what SPZ loses
     assert psnr(picture, rendered(splat.params, ViewTensors.of(views[first]), config, splat.sh_degree)) > 40.0
-
-
-def test_the_page_refers_to_no_other_file() -> None:
+    # nor does it refer to another file
     page = page_of(many(5), [], TrainConfig(), 3, "x").decode()
     assert not re.findall(r"""(?:src|href)\s*=|url\(|@import|fetch\(|XMLHttpRequest|WebSocket|import\(""", page)
     assert "connect-src" not in page
     assert "default-src 'none'" in page
 
 
-def redrawn(tab: Browser) -> np.ndarray:
-    """The picture after frames that were asked for now: one sorts, one draws in the new order."""
+def redrawn(tab: Browser, expression: str = "") -> np.ndarray:
+    """The picture after an event and frames that were asked for now: one sorts, one draws in the new order."""
+    if expression:
+        tab.value(expression)
     for _ in range(3):
         tab.value("delete document.getElementById('view').dataset.drawn; window.dispatchEvent(new Event('resize'))")
         tab.wait_for("document.getElementById('view').dataset.drawn")
     return tab.screenshot()
 
 
-def test_mouse_wheel_and_keys_move_the_camera(tab: Browser, tmp_path: Path) -> None:
-    page = tmp_path / "x.html"
-    page.write_bytes(
-        page_of(many(300), [camera_of(a_view()), camera_of(a_view((3.0, 1.0, 4.0)))], TrainConfig(), 3, "x")
-    )
+def test_mouse_wheel_keys_and_two_fingers_move_the_camera(tab: Browser, tmp_path: Path) -> None:
+    page = page_in(tmp_path, 300, camera_of(a_view()), camera_of(a_view((3.0, 1.0, 4.0))))
     start = shown(tab, page)
 
-    def after(expression: str | None = None) -> np.ndarray:
-        if expression:
-            tab.value(expression)
-        return redrawn(tab)
+    def after(key: str) -> np.ndarray:
+        return redrawn(tab, f"window.dispatchEvent(new KeyboardEvent('keydown', {{key: '{key}'}}))")
 
-    def key(name: str) -> str:
-        return f"window.dispatchEvent(new KeyboardEvent('keydown', {{key: '{name}'}}))"
-
-    turned = after(key("ArrowLeft"))
+    turned = after("ArrowLeft")
     assert psnr(turned, start) < 30.0
-    nearer = after(key("+"))
-    assert psnr(nearer, turned) < 35.0
-    back = after(key("r"))
-    assert psnr(back, start) > 60.0
-    other = after(key("n"))
-    assert psnr(other, start) < 25.0
-    assert psnr(after(key("p")), start) > 60.0
+    assert psnr(after("+"), turned) < 35.0
+    assert psnr(after("r"), start) > 60.0
+    assert psnr(after("n"), start) < 25.0
+    assert psnr(after("p"), start) > 60.0
     for kind, x, buttons in (("mousePressed", 60, 1), ("mouseMoved", 120, 1), ("mouseReleased", 120, 0)):
         tab.call("Input.dispatchMouseEvent", type=kind, x=x, y=70, button="left", buttons=buttons, clickCount=1)
-    dragged = after()
+    dragged = redrawn(tab)
     assert psnr(dragged, start) < 30.0
     tab.call("Input.dispatchMouseEvent", type="mouseWheel", x=60, y=70, deltaX=0, deltaY=-300)
-    assert psnr(after(), dragged) < 35.0
-
-
-def test_two_fingers_zoom(tab: Browser, tmp_path: Path) -> None:
-    page = tmp_path / "x.html"
-    page.write_bytes(page_of(many(300), [camera_of(a_view())], TrainConfig(), 3, "x"))
-    start = shown(tab, page)
+    assert psnr(redrawn(tab), dragged) < 35.0
+    assert psnr(after("r"), start) > 60.0
 
     def touch(kind: str, *points: tuple[int, int]) -> None:
         fingers = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
@@ -176,9 +170,7 @@ def test_two_fingers_zoom(tab: Browser, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("width", "height"), [(1280, 800), (400, 780)])
 def test_the_buttons_fit_into_the_window(tab: Browser, tmp_path: Path, width: int, height: int) -> None:
-    page = tmp_path / "x.html"
-    page.write_bytes(page_of(many(300), [], TrainConfig(), 3, "a title that is rather long"))
-    tab.open(page, width, height)
+    tab.open(page_in(tmp_path, 300, title="a title that is rather long"), width, height)
     tab.wait_for("document.getElementById('view')?.dataset.drawn === '0'")
     assert tab.value("document.documentElement.scrollWidth <= innerWidth && document.body.scrollHeight <= innerHeight")
     boxes = tab.value(
@@ -192,44 +184,34 @@ def test_the_buttons_fit_into_the_window(tab: Browser, tmp_path: Path, width: in
 
 def test_an_empty_splat_and_a_lone_one_have_pages(tab: Browser, tmp_path: Path) -> None:
     for n in (0, 1):
-        page = tmp_path / f"{n}.html"
-        page.write_bytes(page_of(many(n), [], TrainConfig(background=(0.0, 1.0, 0.0)), 3, "x"))
-        assert shown(tab, page)[0, 0].tolist() == [0, 255, 0]
+        assert shown(tab, page_in(tmp_path, n, background=(0.0, 1.0, 0.0)))[0, 0].tolist() == [0, 255, 0]
 
 
-def test_views_turn_about_the_point_that_all_cameras_look_at() -> None:
+def test_views_turn_about_the_point_that_all_cameras_look_at_or_the_median_gaussian() -> None:
     cameras = [camera_of(a_view(place)) for place in ((0.0, -1.0, -6.0), (5.0, -1.0, 0.0), (0.0, 2.0, 3.0))]
     distances = view_distances(cameras, many(200)["means"])
     np.testing.assert_allclose(distances, [np.linalg.norm(camera.eye) for camera in cameras], rtol=1e-6)
-
-
-def test_cameras_that_look_the_same_way_turn_about_the_median_gaussian() -> None:
-    cameras = []
-    for x in (0.0, 0.5):
-        viewmat = np.eye(4)
+    # cameras that look the same way
+    viewmats = [np.eye(4), np.eye(4)]
+    for viewmat, x in zip(viewmats, (0.0, 0.5), strict=True):
         viewmat[:3, 3] = [x, 0.0, 7.0]
-        cameras.append(PageCamera("x", viewmat, np.eye(3), 10, 10))
-    for distance in view_distances(cameras, many(2000)["means"]):
-        assert distance == pytest.approx(7.0, abs=0.2)
+    alike = [PageCamera("x", viewmat, np.eye(3), 10, 10) for viewmat in viewmats]
+    assert view_distances(alike, many(2000)["means"]) == pytest.approx([7.0, 7.0], abs=0.2)
 
 
 def test_a_page_of_a_walk_starts_with_its_first_camera() -> None:
-    stands = [
-        PageCamera(str(i), camera, np.array([[40.0, 0, 20], [0, 40, 20], [0, 0, 1]]), 40, 40)
-        for i, camera in enumerate(walk())
-    ]
-    assert first_view(stands) == 0
-    assert first_view(stands[::-1]) == 0
+    lens = np.array([[40.0, 0, 20], [0, 40, 20], [0, 0, 1]])
+    stands = [PageCamera(str(i), camera, lens, 40, 40) for i, camera in enumerate(walk())]
+    assert first_view(stands) == first_view(stands[::-1]) == 0
 
 
 def test_a_page_starts_where_most_photographs_stand_with_the_subject_in_the_middle() -> None:
     def stand(degrees: float, distance: float, aside: float = 0.0) -> PageCamera:
         angle = np.radians(degrees)
-        eye = distance * np.array([np.sin(angle), 0.0, -np.cos(angle)])
-        viewmat = look_at(eye)
+        viewmat = look_at(distance * np.array([np.sin(angle), 0.0, -np.cos(angle)]))
         viewmat[0, 3] += aside
-        K = np.array([[100.0, 0.0, 60.0], [0.0, 100.0, 45.0], [0.0, 0.0, 1.0]])
-        return PageCamera(f"{degrees}", viewmat, K, 120, 90)
+        lens = np.array([[100.0, 0.0, 60.0], [0.0, 100.0, 45.0], [0.0, 0.0, 1.0]])
+        return PageCamera(f"{degrees}", viewmat, lens, 120, 90)
 
     arc = [stand(degrees, 4.0) for degrees in (-60.0, -40.0, -20.0, 0.0, 20.0, 40.0, 60.0)]
     assert first_view(arc) == 3
@@ -252,6 +234,4 @@ def test_a_splat_without_cameras_is_seen_from_the_front() -> None:
 def test_a_large_capture_gives_sixty_cameras_evenly() -> None:
     views = tiny_capture(n_views=200).views
     cameras = cameras_of(views)
-    assert len(cameras) == 60
-    assert cameras[0].name == views[0].name
-    assert cameras[-1].name == views[-1].name
+    assert (len(cameras), cameras[0].name, cameras[-1].name) == (60, views[0].name, views[-1].name)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import re
 import socket
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
@@ -41,13 +41,16 @@ from tests.app.browser import browser
 from tests.app.conftest import Pop
 from tests.app.damage import says
 from tests.app.test_paths import ring
-from tests.app.tiny import tiny_capture, tiny_config
+from tests.app.tiny import assert_same_run, tiny_capture, tiny_config
 
 WORLD = np.array([[0.0, -2.0, 0.0, 3.0], [2.0, 0.0, 0.0, -1.0], [0.0, 0.0, 2.0, 0.5], [0.0, 0.0, 0.0, 1.0]])
 
 
+Shown = tuple[SplatScene, ViewState, Any]
+
+
 @pytest.fixture(scope="module")
-def shown(shared_result: Path) -> tuple[SplatScene, ViewState, Any]:
+def shown(shared_result: Path) -> Shown:
     """A trained splat, its first training view as a state, and its capture."""
     splat = load_splat(shared_result)
     capture, config = open_capture(splat, CaptureOptions())
@@ -56,7 +59,7 @@ def shown(shared_result: Path) -> tuple[SplatScene, ViewState, Any]:
     return scene, ViewState(view.viewmat, field_of_view(view.K, view.height), view.width, view.height), capture
 
 
-def test_a_training_camera_shows_what_training_renders(shown: tuple[SplatScene, ViewState, Any]) -> None:
+def test_a_training_camera_shows_what_training_renders(shown: Shown) -> None:
     scene, state, capture = shown
     # a browser's camera has its axis in the middle, the demo's nearly
     lens = torch.from_numpy(state.K).float()[None]
@@ -70,7 +73,7 @@ def test_a_training_camera_shows_what_training_renders(shown: tuple[SplatScene, 
     assert drawn.legend == f"{len(scene.params['means']):,} Gaussians"
 
 
-def test_modes_show_owners_opacity_and_depth(shown: tuple[SplatScene, ViewState, Any]) -> None:
+def test_modes_show_owners_opacity_and_depth(shown: Shown) -> None:
     scene, state, _ = shown
     pictures = {mode: scene.draw(replace(state, mode=mode)) for mode in ("dominant", "opacity", "depth")}
     assert "own a pixel" in pictures["dominant"].legend
@@ -89,7 +92,7 @@ def owners(scene: SplatScene, params: dict[str, torch.Tensor], state: ViewState)
     return found.dominant_ids
 
 
-def test_a_gaussian_keeps_its_colour_when_others_are_left_out(shown: tuple[SplatScene, ViewState, Any]) -> None:
+def test_a_gaussian_keeps_its_colour_when_others_are_left_out(shown: Shown) -> None:
     scene, state, _ = shown
     means = scene._own_means()
     centre, half = means.median(0).values, (means.max(0).values - means.min(0).values)
@@ -106,7 +109,7 @@ def test_a_gaussian_keeps_its_colour_when_others_are_left_out(shown: tuple[Splat
     assert np.array_equal(cropped.image[same], whole.image[same])
 
 
-def test_a_threshold_leaves_out_what_is_fainter(shown: tuple[SplatScene, ViewState, Any]) -> None:
+def test_a_threshold_leaves_out_what_is_fainter_and_the_box_that_is_offered_holds_nearly_all(shown: Shown) -> None:
     scene, state, _ = shown
     opacities = torch.sigmoid(scene.params["opacities"])
     middle = float(opacities.median())
@@ -115,17 +118,9 @@ def test_a_threshold_leaves_out_what_is_fainter(shown: tuple[SplatScene, ViewSta
     empty = scene.draw(replace(state, min_opacity=1.0))
     assert empty.legend.startswith("0 of")
     assert np.ptp(empty.image) == 0
-
-
-def test_the_box_that_is_offered_holds_nearly_all(shown: tuple[SplatScene, ViewState, Any]) -> None:
-    box = np.array(shown[0].extent()).reshape(2, 3)
-    means = shown[0]._own_means().numpy()
-    assert ((means >= box[0]) & (means <= box[1])).all(1).mean() > 0.9
-
-
-def test_a_pose_and_its_matrix_say_the_same() -> None:
-    for viewmat in ring(5):
-        np.testing.assert_allclose(viewmat_of_pose(*pose_of_viewmat(viewmat)), viewmat, atol=1e-12)
+    low, high = np.array(scene.extent()).reshape(2, 3)
+    means = scene._own_means().numpy()
+    assert ((means >= low) & (means <= high)).all(1).mean() > 0.9
 
 
 def test_a_moving_camera_is_drawn_small_and_a_resting_one_sharp() -> None:
@@ -144,27 +139,23 @@ def test_a_moving_camera_is_drawn_small_and_a_resting_one_sharp() -> None:
     assert pace.due(10.15) is None
     assert pace.rests_in(10.15) == pytest.approx(0.1)
     assert pace.due(10.3) == "sharp"
-
-
-def test_what_moves_while_a_picture_is_drawn_is_drawn_again() -> None:
+    # what moves while a picture is drawn is drawn again
     pace = Pace()
     pace.begin()
     pace.moved(1.0)
     pace.drawn("sharp", 100, 0.5, 1.1)
     assert pace.due(1.1) == "quick"
-
-
-def test_a_training_is_shown_anew_for_a_fifth_of_the_time_at_most() -> None:
+    # a training is shown anew for a fifth of the time at most
     pace = Pace()
     pace.begin()
     pace.drawn("sharp", 100, 1.0, 100.0)
     pace.renewed()
-    assert pace.due(104.0) is None
-    assert pace.due(105.1) == "sharp"
+    assert [pace.due(seconds) for seconds in (104.0, 105.1)] == [None, "sharp"]
 
 
-def test_a_camera_moves_between_frames_and_back() -> None:
-    viewmat = ring(3)[1]
+def test_a_camera_moves_between_frames_and_back_and_its_pose_says_the_same() -> None:
+    for viewmat in ring(5):
+        np.testing.assert_allclose(viewmat_of_pose(*pose_of_viewmat(viewmat)), viewmat, atol=1e-12)
     there = to_capture(viewmat, WORLD)
     np.testing.assert_allclose(there[:3, :3] @ there[:3, :3].T, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(from_capture(there, WORLD), viewmat, atol=1e-12)
@@ -186,61 +177,12 @@ def test_a_path_passes_its_cameras_in_any_frame(tmp_path: Path) -> None:
     assert len(single) == 3
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("[1]", "it must be an object"),
-        ('{"kind": "something"}', "is not a camera path of 'pop view' (kind 'something')"),
-        ('{"kind": "pop camera path", "frame": "capture", "cameras": []}', "has no cameras"),
-        ('{"kind": "pop camera path", "frame": "capture", "cameras": [{}]}', "cameras[0]: needs viewmat"),
-        (
-            json.dumps(
-                {
-                    "kind": "pop camera path",
-                    "frame": "capture",
-                    "cameras": [
-                        {"viewmat": [[2.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], "fov_y_degrees": 50}
-                    ],
-                }
-            ),
-            "cameras[0]: viewmat is no rigid",
-        ),
-        (
-            json.dumps(
-                {
-                    "kind": "pop camera path",
-                    "frame": "capture",
-                    "cameras": [{"viewmat": np.eye(4).tolist(), "fov_y_degrees": 180}],
-                }
-            ),
-            "fov_y_degrees is 180",
-        ),
-    ],
-)
-def test_a_damaged_path_is_named_before_anything_is_rendered(
-    pop: Pop, shared_result: Path, tmp_path: Path, text: str, said: str
-) -> None:
-    (tmp_path / "path.json").write_text(text)
-    says(pop("render", shared_result, "--path", tmp_path / "path.json", "--out", tmp_path / "r"), said)
-    assert not (tmp_path / "r").exists()
-
-
-def test_a_path_that_is_neither_known_nor_a_file_is_refused(pop: Pop, shared_result: Path, tmp_path: Path) -> None:
-    says(
-        pop("render", shared_result, "--path", "spiral", "--out", tmp_path / "r"),
-        "give --path one of views, orbit, ellipse, interpolate, or a file that 'pop view' saved",
-    )
-
-
-def test_a_recorded_path_is_rendered(
-    pop: Pop, shared_result: Path, shown: tuple[SplatScene, ViewState, Any], tmp_path: Path
-) -> None:
+def test_a_recorded_path_is_rendered(pop: Pop, shared_result: Path, shown: Shown, tmp_path: Path) -> None:
     scene, state, capture = shown
-    views = capture.train_views(8)
-    cameras = [KeyCamera(view.viewmat, state.fov_y) for view in views[:3]]
+    cameras = [KeyCamera(view.viewmat, state.fov_y) for view in capture.train_views(8)[:3]]
     (tmp_path / "path.json").write_text(path_of(cameras, capture.world_transform).text())
     words = ["--path", tmp_path / "path.json", "--frames", "5", "--out", tmp_path / "r", "--video", tmp_path / "v.webm"]
-    assert pop("render", shared_result, *words).status == 0
+    pop.done("render", shared_result, *words)
     assert frames_in(tmp_path / "v.webm") == 5
     first = cv2.imread(str(tmp_path / "r" / "path_0000.png"))[:, :, ::-1]
     assert np.abs(first.astype(int) - scene.draw(state).image).max() <= 1
@@ -255,19 +197,14 @@ def test_without_viser_one_line_says_how_to_get_it(
     assert not (tmp_path / "r").exists()
 
 
-@pytest.mark.parametrize("port", [0, 65536])
-def test_a_port_that_cannot_be_is_refused(pop: Pop, shared_result: Path, port: int) -> None:
-    says(pop("view", shared_result, "--port", port), f"port is {port}; give --port")
+def test_a_port_that_cannot_be_is_refused(pop: Pop, shared_result: Path) -> None:
+    for port in (0, 65536):
+        says(pop("view", shared_result, "--port", port), f"port is {port}; give --port")
 
 
 @pytest.mark.parametrize("lone", [False, True])
 def test_the_command_prints_its_address_serves_it_and_ends_with_ctrl_c(
-    pop: Pop,
-    shared_result: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-    lone: bool,
+    pop: Pop, shared_result: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, lone: bool
 ) -> None:
     pytest.importorskip("viser", reason="pip install 'viser>=1.1,<1.2'")
     from pop_fast.view.live.server import LiveViewer
@@ -280,14 +217,14 @@ def test_the_command_prints_its_address_serves_it_and_ends_with_ctrl_c(
         served.append(urlopen(viewer.url).read())
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(LiveViewer, "wait", interrupted)
     file = tmp_path / "a.ply"
     if lone:
-        assert pop("export", shared_result, "--out", file).status == 0
-    outcome = pop.done("view", file if lone else shared_result, "--port", 18_432)
-    assert re.fullmatch(
-        r"(note: no capture is known.*\n)?viewer: http://127\.0\.0\.1:\d+/[\w-]{24}/\nCtrl-C ends it\n", outcome.out
-    )
+        pop.done("export", shared_result, "--out", file)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(LiveViewer, "wait", interrupted)
+        outcome = pop.done("view", file if lone else shared_result, "--port", 18_432)
+    address = r"viewer: http://127\.0\.0\.1:\d+/[\w-]{24}/\nCtrl-C ends it\n"
+    assert re.fullmatch(rf"(note: no capture is known.*\n)?{address}", outcome.out)
     assert ("note: no capture" in outcome.out) is lone
     assert b"<html" in served[0].lower()
     assert not [record for record in caplog.records if record.name.startswith("websockets")]
@@ -314,34 +251,26 @@ class Viewer:
         return 1
 
 
-def test_a_training_that_is_watched_has_the_same_bits(tmp_path: Path) -> None:
+def test_a_training_that_is_watched_has_the_same_bits_and_is_shown_as_it_is(tmp_path: Path) -> None:
     viewer, capture = Viewer(), tiny_capture()
-    runs = {
-        "alone": TrainingRun(tiny_config(tmp_path / "alone"), capture),
-        "watched": TrainingRun(
-            tiny_config(tmp_path / "watched"), capture, watch=lambda run: follow(viewer, run, capture.world_transform)
-        ),
-    }
-    for run in runs.values():
+    alone = TrainingRun(tiny_config(tmp_path / "alone"), capture)
+    watch = partial(follow, viewer, world_transform=capture.world_transform)
+    watched = TrainingRun(tiny_config(tmp_path / "watched"), capture, watch=watch)
+    for run in (alone, watched):
         run.run()
-    steps = runs["alone"].config.max_steps
+    steps = alone.config.max_steps
     assert viewer.drawn[-1] == f"step {steps} of {steps}"
     assert len(viewer.drawn) >= steps // 5
-    for key, alone in runs["alone"].params.items():
-        assert torch.equal(alone, runs["watched"].params[key]), key
-    alone, watched = (sorted((tmp_path / name / "ply").iterdir())[-1].read_bytes() for name in runs)
-    assert alone == watched
-
-
-def test_a_watched_training_shows_the_gaussians_as_they_are(tmp_path: Path) -> None:
-    run = TrainingRun(tiny_config(tmp_path / "r"), tiny_capture())
-    scene = scene_of(run, np.eye(4))
-    assert all(scene.params[key].data_ptr() == run.params[key].data_ptr() for key in run.params)
+    assert_same_run(tmp_path / "watched", tmp_path / "alone")
+    files = (sorted((tmp_path / name / "ply").iterdir())[-1].read_bytes() for name in ("alone", "watched"))
+    assert len(set(files)) == 1
+    scene = scene_of(watched, np.eye(4))
+    assert all(scene.params[key].data_ptr() == watched.params[key].data_ptr() for key in watched.params)
     assert not any(tensor.requires_grad for tensor in scene.params.values())
 
 
 def test_a_browser_shows_the_first_training_camera_and_moves_on(
-    shown: tuple[SplatScene, ViewState, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    shown: Shown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("viser", reason="pip install 'viser>=1.1,<1.2'")
     from pop_fast.view.live.server import LiveViewer

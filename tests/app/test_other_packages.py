@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +21,16 @@ import torch
 
 from pop_fast.api import backend
 from pop_fast.api.backend import BACKENDS
-from pop_fast.api.backends import FAST
+from pop_fast.api.backends import FAST, TorchBackend
 from pop_fast.api.rasterize import rasterization
 from pop_fast.density import DensificationStep, POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train import checkpoint as ckpt
-from tests.app.conftest import TRAIN, Pop
-from tests.app.interruptions import run_until
-from tests.app.test_resume import assert_same_run
-from tests.app.tiny import tiny_capture, tiny_config
+from tests.app.conftest import ROOT, TRAIN, Pop
+from tests.app.tiny import assert_same_run, records, run_until, tiny_capture, tiny_config
 from tests.fast.test_rasterization import cameras, scene
 
-ROOT = Path(__file__).resolve().parents[2]
 # no other file of the tree knows this name
 NAME = "elsewhere_" + "made_up"
 MODULE = '''
@@ -166,9 +164,9 @@ def test_it_trains_saves_resumes_and_exports(site: Path, shared_capture: Path, t
     given = {"method": "mine", "backend": "mine", "photometric": "huber", "profile": "mine"}
     assert {name: config[name] for name in given} == given
     assert (site / "asked.txt").stat().st_size > 30
-    records = [json.loads(line) for line in (tmp_path / "whole" / "metrics.jsonl").read_text().splitlines()]
-    assert all(0.0 < record["huber"] < record["huber"] ** 0.5 for record in records)
-    assert any(record.get("pruned") for record in records)
+    found = records(tmp_path / "whole")
+    assert all(0.0 < record["huber"] < record["huber"] ** 0.5 for record in found)
+    assert any(record.get("pruned") for record in found)
     # as if it had been stopped after step 14
     shutil.copytree(tmp_path / "whole", tmp_path / "parts")
     for path in (tmp_path / "parts" / "ckpts").glob("ckpt_*"):
@@ -254,21 +252,19 @@ def run(folder: Any, stop_after: int | None = None, resume: bool = False, **opti
 
 def test_it_decides_over_the_population_and_the_loss_falls(tmp_path):
     n = len(tiny_capture().points)
-    training = run(tmp_path)
+    training = run(tmp_path / "a")
     # steps 0, 4, ... 28
     assert len(training.params["means"]) == n + 8
-    stats = json.loads((tmp_path / "stats" / "val_step0029.json").read_text())
+    stats = json.loads((tmp_path / "a" / "stats" / "val_step0029.json").read_text())
     assert (stats["num_GS"], stats["stepper"], stats["method"]) == (n + 8, "torch", "Jitter")
-    records = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
-    assert records[-1]["loss"] < records[0]["loss"]
-    assert not any("cloned" in record or "pop" in record for record in records)
-
-
-def test_what_it_says_of_a_change_goes_into_the_records(tmp_path):
-    run(tmp_path, every=5, tells=True)
-    records = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
-    assert [record["step"] for record in records if "cloned" in record] == [0, 5, 10, 15, 20, 25]
-    assert all(record["cloned"] == 1 and record["pruned"] == 0 for record in records if "cloned" in record)
+    found = records(tmp_path / "a")
+    assert found[-1]["loss"] < found[0]["loss"]
+    assert not any("cloned" in record or "pop" in record for record in found)
+    # what it says of a change goes into the records
+    run(tmp_path / "b", every=5, tells=True)
+    changed = [record for record in records(tmp_path / "b") if "cloned" in record]
+    assert [record["step"] for record in changed] == [0, 5, 10, 15, 20, 25]
+    assert all((record["cloned"], record["pruned"]) == (1, 0) for record in changed)
 
 
 def test_a_run_that_is_resumed_goes_on_to_the_same_bits_whatever_it_drew_with(tmp_path):
@@ -280,7 +276,7 @@ def test_a_run_that_is_resumed_goes_on_to_the_same_bits_whatever_it_drew_with(tm
     assert_same_run(tmp_path / "parts", tmp_path / "whole")
 
 
-def test_our_own_strategies_follow_the_protocol_too(tmp_path):
+def test_our_own_strategies_follow_the_protocol_too(tmp_path, monkeypatch):
     own = tiny_config("x").strategy
     assert isinstance(own, POPStrategy)
     given = TrainingRun(tiny_config(tmp_path / "given"), tiny_capture(), strategy=own)
@@ -291,9 +287,7 @@ def test_our_own_strategies_follow_the_protocol_too(tmp_path):
     named.run()
     for key, value in named.params.items():
         assert torch.equal(given.params[key], value), key
-
-
-def test_a_gpu_trains_with_the_strategies_of_this_package(tmp_path, monkeypatch):
+    # a GPU trains with no others
     monkeypatch.setattr("cuda_ext.why_not", lambda: None)
     with pytest.raises(PopError, match="strategies of this package only; use --backend fast"):
         TrainingRun(tiny_config(tmp_path, backend="cuda"), tiny_capture(), strategy=Jitter())
@@ -301,55 +295,27 @@ def test_a_gpu_trains_with_the_strategies_of_this_package(tmp_path, monkeypatch)
 
 # Backends of other packages: found under their entry point, they draw, train, save, resume and are measured.
 
-# as somebody else writes one who reads `pop_fast.api.backend.Backend`: torch's stages, and a count of who asks for them
-BACKEND_MODULE = """
-from dataclasses import dataclass
-
-from pop_fast.api.backends import TorchBackend
-
-ASKED = []
-
-
-@dataclass(frozen=True)
-class MadeUp(TorchBackend):
-    def stages(self):
-        ASKED.append(self.name)
-        return super().stages()
-
-
-MINE = MadeUp("mine", "cpu", ("float32", "float64"), speed=None)
-"""
-BACKEND_ENTRIES = f"[{BACKENDS.group}]\nmine = made_up_backend:MINE\nbroken = no_such_package:BACKEND\n"
+MINE = TorchBackend("mine", "cpu", ("float32", "float64"), speed=None)
 
 
 @pytest.fixture
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[pytest.MonkeyPatch]:
-    """As where another distribution has registered two backends, one of which is not there; undoing it removes it."""
-    site = tmp_path_factory.mktemp("site")
-    (site / "made_up_backend.py").write_text(BACKEND_MODULE)
-    about = site / "made_up_backend-1.0.dist-info"
-    about.mkdir()
-    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: made-up-backend\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text(BACKEND_ENTRIES)
+def installed() -> Iterator[pytest.MonkeyPatch]:
+    """As where other distributions have registered two backends, one of which is not there; undoing it removes both."""
+    places = {"mine": f"{__name__}:MINE", "broken": "no_such_package:BACKEND"}
+    found = [EntryPoint(name, place, BACKENDS.group) for name, place in places.items()]
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(site))
-        look_again()
+        patch.setattr("importlib.metadata.entry_points", lambda group: found if group == BACKENDS.group else [])
+        BACKENDS.look_again()
         yield patch
-    look_again()
-
-
-def look_again() -> None:
     BACKENDS.look_again()
 
 
-def test_a_registered_backend_is_known_by_its_name_and_draws(installed: pytest.MonkeyPatch) -> None:
-    assert backend.backend_names() == ("fast", "compiled", "cuda", "ref", "mine", "broken")
-    drawn = rasterization(**scene(), **cameras(), backend="mine")[0]
-    assert torch.equal(drawn, rasterization(**scene(), **cameras(), backend="fast")[0])
-    assert torch.equal(drawn, rasterization(**scene(), **cameras(), backend=backend.get_backend("mine"))[0])
-
-
-def test_one_that_cannot_be_loaded_is_named(installed: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("installed")
+def test_a_registered_backend_is_known_by_its_name_and_draws_and_one_that_cannot_be_loaded_is_named() -> None:
+    assert registry.backend_names() == ("fast", "compiled", "cuda", "ref", "mine", "broken")
+    expected = rasterization(**scene(), **cameras(), backend="fast")[0]
+    for mine in ("mine", registry.get_backend("mine")):
+        assert torch.equal(rasterization(**scene(), **cameras(), backend=mine)[0], expected)
     with pytest.raises(PopError, match=r"the backend at no_such_package:BACKEND cannot be loaded: No module named"):
         backend.get_backend("broken")
 
@@ -359,22 +325,19 @@ def test_a_name_that_nobody_registers_is_refused_before_anything_is_written(
 ) -> None:
     made = TrainConfig.of(backend="mine").to_json()
     installed.undo()
-    look_again()
-    for make in (lambda: TrainConfig(backend="mine"), lambda: TrainConfig.of(backend="mine")):
-        with pytest.raises(
-            PopError, match=r"backend is 'mine'; it must be one of auto, fast, compiled, cuda, ref; one"
-        ):
-            make()
+    BACKENDS.look_again()
+    names = r"backend is 'mine'; it must be one of auto, fast, compiled, cuda, ref; one"
+    for make in (TrainConfig, TrainConfig.of):
+        with pytest.raises(PopError, match=names):
+            make(backend="mine")
     with pytest.raises(PopError, match="where that is installed"):
         TrainConfig.from_json(made)
     assert pop("train", shared_capture, *TRAIN, "--backend", "mine", "--out", tmp_path / "none").status == 2
     assert not (tmp_path / "none").exists()
 
 
-@pytest.mark.parametrize("name", [FAST.name, "auto"])
-def test_names_of_this_package_are_known_without_a_look_at_what_is_installed(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_names_of_this_package_are_known_without_a_look_at_what_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.metadata.entry_points", lambda group: pytest.fail("looked"))
-    look_again()
-    assert TrainConfig.from_json(TrainConfig(backend=name).to_json()).backend == name
+    for name in (FAST.name, "auto"):
+        BACKENDS.look_again()
+        assert TrainConfig.from_json(TrainConfig(backend=name).to_json()).backend == name

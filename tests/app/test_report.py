@@ -9,6 +9,7 @@ from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,8 +22,9 @@ from pop_fast.data import load_capture
 from pop_fast.data.capture import View, neighbour_degrees
 from pop_fast.errors import PopError
 from pop_fast.io import images
-from pop_fast.io.images import colormap_table, depth_picture, depth_range
+from pop_fast.io.images import colormap_table
 from pop_fast.io.ply import Frame, save_ply
+from pop_fast.train.config import TrainConfig
 from pop_fast.train.engines import renderer
 from pop_fast.train.load_result import load_splat
 from pop_fast.view.document import Chart, Series, Window, draw, draw_histogram, nice_ticks, short_number
@@ -43,7 +45,6 @@ from pop_fast.view.report.source import read_result, running_mean, thin_out
 from tests.app.browser import browser
 from tests.app.conftest import TRAIN, TRAIN_AND_CHECK, Pop
 from tests.app.damage import says
-from tests.app.result_folder import VIEWS, write_result
 from tests.app.test_paths import ring
 from tests.app.tiny import tiny_capture
 
@@ -77,6 +78,10 @@ def html(tmp_path_factory: pytest.TempPathFactory) -> str:
     return write_report(write_result(tmp_path_factory.mktemp("result") / "toy")).read_text(encoding="utf-8")
 
 
+def text_of(page: str) -> str:
+    return unescape(re.sub(r"<[^>]+>", " ", page))
+
+
 def test_the_page_is_well_formed_and_loads_nothing_from_elsewhere(html: str) -> None:
     tags = Tags(html).seen
     sources = [value for _, attrs in tags for key, value in attrs.items() if key in ("src", "href") and value]
@@ -88,12 +93,14 @@ def test_the_page_is_well_formed_and_loads_nothing_from_elsewhere(html: str) -> 
     assert "@import" not in html
 
 
-def test_headline_numbers_are_those_of_the_stats_file(html: str) -> None:
-    text = unescape(re.sub(r"<[^>]+>", " ", html))
-    for number in ("24.50", "0.8100", "1,200", "1,100 with opacity", "no weights were given", "10.0 iterations"):
-        assert number in text, number
-    assert f"{1200 * 236 / 2**20:.1f}" in text
-    assert f"as PLY {1200 * 248 / 2**20:.1f}" in text
+def test_numbers_windows_densification_steps_and_settings_are_those_of_the_run(html: str) -> None:
+    for words in (
+        *("24.50", "0.8100", "1,200", "1,100 with opacity", "no weights were given", "10.0 iterations"),
+        *(f"{1200 * 236 / 2**20:.1f}", f"as PLY {1200 * 248 / 2**20:.1f}"),
+        *("density control 5–150", "blur densification 30–70", "POP loss 0–150", "opacity reset at 40"),
+        *("Densification steps (2)", "pop.theta_blur"),
+    ):
+        assert words in text_of(html), words
 
 
 def test_every_curve_is_drawn_with_its_data_under_the_pointer(html: str) -> None:
@@ -109,48 +116,31 @@ def test_every_curve_is_drawn_with_its_data_under_the_pointer(html: str) -> None
     assert charts[1]["series"][1] == {"n": "held-out views", "c": "var(--c2)", "x": [300], "y": [24.5]}
 
 
-def test_schedule_windows_are_those_that_ran(html: str) -> None:
-    text = unescape(re.sub(r"<[^>]+>", " ", html))
-    assert "density control 5–150" in text
-    assert "blur densification 30–70" in text
-    assert "POP loss 0–150" in text
-    assert "opacity reset at 40" in text
-
-
-def test_plain_density_control_shows_no_blur_and_no_pop_window(tmp_path: Path) -> None:
-    names = [window.name for window in read_result(write_result(tmp_path / "r", method="gsplat")).windows]
-    assert names == ["density control"]
-
-
-def test_histograms_stand_for_start_middle_and_end(tmp_path: Path) -> None:
+def test_histograms_stand_for_start_middle_and_end_and_plain_density_control_has_one_window(tmp_path: Path) -> None:
     histograms = read_result(write_result(tmp_path / "r")).histograms
     assert [h.title for h in histograms] == ["start", "iteration 70", "end"]
     assert histograms[0].share_between(0.1, 0.2) == 1.0
     assert sum(histograms[2].shares) == pytest.approx(1.0)
+    names = [window.name for window in read_result(write_result(tmp_path / "g", method="gsplat")).windows]
+    assert names == ["density control"]
 
 
 def test_every_held_out_view_is_shown_as_render_photo_and_error(html: str) -> None:
     alts = [attrs["alt"] for tag, attrs in Tags(html).seen if tag == "img"]
-    for name in VIEWS:
-        assert [f"{what} of {name}" in alts for what in ("render", "photo", "error")] == [True] * 3
+    assert {f"{what} of {name}" for name in VIEWS for what in ("render", "photo", "error")} <= set(alts)
     assert f"dominant Gaussians of {VIEWS[0]}" in alts
+    # 24 dB before 25, and no pictures of depth where there are none
+    assert alts.index(f"photo of {VIEWS[0]}") < alts.index(f"photo of {VIEWS[1]}")
+    assert "depth of" not in html
 
 
-def test_densification_steps_and_settings_are_in_the_record(html: str) -> None:
-    text = unescape(re.sub(r"<[^>]+>", " ", html))
-    assert "Densification steps (2)" in text
-    assert "pop.theta_blur" in text
-
-
-def test_the_report_reads_only_the_result_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_report_reads_only_the_result_folder_and_that_of_a_run_that_was_killed_early(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     first = write_report(write_result(tmp_path / "r")).read_bytes()
-    (tmp_path / "r").rename(tmp_path / "moved")
+    folder = (tmp_path / "r").rename(tmp_path / "moved")
     monkeypatch.chdir(tmp_path)
     assert write_report("moved").read_bytes() == first
-
-
-def test_a_run_that_was_killed_early_still_gets_a_report(tmp_path: Path) -> None:
-    folder = write_result(tmp_path / "r")
     for path in [*(folder / "stats").iterdir(), *(folder / "report_data").iterdir()]:
         path.unlink()
     with open(folder / "metrics.jsonl", "a") as file:
@@ -171,11 +161,7 @@ def test_ticks_are_even_and_inside_the_axis(low: float, span: float, n: int) -> 
         np.testing.assert_allclose(np.diff(ticks), ticks[1] - ticks[0], rtol=1e-6, atol=slack)
 
 
-@given(
-    st.lists(st.one_of(st.floats(-1e9, 1e9), st.just(float("nan"))), max_size=12),
-    st.booleans(),
-    st.booleans(),
-)
+@given(st.lists(st.one_of(st.floats(-1e9, 1e9), st.just(float("nan"))), max_size=12), st.booleans(), st.booleans())
 def test_any_values_draw_without_leaving_the_plot(values: list[float], log: bool, zero: bool) -> None:
     series = Series("<s>", list(range(len(values))), values, "red", dots=True)
     chart = Chart("a & b", [series], 12, [Window("w", 0, 99, "blue")], [4], log, zero)
@@ -186,25 +172,19 @@ def test_any_values_draw_without_leaving_the_plot(values: list[float], log: bool
     assert all(0.0 <= y <= 220.0 for y in heights)
 
 
-@pytest.mark.parametrize("value", [5e-324, 1e300])
-@pytest.mark.parametrize("log", [False, True])
-def test_very_small_and_very_large_numbers_have_an_axis(value: float, log: bool) -> None:
-    assert 'cy="' in draw(Chart("one", [Series("s", [0], [value], "red", dots=True)], 1, [], [], log, False))
-
-
-def test_a_bar_taller_than_its_axis_is_cut_and_says_so() -> None:
+def test_very_small_and_very_large_numbers_have_an_axis_and_a_bar_taller_than_its_axis_is_cut() -> None:
+    for value in (5e-324, 1e300):
+        for log in (False, True):
+            assert 'cy="' in draw(Chart("one", [Series("s", [0], [value], "red", dots=True)], 1, [], [], log, False))
     svg = draw_histogram("h", [0.0, 1.0, 0.0], 0.2, "red", ["note"])
     assert "100 %" in svg
     assert max(float(h) for h in re.findall(r'height="([0-9.]+)"', svg)) <= 180.0
 
 
-def test_numbers_on_axes_are_short() -> None:
-    assert [short_number(v) for v in (0.0, 0.5, 1200.0, 2.5e6, 2.5e-4, -3e-5)] == [
-        *("0", "0.5", "1.2k", "2.5M", "2.5e-4", "-3e-5"),
-    ]
-
-
-def test_running_mean_forgets_and_skips_what_is_not_finite() -> None:
+def test_numbers_on_axes_are_short_and_a_mean_runs() -> None:
+    short = {0.0: "0", 0.5: "0.5", 1200.0: "1.2k", 2.5e6: "2.5M", 2.5e-4: "2.5e-4", -3e-5: "-3e-5"}
+    assert {value: short_number(value) for value in short} == short
+    # a running mean forgets and skips what is not finite
     assert running_mean([1.0, 3.0, float("inf"), 5.0], 2) == [1.0, 2.0, 3.0, 5.0]
 
 
@@ -226,12 +206,10 @@ def test_an_id_keeps_its_colour_and_no_one_is_black(ids: list[int]) -> None:
     np.testing.assert_array_equal(images.id_colors(array[:, ::-1])[:, ::-1], colors)
 
 
-def test_neighbouring_ids_get_different_colours() -> None:
+def test_neighbouring_ids_get_different_colours_and_error_maps_share_one_scale() -> None:
     colors = images.id_colors(np.arange(1000).reshape(1, -1))[0].astype(int)
     assert (np.abs(np.diff(colors, axis=0)).sum(axis=1) > 20).mean() > 0.95
-
-
-def test_error_maps_share_one_scale_that_rises_in_brightness() -> None:
+    # the scale of errors rises in brightness
     table = images.colormap_table().astype(float) @ [0.2126, 0.7152, 0.0722]
     assert np.all(np.diff(table) > -0.6)  # rounding to 8 bit
     photo = np.zeros((4, 4, 3), np.uint8)
@@ -241,27 +219,18 @@ def test_error_maps_share_one_scale_that_rises_in_brightness() -> None:
     assert np.all(images.error_picture(errors[1], 0.2) == images.colormap_table()[-1])
 
 
-@pytest.mark.parametrize("lossless", [True, False])
-def test_a_data_uri_holds_the_picture(lossless: bool) -> None:
+def test_a_data_uri_holds_the_picture_shrunk_to_fit_and_never_enlarged() -> None:
     picture = np.kron(np.arange(16, dtype=np.uint8).reshape(4, 4)[..., None] * [3, 9, 15], np.ones((8, 8, 1)))
     picture = picture.astype(np.uint8)
-    data = base64.b64decode(images.data_uri(picture, lossless).partition(",")[2])
-    back = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1].astype(int)
-    assert np.abs(back - picture).max() <= (0 if lossless else 12)
-
-
-def test_pictures_are_shrunk_to_fit_and_never_enlarged() -> None:
-    assert images.fit(np.zeros((300, 900, 3), np.uint8), max_side=600).shape == (200, 600, 3)
-    assert images.fit(np.zeros((30, 90, 3), np.uint8), max_side=600).shape == (30, 90, 3)
+    for lossless, off in ((True, 0), (False, 12)):
+        data = base64.b64decode(images.data_uri(picture, lossless).partition(",")[2])
+        back = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[:, :, ::-1].astype(int)
+        assert np.abs(back - picture).max() <= off
+    for shape, fitted in (((300, 900, 3), (200, 600, 3)), ((30, 90, 3), (30, 90, 3))):
+        assert images.fit(np.zeros(shape, np.uint8), max_side=600).shape == fitted
 
 
 # What the report says of a finished splat: floaters, exposure, depth, the orbit, the command.
-
-
-@pytest.fixture
-def short_orbit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Film four frames."""
-    monkeypatch.setattr(checks, "_ORBIT_FRAMES", 4)
 
 
 def camera() -> View:
@@ -269,16 +238,16 @@ def camera() -> View:
     return View("v", np.zeros((20, 20, 3), np.uint8), np.eye(4), np.array([[10.0, 0, 10], [0, 10, 10], [0, 0, 1]]))
 
 
-def test_nothing_was_photographed_nearer_than_half_the_way_to_the_nearest_points() -> None:
+def test_only_gaussians_nearer_than_half_the_way_to_the_nearest_points_are_near() -> None:
     points = np.array([[0.0, 0.0, z] for z in np.linspace(4.0, 8.0, 201)])
     outside = np.array([[9.0, 0.0, 1.0], [0.0, 0.0, -1.0]] * 50)
     assert near_limit(camera(), np.concatenate([points, outside])) == pytest.approx(2.04)
     assert near_limit(camera(), outside) is None
-
-
-def test_only_gaussians_between_the_camera_and_the_limit_are_near() -> None:
     params = {"means": torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [5.0, 0.0, 1.9], [0.0, 0.0, 2.1]])}
     assert nearer_than(params, camera(), 2.0)["means"][:, 2].tolist() == [1.0, pytest.approx(1.9)]
+    # neighbours in a ring of twelve are thirty degrees apart
+    assert neighbour_degrees(ring(12, height=0.0)) == pytest.approx(30.0)
+    assert neighbour_degrees(ring(1)) is None
 
 
 def test_a_photograph_of_twice_the_light_is_one_stop_brighter() -> None:
@@ -307,58 +276,67 @@ def test_what_moved_is_told_where_the_rest_fits(share: float, rest: float, moved
     assert misfit_share(replace(view, mask=np.zeros_like(mask)), photo / 255.0 + error) == 0.0
 
 
-def test_neighbours_in_a_ring_of_twelve_are_thirty_degrees_apart() -> None:
-    assert neighbour_degrees(ring(12, height=0.0)) == pytest.approx(30.0)
-    assert neighbour_degrees(ring(1)) is None
-
-
 def test_a_training_leaves_what_its_report_shows(shared_result: Path, shared_capture: Path) -> None:
     found = read_checks(shared_result / "report_data" / "checks_step29.json")
     stats = json.loads((shared_result / "stats" / "val_step0029.json").read_text())
     assert found.photographs == 7
     assert found.held_out_psnr == pytest.approx(stats["psnr"], abs=1e-3)
     assert set(found.stops) == {view.name for view in load_capture(shared_capture).views}
-    assert frames_in(shared_result / "videos" / "orbit_step29.webm") == 60
+    orbit = shared_result / "videos" / "orbit_step29.webm"
+    assert frames_in(orbit) == 60
+    assert cv2.VideoCapture(str(orbit)).read()[1].std() > 5.0
     page = (shared_result / "report.html").read_text()
-    text = unescape(re.sub(r"<[^>]+>", " ", page))
-    assert f"held-out views {found.held_out_psnr:.2f} dB" in text
-    assert f"pop train {shared_capture} --out {shared_result} {' '.join(TRAIN_AND_CHECK)}" in text
+    assert f"held-out views {found.held_out_psnr:.2f} dB" in text_of(page)
+    assert f"pop train {shared_capture} --out {shared_result} {' '.join(TRAIN_AND_CHECK)}" in text_of(page)
     assert '<a href="ply/point_cloud_29.ply">' in page
     assert 'src="data:video/webm;base64,' in page
 
 
-@pytest.mark.usefixtures("short_orbit")
-def test_a_gaussian_in_front_of_a_camera_is_a_floater(result: Path, shared_capture: Path) -> None:
-    splat, capture = load_splat(result), load_capture(shared_capture)
-    view = capture.test_views()[0]
-    before = read_checks(result / "report_data" / "checks_step29.json").floaters[view.name]
-    near = 0.3 * near_limit(view, capture.points)
-    place = torch.from_numpy(view.camera_center + near * view.viewmat[2, :3]).float()
-    row = {"means": place, "scales": torch.full((3,), float(np.log(0.1 * near))), "opacities": torch.tensor(3.0)}
-    params = {name: torch.cat([t, (row[name] if name in row else t[0])[None]]) for name, t in splat.params.items()}
-    found = write_checks(result, capture, params, splat.config, splat.sh_degree, renderer("auto")[0], 29)
+class Looked:
+    """The tiny result with its capture, looked at again."""
+
+    def __init__(self, folder: Path, capture: Path) -> None:
+        self.folder, self.splat, self.capture = folder, load_splat(folder), load_capture(capture)
+
+    def checks(self, params: dict | None = None, step: int = 29, **settings: Any) -> Checks:
+        config = self.splat.config.with_overrides(**settings) if settings else self.splat.config
+        given = (self.splat.params if params is None else params, config, self.splat.sh_degree)
+        return write_checks(self.folder, self.capture, *given, renderer("auto")[0], step)
+
+    def with_one(self, view: View, distance: float, size: float) -> dict[str, torch.Tensor]:
+        """Plant a Gaussian in front of a camera."""
+        place = torch.from_numpy(view.camera_center + distance * view.viewmat[2, :3]).float()
+        row = {"means": place, "scales": torch.full((3,), float(np.log(size))), "opacities": torch.tensor(3.0)}
+        return {n: torch.cat([t, (row[n] if n in row else t[0])[None]]) for n, t in self.splat.params.items()}
+
+
+@pytest.fixture
+def looked(result: Path, shared_capture: Path, monkeypatch: pytest.MonkeyPatch) -> Looked:
+    # film four frames
+    monkeypatch.setattr(checks, "_ORBIT_FRAMES", 4)
+    return Looked(result, shared_capture)
+
+
+def test_a_gaussian_in_front_of_a_camera_is_a_floater(looked: Looked) -> None:
+    view = looked.capture.test_views()[0]
+    before = read_checks(looked.folder / "report_data" / "checks_step29.json").floaters[view.name]
+    near = 0.3 * near_limit(view, looked.capture.points)
+    found = looked.checks(looked.with_one(view, near, 0.1 * near))
     assert found.floaters[view.name] > before + 0.02
     # and only there
     assert {name for name, share in found.floaters.items() if share > 0.02} == {view.name}
-    stats = json.loads((result / "stats" / "val_step0029.json").read_text())
+    stats = json.loads((looked.folder / "stats" / "val_step0029.json").read_text())
     assert found.held_out_psnr < stats["psnr"] - 0.02
     assert found.without_floaters == pytest.approx(stats["psnr"], abs=1e-3)
 
 
-@pytest.mark.usefixtures("short_orbit")
-def test_a_veil_between_the_photographs_is_found(result: Path, shared_capture: Path) -> None:
-    splat, capture = load_splat(result), load_capture(shared_capture)
+def test_a_veil_between_the_photographs_is_found(looked: Looked) -> None:
+    capture, config = looked.capture, looked.splat.config
     turn = checks.orbit_views(capture.train_views())
     limit = near_limit(turn[1], capture.points)
     # so near to the camera of the orbit, and so small, that only it sees the veil
-    place = torch.from_numpy(turn[1].camera_center + 0.06 * limit * turn[1].viewmat[2, :3]).float()
-    row = {"means": place, "scales": torch.full((3,), float(np.log(0.012 * limit))), "opacities": torch.tensor(3.0)}
-    params = {name: torch.cat([t, (row[name] if name in row else t[0])[None]]) for name, t in splat.params.items()}
-
-    def looked(params: dict) -> Checks:
-        return write_checks(result, capture, params, splat.config, splat.sh_degree, renderer("auto")[0], 29)
-
-    before, found = looked(splat.params), looked(params)
+    params = looked.with_one(turn[1], 0.06 * limit, 0.012 * limit)
+    before, found = looked.checks(), looked.checks(params)
     worst = turn[1].name
     assert found.orbit_floaters[worst] > before.orbit_floaters[worst] + 0.02
     # the photographs' own views, which were all that was looked at, show nothing of it
@@ -367,10 +345,10 @@ def test_a_veil_between_the_photographs_is_found(result: Path, shared_capture: P
     assert told[0].kind != "good"
     assert told[0].next == ("export", "RESULT", "--to", "html", "--without-floaters")
     # what it says to type takes the veil away, and little else
-    gone = are_floaters(params["means"], capture, splat.config.test_every)
+    gone = are_floaters(params["means"], capture, config.test_every)
     assert gone[-1]
     assert gone.float().mean() < 0.05
-    after = looked({name: tensor[~gone] for name, tensor in params.items()})
+    after = looked.checks({name: tensor[~gone] for name, tensor in params.items()})
     assert max(after.orbit_floaters.values()) <= max(before.orbit_floaters.values())
     assert after.orbit_floaters[worst] < 0.01
     assert after.held_out_psnr > before.held_out_psnr - 0.1
@@ -384,45 +362,34 @@ def test_floaters_are_left_out_of_a_file_by_their_places(
     planted = {name: torch.cat([t, (place if name == "means" else t[0])[None]]) for name, t in params.items()}
     save_ply(tmp_path / "planted.ply", planted, frame=Frame("training"))
     words = ("export", tmp_path / "planted.ply", "--out", tmp_path / "a.ply", "--without-floaters")
-    outcome = pop(*words, "--capture", shared_capture)
-    assert outcome.status == 0, outcome.err
     many = len(params["means"])
-    assert f"without floaters: {many:,} of {many + 1:,} Gaussians kept" in outcome.out
+    said = pop.done(*words, "--capture", shared_capture).out
+    assert f"without floaters: {many:,} of {many + 1:,} Gaussians kept" in said
     says(pop(*words, "--overwrite"), "floaters are found from the places of the photographs; give --capture")
-
-
-def test_what_points_that_were_made_up_say_of_floaters_is_refused() -> None:
+    # what points that were made up say of them is refused
     capture = replace(tiny_capture(), source="no points: 60 random ones (seed 0)")
     with pytest.raises(PopError, match="no sparse points of its own"):
         are_floaters(torch.zeros(1, 3), capture, 8)
 
 
-@pytest.mark.usefixtures("short_orbit")
-def test_the_worst_views_come_first_and_have_pictures_whatever_was_kept(result: Path, shared_capture: Path) -> None:
-    splat, capture = load_splat(result), load_capture(shared_capture)
-    config = splat.config.with_overrides(test_every=2, max_renders=1)
-    write_checks(result, capture, splat.params, config, splat.sh_degree, renderer("auto")[0], 29)
-    views = read_result(result).views
+def test_the_worst_views_come_first_and_have_pictures_whatever_was_kept(looked: Looked) -> None:
+    looked.checks(test_every=2, max_renders=1)
+    views = read_result(looked.folder).views
     assert [view.psnr for view in views] == sorted(view.psnr for view in views)
     assert len(views) == 2
     assert all(view.depth is not None and np.nanmin(view.depth) > 0.0 for view in views)
 
 
-@pytest.mark.usefixtures("short_orbit")
-def test_training_views_are_measured_with_what_the_run_learned_of_their_photographs(
-    result: Path, shared_capture: Path
-) -> None:
-    splat, capture = load_splat(result), load_capture(shared_capture)
-
+def test_training_views_are_measured_with_what_the_run_learned_of_their_photographs(looked: Looked) -> None:
     def measured(learned: dict | None) -> Checks:
-        text = json.dumps({view.name: learned for view in capture.train_views()})
-        (result / "stats" / "appearance_step0029.json").write_text(text if learned is not None else "{}")
-        return write_checks(result, capture, splat.params, splat.config, splat.sh_degree, renderer("auto")[0], 29)
+        text = json.dumps({view.name: learned for view in looked.capture.train_views()})
+        (looked.folder / "stats" / "appearance_step0029.json").write_text(text if learned is not None else "{}")
+        return looked.checks()
 
     plain, same = measured(None), measured({"exposure": np.eye(3, 4).tolist()})
     assert (plain.exposures_learned, same.exposures_learned) == (False, True)
     assert same.train_psnr == pytest.approx(plain.train_psnr, abs=1e-4)
-    assert read_checks(result / "report_data" / "checks_step29.json") == same
+    assert read_checks(looked.folder / "report_data" / "checks_step29.json") == same
     dark = measured({"exposure": (0.25 * np.eye(3, 4)).tolist()})
     assert dark.train_psnr < plain.train_psnr - 1.0
     # what a photograph differs by is told without, and held-out views have none
@@ -433,38 +400,30 @@ def test_training_views_are_measured_with_what_the_run_learned_of_their_photogra
     assert measured({"viewmat": away.tolist()}).train_psnr < plain.train_psnr - 1.0
 
 
-@pytest.mark.usefixtures("short_orbit")
-def test_a_run_that_was_stopped_is_shown_as_it_was_then(result: Path, shared_capture: Path) -> None:
-    for path in (result / "report_data").glob("val_*"):
+def test_a_run_that_was_stopped_is_shown_as_it_was_then(looked: Looked) -> None:
+    for path in (looked.folder / "report_data").glob("val_*"):
         path.unlink()
-    splat, capture = load_splat(result), load_capture(shared_capture)
-    found = write_checks(result, capture, splat.params, splat.config, splat.sh_degree, renderer("auto")[0], 19)
-    data = read_result(result)
-    assert [view.name for view in data.views] == [view.name for view in capture.test_views()]
+    found, data = looked.checks(step=19), read_result(looked.folder)
+    assert [view.name for view in data.views] == [view.name for view in looked.capture.test_views()]
     assert f"{found.held_out_psnr:.2f} dB on average" in data.verdict[0].text
 
 
 def test_a_resumed_run_has_all_its_commands(pop: Pop, result: Path, shared_capture: Path) -> None:
     words = ("train", shared_capture, "--out", result, *TRAIN, "--resume", "--skip-sizes", "--skip-checks")
-    assert pop(*words).status == 0
-    commands = json.loads((result / "commands.json").read_text())
-    assert [entry["words"][:2] for entry in commands] == [["pop", "train"]] * 2
-    assert commands[0]["words"][-2:] == list(TRAIN_AND_CHECK[-2:])
-    assert commands[1]["words"] == ["pop", *map(str, words)]
+    pop.done(*words)
+    first, second = json.loads((result / "commands.json").read_text())
+    assert first["words"][:2] == ["pop", "train"]
+    assert first["words"][-2:] == list(TRAIN_AND_CHECK[-2:])
+    assert second["words"] == ["pop", *map(str, words)]
 
 
-@pytest.mark.usefixtures("short_orbit")
-def test_a_run_without_checks_says_how_to_get_them(pop: Pop, result: Path) -> None:
-    (result / "report_data" / "checks_step29.json").unlink()
-    (result / "videos" / "orbit_step29.webm").unlink()
-    assert pop("report", result).status == 0
-    page = (result / "report.html").read_text()
-    assert "pop report RESULT --check" in page
-    assert "<video" not in page
-    assert pop("report", result, "--check").status == 0
-    page = (result / "report.html").read_text()
-    assert "pop report RESULT --check" not in page
-    assert "<video" in page
+def test_a_run_without_checks_says_how_to_get_them(pop: Pop, looked: Looked) -> None:
+    (looked.folder / "report_data" / "checks_step29.json").unlink()
+    (looked.folder / "videos" / "orbit_step29.webm").unlink()
+    for words, shown in ((), False), (("--check",), True):
+        pop.done("report", looked.folder, *words)
+        page = (looked.folder / "report.html").read_text()
+        assert ("pop report RESULT --check" in page, "<video" in page) == (not shown, shown)
 
 
 @pytest.mark.parametrize(
@@ -516,12 +475,51 @@ def test_the_slider_uncovers_the_photograph_and_the_orbit_plays(shared_result: P
         assert all(url.startswith(("file:", "blob:", "about:", "data:")) for url in tab.requests)
 
 
-def test_the_report_of_a_folder_without_pictures_of_depth_is_whole(tmp_path: Path) -> None:
-    page = write_report(write_result(tmp_path / "r")).read_text()
-    assert page.index(f"photo of {VIEWS[0]}") < page.index(f"photo of {VIEWS[1]}")  # 24 dB before 25
-    assert "depth of" not in page
+# A small result folder as `pop train` leaves it, made without training.
+
+VIEWS = ("a.png", "b.png")
 
 
-def test_a_frame_of_the_orbit_shows_the_scene(shared_result: Path) -> None:
-    video = cv2.VideoCapture(str(shared_result / "videos" / "orbit_step29.webm"))
-    assert video.read()[1].std() > 5.0
+def write_result(folder: Path, method: str = "pop", steps: int = 300, **stats: Any) -> Path:
+    """Write cfg.json, metrics.jsonl, stats and report_data of a made-up run of `steps` steps; returns the folder."""
+    config = TrainConfig.of(data="captures/toy", method=method, steps_scaler=steps / 30_000)
+    for name in ("stats", "report_data"):
+        (folder / name).mkdir(parents=True)
+    (folder / "cfg.json").write_text(config.to_json())
+    rng = np.random.default_rng(0)
+    with open(folder / "metrics.jsonl", "w") as file:
+        for step in range(0, steps, 10):
+            file.write(json.dumps(_record(step, steps, rng)) + "\n")
+    measured = {"psnr": 24.5, "ssim": 0.81, "lpips": None, "lpips_reason": "no weights were given", **stats}
+    last = steps - 1
+    base = {"step": last, "num_GS": 1200, "num_GS_above_floor": 1100, "seconds": 30.0, "machine": "a machine"}
+    opacity = {"opacity_below_0.1": 0.25, "opacity_above_0.9": 0.5}
+    (folder / "stats" / f"train_step{last:04d}.json").write_text(json.dumps({**base, **opacity}))
+    (folder / "stats" / f"val_step{last:04d}.json").write_text(json.dumps({**base, **opacity, **measured}))
+    edges = np.linspace(0.0, 1.0, 101)
+    for step, sample in ((-1, np.full(50, 0.1)), (69, rng.beta(1, 1, 500)), (last, rng.beta(0.3, 0.3, 500))):
+        counts = np.histogram(sample, edges)[0]
+        np.savez(folder / "report_data" / f"opacity_step{step}.npz", step=step, counts=counts, edges=edges)
+    for i, name in enumerate(VIEWS):
+        photo = rng.integers(0, 255, (24, 32, 3), dtype=np.uint8)
+        render = np.clip(photo.astype(int) + rng.integers(-9, 9, photo.shape), 0, 255).astype(np.uint8)
+        ids = rng.integers(-1, 40, (24, 32)).astype(np.int32)
+        arrays = {"name": name, "render": render, "photo": photo, "dominant_ids": ids, "psnr": 24.0 + i, "ssim": 0.8}
+        np.savez(folder / "report_data" / f"val_step{last}_{i}.npz", **arrays)
+    return folder
+
+
+def _record(step: int, steps: int, rng: np.random.Generator) -> dict[str, Any]:
+    record: dict[str, Any] = {
+        "step": step,
+        "loss": 0.1 / (1 + step / 50) + 0.001 * float(rng.random()),
+        "psnr": 15.0 + 10.0 * step / steps,
+        "num_gaussians": 1000 + step,
+        "n_blended": 20.0 - step / steps,
+        "n_traversed": 40.0 - step / steps,
+    }
+    if step in (20, 40):
+        record |= {"cloned": 5, "split": 3, "pruned": 2}
+    if step == 40:
+        record["reset"] = True
+    return record

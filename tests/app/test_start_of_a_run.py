@@ -29,11 +29,10 @@ from pop_fast.train import TrainingRun
 from pop_fast.train.results import ResultFolder
 from tests.app.browser import browser
 from tests.app.captures import photograph, write_photograph
-from tests.app.conftest import TRAIN, Pop
+from tests.app.conftest import TRAIN, Outcome, Pop, done
 from tests.app.damage import contents, says
-from tests.app.interruptions import Killed, interrupt, killed_after
-from tests.app.test_resume import assert_same_run, run_to
-from tests.app.tiny import tiny_capture, tiny_config
+from tests.app.test_resume import run_to
+from tests.app.tiny import Killed, assert_same_run, interrupt, killed_after, tiny_capture, tiny_config
 
 # in a folder of results: small files and folders, under names that a run writes and one that it does not
 OLD = {
@@ -63,25 +62,33 @@ def as_bytes(files: dict[str, str]) -> dict[str, bytes]:
     return {name: text.encode() for name, text in files.items()}
 
 
-FAILING: list[tuple[list[str], tuple[str, ...]]] = [
-    (["--factor", "4"], ("view_001.png is 10 x 8 px", "--ssim-padding same", "--test-every 0")),
-    (["--factor", "4", "--ssim-padding", "same"], ("view_000.png is 10 x 8 px", "--test-every 0")),
-    (["--factor", "4", "--test-every", "0"], ("view_000.png is 10 x 8 px", "or --ssim-padding same")),
-    (["--init-scale", "1e300"], ("scales[0, 0] of the first Gaussians is inf", "--init-scale")),
-    (["--lr.scales", "1e6"], ("is inf after 1 steps; nothing was written", "learning rate of scales")),
-    (["--lr.opacities", "inf"], ("lr.opacities is inf",)),
-    (["--pop.lambda-pop", "nan"], ("pop.lambda_pop is nan",)),
-]
+@pytest.fixture
+def train(pop: Pop, shared_capture: Path, result: Path) -> Callable[..., Outcome]:
+    """`pop train` on the tiny capture, into the finished result where no folder is named."""
+    return lambda *words, out=result: pop("train", shared_capture, "--out", out, *TRAIN, *words)
 
 
-@pytest.mark.parametrize(("words", "parts"), FAILING, ids=[" ".join(words) for words, _ in FAILING])
+FAILING: dict[str, tuple[str, ...]] = {
+    "--factor 4": ("view_001.png is 10 x 8 px", "--ssim-padding same", "--test-every 0"),
+    "--factor 4 --ssim-padding same": ("view_000.png is 10 x 8 px", "--test-every 0"),
+    "--factor 4 --test-every 0": ("view_000.png is 10 x 8 px", "or --ssim-padding same"),
+    "--init-scale 1e300": ("scales[0, 0] of the first Gaussians is inf", "--init-scale"),
+    "--lr.scales 1e6": ("is inf after 1 steps; nothing was written", "learning rate of scales"),
+    "--lr.opacities inf": ("lr.opacities is inf",),
+    "--pop.lambda-pop nan": ("pop.lambda_pop is nan",),
+    "--target-mb -1": ("--target-mb -1 must be over 0",),
+    "--final-prune 2": ("--final-prune 2 must be in [0, 1)",),
+}
+
+
+@pytest.mark.parametrize("words", FAILING)
 def test_a_run_that_cannot_start_leaves_earlier_results_and_no_stub(
-    pop: Pop, shared_capture: Path, result: Path, tmp_path: Path, words: list[str], parts: tuple[str, ...]
+    train: Callable[..., Outcome], result: Path, tmp_path: Path, words: str
 ) -> None:
     before = contents(result)
-    says(pop("train", shared_capture, "--out", result, *TRAIN, *words, "--overwrite"), *parts)
+    says(train(*words.split(), "--overwrite"), *FAILING[words])
     assert contents(result) == before
-    says(pop("train", shared_capture, "--out", tmp_path / "new", *TRAIN, *words), *parts)
+    says(train(*words.split(), out=tmp_path / "new"), *FAILING[words])
     assert not (tmp_path / "new").exists()
 
 
@@ -125,9 +132,13 @@ def test_the_new_run_has_only_what_it_wrote_and_what_is_not_a_result(tmp_path: P
     begin(folder)
     files = visible(folder)
     assert set(files) == {"cfg.json", "capture.json", "metrics.jsonl", "report_data/opacity_step-1.npz", "notes.txt"}
-    assert files["metrics.jsonl"] == b'{"step": 0}\n'
-    assert as_bytes({"capture.json": "new", "notes.txt": "mine"}).items() <= files.items()
+    written = {"metrics.jsonl": '{"step": 0}\n', "capture.json": "new", "notes.txt": "mine"}
+    assert as_bytes(written).items() <= files.items()
     assert sorted(path.name for path in folder.iterdir() if path.is_dir()) == ["report_data"]
+    # and the bits of a run in a new folder
+    run_to(tmp_path / "new")
+    TrainingRun(tiny_config(old_results(tmp_path / "old")), tiny_capture(), overwrite=True).run()
+    assert_same_run(tmp_path / "old", tmp_path / "new")
 
 
 @pytest.mark.parametrize("exists", [True, False])
@@ -195,60 +206,49 @@ def test_a_replacement_that_is_killed_anywhere_is_undone_or_was_complete(tmp_pat
     assert set(kept) == {True, False}
 
 
-def test_results_that_a_kill_left_aside_come_back_with_a_note(pop: Pop, shared_capture: Path, result: Path) -> None:
-    before = contents(result)
+def test_results_that_a_kill_left_aside_come_back_with_a_note(train: Callable[..., Outcome], result: Path) -> None:
+    def kept() -> dict[Path, bytes]:
+        return {path: data for path, data in contents(result).items() if path.suffix in (".pt", ".ply")}
+
+    before = kept()
     with killed_after(4), pytest.raises(Killed):
         begin(result)
     assert not (result / "cfg.json").exists()
-    again = pop.done("train", shared_capture, "--out", result, *TRAIN, "--resume")
-    assert "an --overwrite was cut short; the results that it had set aside are back" in again.out
-    assert "continuing from step 30" in again.out
-    assert {path: data for path, data in contents(result).items() if path.suffix in (".pt", ".ply")} == {
-        path: data for path, data in before.items() if path.suffix in (".pt", ".ply")
-    }
-
-
-def test_a_run_that_replaced_another_has_the_bits_of_one_in_a_new_folder(tmp_path: Path) -> None:
-    run_to(tmp_path / "new")
-    TrainingRun(tiny_config(old_results(tmp_path / "r")), tiny_capture(), overwrite=True).run()
-    assert_same_run(tmp_path / "r", tmp_path / "new")
-
-
-@pytest.fixture
-def odd_capture(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A capture whose photographs are found by --images alone; commands are given from the folder that holds it."""
-    (capture / "images").rename(capture / "shots")
-    monkeypatch.chdir(tmp_path)
-    return capture
+    said = done(train("--resume"))
+    assert "an --overwrite was cut short; the results that it had set aside are back" in said
+    assert "continuing from step 30" in said
+    assert kept() == before
 
 
 def test_a_run_that_is_cut_off_can_be_looked_at_and_gone_on_with_in_few_words(
-    pop: Pop, odd_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    pop: Pop, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    # photographs that are found by --images alone, and a command that is given from the folder that holds the capture
+    (capture / "images").rename(capture / "shots")
+    monkeypatch.chdir(tmp_path)
     interrupt(monkeypatch, at=10)
-    words: tuple[Any, ...] = ("train", odd_capture.name, "--out", "r", *TRAIN)
+    words: tuple[Any, ...] = ("train", capture.name, "--out", "r", *TRAIN)
     assert pop(*words, "--images", "shots").status == 130
     # as after a kill: nothing was done when the run ended
     assert json.loads((tmp_path / "r" / "capture.json").read_text())["images"] == "shots"
-    monkeypatch.chdir(odd_capture)
+    monkeypatch.chdir(capture)
     pop.done("eval", "../r")
     pop.done("export", "../r", "--out", "../x.ply")
     monkeypatch.chdir(tmp_path)
     interrupt(monkeypatch, at=-1)
-    again = pop.done(*words, "--resume")
-    assert "continuing from step 7\n" in again.out
+    assert "continuing from step 7\n" in pop.done(*words, "--resume").out
 
 
-def test_resuming_where_no_run_is_says_that_it_starts(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
-    outcome = pop.done("train", shared_capture, "--out", tmp_path / "r", *TRAIN, "--resume")
-    assert f"nothing to resume in {tmp_path / 'r'}: starting anew\n" in outcome.out
-    assert "continuing" not in outcome.out
+def test_resuming_where_no_run_is_says_that_it_starts(train: Callable[..., Outcome], tmp_path: Path) -> None:
+    said = done(train("--resume", out=tmp_path / "r"))
+    assert f"nothing to resume in {tmp_path / 'r'}: starting anew\n" in said
+    assert "continuing" not in said
 
 
-def test_a_damaged_capture_json_is_named_on_resume(pop: Pop, shared_capture: Path, result: Path) -> None:
+def test_a_damaged_capture_json_is_named_on_resume(train: Callable[..., Outcome], result: Path) -> None:
     for text in ("", "[1]", '{"colour": 1}'):
         (result / "capture.json").write_text(text)
-        says(pop("train", shared_capture, "--out", result, *TRAIN, "--resume"), "capture.json", "remove it", "--images")
+        says(train("--resume"), "capture.json", "remove it", "--images")
 
 
 def test_what_a_run_left_that_was_killed_while_it_wrote_its_first_file_is_nobody_s(tmp_path):
@@ -369,44 +369,40 @@ def test_what_can_be_done_goes_on_to_the_long_work(pop: Pop, place: Path) -> Non
 LAST = "stats/val_step0029.json"
 
 
-def again(pop: Pop, result: Path, capture: Path, *words: object) -> str:
-    """Finish a finished run again."""
-    outcome = pop.done("train", capture, "--out", result, *TRAIN, "--resume", *words)
-    return outcome.out
-
-
 def test_a_run_ends_with_its_size_in_every_format(shared_result: Path) -> None:
-    entries = json.loads((shared_result / LAST).read_text())["encodings"]
-    assert [entry["format"] for entry in entries] == list(format_names())
-    by_name = {entry["format"]: entry for entry in entries}
+    stats = json.loads((shared_result / LAST).read_text())
+    assert [entry["format"] for entry in stats["encodings"]] == list(format_names())
+    by_name = {entry["format"]: entry for entry in stats["encodings"]}
     n = len(load_ply(shared_result / "ply" / "point_cloud_29.ply")["means"])
-    assert {entry["num_gaussians"] for entry in entries} == {n}
+    assert {entry["num_gaussians"] for entry in stats["encodings"]} == {n}
     assert 248 * n < by_name["ply"]["bytes"] < 248 * n + 3000
     assert by_name["splat"]["bytes"] == 32 * n
     assert by_name["spz"]["bytes"] < by_name["ply"]["bytes"] / 5
+    assert by_name["ply"]["views"] == 1
+    assert by_name["ply"]["psnr"] == pytest.approx(stats["psnr"], abs=1e-3)
     # what comes back from glTF is what went in; of the others little is lost
     assert by_name["gltf"]["psnr"] == pytest.approx(by_name["ply"]["psnr"], abs=1e-3)
     for name in ("spz", "sog", "compressed-ply"):
         assert by_name[name]["psnr"] == pytest.approx(by_name["ply"]["psnr"], abs=0.2)
-    psnr = json.loads((shared_result / LAST).read_text())["psnr"]
-    assert by_name["ply"]["views"] == 1
-    assert by_name["ply"]["psnr"] == pytest.approx(psnr, abs=1e-3)
 
 
-def test_the_table_is_printed_and_the_report_shows_it(pop: Pop, result: Path, shared_capture: Path) -> None:
-    said = again(pop, result, shared_capture)
-    lines = said.splitlines()
+def test_the_table_is_printed_and_the_report_shows_it(train: Callable[..., Outcome], result: Path) -> None:
+    lines = done(train("--resume")).splitlines()
     head = next(i for i, line in enumerate(lines) if line.startswith("format "))
     assert [line.split()[0] for line in lines[head + 1 : head + 1 + len(format_names())]] == list(format_names())
     page = (result / "report.html").read_text()
     assert "<h2>Files</h2>" in page
     assert all(f"<td>{name}</td>" in page for name in format_names())
     assert '<iframe class="viewer"' in page
+    # it has its first column to the left
+    assert table_lines([("a", "bb"), ("ccc", "d")]) == ["a    bb", "ccc   d"]
 
 
-def test_exports_are_written_with_the_limits_that_are_asked_for(pop: Pop, result: Path, shared_capture: Path) -> None:
+def test_exports_are_written_with_the_limits_that_are_asked_for_and_go_with_their_run(
+    train: Callable[..., Outcome], result: Path
+) -> None:
     words = ("--export", "spz", "gltf-spz", "html", "--max-gaussians", "100", "--skip-sizes")
-    said = again(pop, result, shared_capture, *words)
+    said = done(train("--resume", *words))
     assert "highest sensitivity: 100 of" in said
     assert "format " not in said
     names = sorted(path.name for path in (result / "export").iterdir())
@@ -414,53 +410,29 @@ def test_exports_are_written_with_the_limits_that_are_asked_for(pop: Pop, result
     assert len(load_splat_file(result / "export" / "result.spz")[0]["means"]) == 100
     # what was trained stays whole
     assert len(load_ply(result / "ply" / "point_cloud_29.ply")["means"]) > 100
+    # a new run replaces the page and the exports of the old one
+    done(train("--overwrite"))
+    assert not (result / "export").exists()
+    assert (result / "viewer.html").is_file()
 
 
 def test_limits_without_a_format_make_a_ply_in_the_frame_of_the_capture(
-    pop: Pop, result: Path, shared_capture: Path, tmp_path: Path
+    pop: Pop, train: Callable[..., Outcome], result: Path, tmp_path: Path
 ) -> None:
-    again(pop, result, shared_capture, "--final-prune", "0", "--min-opacity", "0", "--skip-sizes")
-    assert pop("export", result, "--out", tmp_path / "whole.ply").status == 0
-    kept = load_ply(result / "export" / "result.ply")["means"]
-    whole = load_ply(tmp_path / "whole.ply")["means"]
-    rows = {tuple(row) for row in whole.tolist()}
-    assert all(tuple(row) in rows for row in kept.tolist())
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--target-mb", "-1"), "--target-mb -1 must be over 0"),
-        (("--final-prune", "2"), "--final-prune 2 must be in [0, 1)"),
-    ],
-)
-def test_a_limit_that_cannot_be_is_said_before_training(
-    pop: Pop, shared_capture: Path, tmp_path: Path, words: tuple[str, ...], said: str
-) -> None:
-    says(pop("train", shared_capture, "--out", tmp_path / "new", *TRAIN, *words), said)
-    assert not (tmp_path / "new").exists()
+    done(train("--resume", "--final-prune", "0", "--min-opacity", "0", "--skip-sizes"))
+    pop.done("export", result, "--out", tmp_path / "whole.ply")
+    kept, whole = (load_ply(path)["means"] for path in (result / "export" / "result.ply", tmp_path / "whole.ply"))
+    assert {tuple(row) for row in kept.tolist()} <= {tuple(row) for row in whole.tolist()}
 
 
 def test_an_export_that_cannot_be_written_leaves_the_results_and_says_so(
-    pop: Pop, result: Path, shared_capture: Path
+    train: Callable[..., Outcome], result: Path
 ) -> None:
-    outcome = pop(
-        "train", shared_capture, "--out", result, *TRAIN, "--resume", "--export", "spz", "--target-mb", "1e-5"
-    )
+    outcome = train("--resume", "--export", "spz", "--target-mb", "1e-5")
     assert outcome.status == 1
     assert "a file without any Gaussian has" in outcome.err
     assert f"the results in {result} are complete" in outcome.err
     assert not (result / "export").exists()
-
-
-def test_a_new_run_replaces_the_page_and_the_exports_of_the_old_one(
-    pop: Pop, result: Path, shared_capture: Path
-) -> None:
-    again(pop, result, shared_capture, "--export", "spz", "--skip-sizes")
-    assert (result / "export" / "result.spz").is_file()
-    pop.done("train", shared_capture, "--out", result, *TRAIN, "--overwrite")
-    assert not (result / "export").exists()
-    assert (result / "viewer.html").is_file()
 
 
 @pytest.mark.parametrize(
@@ -478,12 +450,19 @@ def test_a_damaged_entry_of_the_statistics_is_named(pop: Pop, result: Path, entr
     says(pop("report", result), said)
 
 
-def test_a_result_from_before_there_was_a_page_has_a_report(pop: Pop, result: Path) -> None:
+def test_a_result_without_a_page_or_with_that_of_another_version_has_a_report(pop: Pop, result: Path) -> None:
+    # the same text and more is another script
+    viewer = result / "viewer.html"
+    viewer.write_text(viewer.read_text().replace("</script></body>", "window.other = 1</script></body>"))
+    pop.done("report", result)
+    assert 'in <a href="viewer.html">viewer.html</a>' in (result / "report.html").read_text()
+    assert "<iframe" not in (result / "report.html").read_text()
+    # as of before there was one
     stats = json.loads((result / LAST).read_text())
     del stats["encodings"]
     (result / LAST).write_text(json.dumps(stats))
-    (result / "viewer.html").unlink()
-    assert pop("report", result).status == 0
+    viewer.unlink()
+    pop.done("report", result)
     page = (result / "report.html").read_text()
     assert "<h2>Files</h2>" not in page
     assert "<iframe" not in page
@@ -500,16 +479,3 @@ def test_the_report_shows_the_splat_in_a_frame(result: Path, tmp_path: Path) -> 
         assert all(url.startswith(("file:", "blob:", "about:", "data:")) for url in tab.requests)
         assert tab.errors == []
     assert picture.std() > 10.0
-
-
-def test_a_viewer_whose_script_is_not_of_this_version_is_linked(pop: Pop, result: Path) -> None:
-    viewer = result / "viewer.html"
-    viewer.write_text(viewer.read_text().replace("</script></body>", "window.other = 1</script></body>"))
-    # the same text and more is another script
-    assert pop("report", result).status == 0
-    assert 'in <a href="viewer.html">viewer.html</a>' in (result / "report.html").read_text()
-    assert "<iframe" not in (result / "report.html").read_text()
-
-
-def test_a_table_has_its_first_column_to_the_left() -> None:
-    assert table_lines([("a", "bb"), ("ccc", "d")]) == ["a    bb", "ccc   d"]

@@ -14,8 +14,6 @@ import numpy as np
 import pytest
 import torch
 
-from pop_fast.api.backend import get_backend
-from pop_fast.api.backends import FAST
 from pop_fast.data import Capture, View
 from pop_fast.data.gaussians import initialize_params
 from pop_fast.density import POPStrategy
@@ -28,15 +26,11 @@ from pop_fast.train.evaluate import average, measure, population, psnr
 from pop_fast.train.model import KEYS, adam_step, first_non_finite, make_optimizers
 from pop_fast.train.schedule import steady_updates
 from pop_fast.train.torch_stepper import PhotoLoss
-from pop_fast.train.views import ViewTensors, render_view
+from pop_fast.train.views import ViewTensors
 from pop_ref.settings import Objective
 from tests.app.captures import assert_one_line, cloud, photograph, ring
-from tests.app.conftest import TRAIN, Pop
-from tests.app.tiny import HEIGHT, WIDTH, tiny_capture, tiny_config
-
-
-def records(folder):
-    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+from tests.app.conftest import TRAIN, Pop, wait_until
+from tests.app.tiny import HEIGHT, WIDTH, records, tiny_capture, tiny_config
 
 
 @pytest.fixture(scope="module", params=["pop", "gsplat", "3dgs"])
@@ -65,18 +59,14 @@ def test_what_a_run_starts_from_stays_the_callers(tmp_path):
     assert not torch.equal(run.params["means"], before["means"])
 
 
-def test_the_number_of_gaussians_changes_when_the_schedule_says(finished):
-    trainer, _, folder = finished
+def test_the_number_of_gaussians_changes_when_the_schedule_says_and_adds_up(finished):
+    trainer, stats, folder = finished
     changed = [record for record in records(folder) if "cloned" in record]
     changes = [record["step"] for record in changed if not record.get("reset") or record["step"] % 4 == 0]
     assert changes == [4, 8, 12, 16, 20]
     resets = [record["step"] for record in changed if record.get("reset")]
     assert resets == ([] if trainer.config.method == "pop" else [12])
     assert sum(record["cloned"] + record["split"] for record in changed) > 0
-
-
-def test_numbers_of_gaussians_add_up(finished):
-    _, stats, folder = finished
     n = len(tiny_capture().points)
     for record in records(folder):
         n += record.get("cloned", 0) + record.get("split", 0) - record.get("pruned", 0)
@@ -84,26 +74,17 @@ def test_numbers_of_gaussians_add_up(finished):
     assert stats["num_GS"] == n
 
 
-def test_the_pop_term_is_logged_while_it_is_on(finished):
+def test_a_record_is_written_every_other_step_and_its_loss_is_the_sum_of_its_terms(finished):
     trainer, _, folder = finished
-    with_term = [record["step"] for record in records(folder) if "pop" in record]
-    assert with_term == (list(range(0, 24, 2)) if trainer.config.method == "pop" else [])
-
-
-def test_the_loss_is_the_sum_of_its_terms(finished):
-    trainer, _, folder = finished
-    weight = trainer.config.objective_at(0).lambda_ssim
+    pop, weight = trainer.config.method == "pop", trainer.config.objective_at(0).lambda_ssim
+    assert [record["step"] for record in records(folder)] == list(range(0, 30, 2))
+    assert [record["step"] for record in records(folder) if "pop" in record] == (list(range(0, 24, 2)) if pop else [])
+    needed = {"view", "n_blended", "n_traversed", "sh_degree", "lr_means", "it_per_s", "seconds", "num_gaussians"}
     for record in records(folder):
-        pixelwise = record["l2" if trainer.config.method == "pop" else "l1"]
+        assert needed <= set(record)
+        pixelwise = record["l2" if pop else "l1"]
         total = (1 - weight) * pixelwise + weight * record["d_ssim"] + record.get("pop", 0.0)
         assert record["loss"] == pytest.approx(total, rel=1e-5)
-
-
-def test_a_record_is_written_every_other_step_and_at_changes(finished):
-    _, _, folder = finished
-    assert [record["step"] for record in records(folder)] == list(range(0, 30, 2))
-    needed = {"view", "n_blended", "n_traversed", "sh_degree", "lr_means", "it_per_s", "seconds", "num_gaussians"}
-    assert all(needed <= set(record) for record in records(folder))
 
 
 def test_the_folder_holds_what_its_docstring_lists(finished):
@@ -140,26 +121,19 @@ def test_statistics_are_complete(finished):
     assert list(stats["per_view"]) == ["00.png"]
 
 
-def test_the_ply_holds_the_last_parameters(finished):
+def test_the_ply_the_pictures_and_the_checkpoint_are_of_the_last_parameters(finished):
     trainer, _, folder = finished
     loaded = load_ply(folder / "ply" / "point_cloud_29.ply")
-    for key in KEYS:
-        assert torch.equal(loaded[key], trainer.params[key].detach())
-
-
-def test_pictures_keep_size_and_ids(finished):
-    trainer, _, folder = finished
-    with np.load(folder / "report_data" / "val_step29_0000.npz") as arrays:
-        assert arrays["render"].shape == arrays["photo"].shape == (HEIGHT, WIDTH, 3)
-        assert -1 <= arrays["dominant_ids"].min() <= arrays["dominant_ids"].max() < len(trainer.params["means"])
-
-
-def test_gsplat_can_read_the_checkpoint(finished):
-    trainer, _, folder = finished
+    # as gsplat reads it
     content = torch.load(folder / "ckpts" / "ckpt_29_rank0.pt", weights_only=True)
     assert content["step"] == 29
     assert list(content["splats"]) == list(KEYS)
-    assert all(torch.equal(content["splats"][key], trainer.params[key]) for key in KEYS)
+    for key in KEYS:
+        assert torch.equal(loaded[key], trainer.params[key].detach())
+        assert torch.equal(content["splats"][key], trainer.params[key])
+    with np.load(folder / "report_data" / "val_step29_0000.npz") as arrays:
+        assert arrays["render"].shape == arrays["photo"].shape == (HEIGHT, WIDTH, 3)
+        assert -1 <= arrays["dominant_ids"].min() <= arrays["dominant_ids"].max() < len(trainer.params["means"])
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_does_not(finished, tmp_path):
@@ -210,18 +184,6 @@ def test_masked_pixels_have_no_say(tmp_path):
     assert runs[0][1] == runs[1][1]
 
 
-def test_dominant_counts_of_a_masked_view_are_those_inside_the_mask(tmp_path):
-    mask = np.zeros((HEIGHT, WIDTH), dtype=bool)
-    mask[5:15, 3:20] = True
-    trainer = TrainingRun(tiny_config(tmp_path), tiny_capture(mask=mask))
-    view = trainer._train[0]
-    rendered = render_view(get_backend("fast"), trainer.params, view, trainer.config, 0, dominance=True)
-    ids = rendered.info["dominant_ids"][0][view.mask]
-    want = torch.bincount(ids[ids >= 0], minlength=len(trainer.params["means"]))
-    assert torch.equal(rendered.info["dominant_counts"][0], want)
-    assert want.sum() > 0
-
-
 def test_the_target_cache_changes_no_bit(tmp_path):
     views = [ViewTensors.of(view) for view in tiny_capture().views]
     image = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))
@@ -234,15 +196,14 @@ def test_the_target_cache_changes_no_bit(tmp_path):
     assert losses[0] == losses[1]
 
 
-def test_an_existing_folder_is_not_touched_without_leave(tmp_path):
+def test_a_folder_is_not_touched_without_leave_and_overwriting_removes_results_and_nothing_else(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     for kind in ({}, {"overwrite": True}, {"resume": True}):
         with pytest.raises(PopError, match=r"choose another|another result folder"):
             TrainingRun(tiny_config(tmp_path), tiny_capture(), **kind).run()
+    with pytest.raises(PopError, match="is a file"):
+        TrainingRun(tiny_config(tmp_path / "notes.txt"), tiny_capture()).run()
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
-
-
-def test_overwriting_removes_results_and_nothing_else(tmp_path):
     folder = tmp_path / "run"
     TrainingRun(tiny_config(folder, max_steps=6), tiny_capture()).run()
     (folder / "notes.txt").write_text("mine")
@@ -251,17 +212,6 @@ def test_overwriting_removes_results_and_nothing_else(tmp_path):
     TrainingRun(tiny_config(folder, max_steps=4), tiny_capture(), overwrite=True).run()
     assert (folder / "notes.txt").read_text() == "mine"
     assert [path.name for path in (folder / "ckpts").iterdir()] == ["ckpt_3_rank0.pt"]
-
-
-def test_a_result_folder_that_is_a_file_is_refused(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(PopError, match="is a file"):
-        TrainingRun(tiny_config(tmp_path / "file"), tiny_capture()).run()
-
-
-def test_no_view_to_train_on_is_said(tmp_path):
-    with pytest.raises(PopError, match="no view to train on"):
-        TrainingRun(tiny_config(tmp_path, test_every=1), tiny_capture())
 
 
 @pytest.mark.parametrize("key", ["means", "opacities", "shN"])
@@ -308,26 +258,18 @@ def test_sizes_are_the_root_mean_square_distance_to_the_three_nearest_neighbours
     assert torch.allclose(wider["scales"], params["scales"] + math.log(2.0))
 
 
-def test_colours_places_and_opacities_are_those_of_the_points() -> None:
+def test_colours_places_and_opacities_are_those_of_the_points_and_rotations_are_drawn() -> None:
     points, rgb = cloud(10)
     params = initialize_params(some_capture(points, rgb), init_opacity=0.25)
-    assert {name: tuple(value.shape) for name, value in params.items()} == {
-        "means": (10, 3),
-        "scales": (10, 3),
-        "quats": (10, 4),
-        "opacities": (10,),
-        "sh0": (10, 1, 3),
-        "shN": (10, 15, 3),
-    }
+    shapes = [(10, 3), (10, 3), (10, 4), (10,), (10, 1, 3), (10, 15, 3)]
+    assert {name: tuple(value.shape) for name, value in params.items()} == dict(zip(KEYS, shapes, strict=True))
     assert all(value.dtype == torch.float32 for value in params.values())
     assert np.allclose(params["means"].numpy(), points, atol=1e-6)
     assert torch.allclose(torch.sigmoid(params["opacities"]), torch.tensor(0.25))
     shown = 0.5 + 0.28209479177387814 * params["sh0"][:, 0]
     assert np.allclose(shown.numpy() * 255.0, rgb, atol=1e-3)
     assert not params["shN"].any()
-
-
-def test_rotations_are_uniform_in_the_unit_cube_and_follow_the_seed() -> None:
+    # rotations are uniform in the unit cube and follow the seed
     capture = some_capture(cloud(2000)[0])
     first, again, other = (initialize_params(capture, seed)["quats"] for seed in (0, 0, 1))
     assert torch.equal(first, again)
@@ -337,25 +279,24 @@ def test_rotations_are_uniform_in_the_unit_cube_and_follow_the_seed() -> None:
     assert torch.allclose(first.mean(dim=0), torch.tensor(0.5), atol=0.03)
 
 
-def test_points_that_coincide_and_single_points_get_a_finite_size() -> None:
+def test_points_that_coincide_and_few_points_get_a_finite_size() -> None:
     same = some_capture(np.zeros((5, 3)))
     floor = math.log(math.sqrt(1e-7) * same.scene_scale())
     for capture in (same, some_capture(np.zeros((1, 3)))):
-        assert initialize_params(capture)["scales"].flatten().tolist() == pytest.approx(
-            [floor] * (3 * len(capture.points)), rel=1e-6
-        )
-
-
-def test_fewer_than_four_points_use_the_neighbours_there_are() -> None:
+        found = initialize_params(capture)["scales"].flatten().tolist()
+        assert found == pytest.approx([floor] * (3 * len(capture.points)), rel=1e-6)
+    # fewer than four use the neighbours there are
     params = initialize_params(some_capture(np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])), dtype=torch.float64)
     assert params["scales"].exp().flatten().tolist() == pytest.approx([2.0] * 6)
 
 
-def test_a_capture_without_points_and_an_impossible_opacity_are_refused() -> None:
+def test_a_capture_without_points_or_views_and_an_impossible_opacity_are_refused(tmp_path) -> None:
     capture = some_capture(cloud(4)[0])
     empty = replace(capture, points=np.zeros((0, 3)), points_rgb=np.zeros((0, 3), np.uint8))
     assert_one_line(lambda: initialize_params(empty), "scene", "no points")
     assert_one_line(lambda: initialize_params(capture, init_opacity=1.0), "init_opacity", "between 0 and 1")
+    all_held_out = tiny_config(tmp_path, test_every=1)
+    assert_one_line(lambda: TrainingRun(all_held_out, tiny_capture()), "no view to train on")
 
 
 # What is measured: PSNR, SSIM, counts of the Gaussians, and averages.
@@ -367,40 +308,21 @@ def pictures(seed=0, height=40, width=30):
     return (target + 0.2 * torch.randn(height, width, 3, generator=g)), target
 
 
-def test_psnr_is_scikit_images_on_the_clamped_render():
+def test_psnr_and_ssim_are_scikit_images_on_the_clamped_render_and_ssim_over_whole_windows():
     # here, since it takes seconds to import and every worker imports every module
-    from skimage.metrics import peak_signal_noise_ratio
+    from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
     image, target = pictures()
-    want = peak_signal_noise_ratio(target.double().numpy(), image.clamp(0, 1).double().numpy(), data_range=1.0)
-    assert psnr(image, target) == pytest.approx(want, rel=1e-6)
-
-
-def test_psnr_of_equal_pictures_is_infinite_and_of_black_on_white_zero():
-    white = torch.ones(4, 4, 3)
-    assert psnr(white, white) == math.inf
-    assert psnr(torch.zeros(4, 4, 3), white) == 0.0
-
-
-def test_ssim_is_scikit_images_over_whole_windows():
-    from skimage.metrics import structural_similarity
-
-    image, target = pictures()
-    clamped = image.clamp(0, 1)
-    _, full = structural_similarity(
-        target.double().numpy(),
-        clamped.double().numpy(),
-        data_range=1.0,
-        channel_axis=2,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        full=True,
-    )
+    given = (target.double().numpy(), image.clamp(0, 1).double().numpy())
+    assert psnr(image, target) == pytest.approx(peak_signal_noise_ratio(*given, data_range=1.0), rel=1e-6)
+    windows = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    _, full = structural_similarity(*given, data_range=1.0, channel_axis=2, full=True, **windows)
     assert measure(image, target).ssim == pytest.approx(full[5:-5, 5:-5].mean(), rel=1e-5)
+    white = torch.ones(4, 4, 3)
+    assert (psnr(white, white), psnr(torch.zeros(4, 4, 3), white)) == (math.inf, 0.0)
 
 
-def test_masked_pixels_do_not_count():
+def test_masked_pixels_do_not_count_and_averages_are_over_views():
     image, target = pictures()
     mask = torch.ones(40, 30, dtype=torch.bool)
     mask[:, 20:] = False
@@ -408,9 +330,7 @@ def test_masked_pixels_do_not_count():
     spoiled[:, 20:] = 1.0 - target[:, 20:].round()
     assert measure(spoiled, target, mask) == measure(image, target, mask)
     assert measure(spoiled, target, mask).psnr == pytest.approx(psnr(image[:, :20], target[:, :20]), rel=1e-6)
-
-
-def test_averages_are_over_views_and_no_view_gives_null():
+    # averages are over views, and no view gives null
     measured = [measure(*pictures(seed)) for seed in (0, 1)]
     means = average(measured, [])
     assert means["psnr"] == pytest.approx(np.mean([m.psnr for m in measured]))
@@ -429,13 +349,7 @@ def test_the_population_is_counted_at_both_poles_and_at_the_floor():
 
 
 def wait_for_a_line(capsys: pytest.CaptureFixture[str]) -> str:
-    end = time.monotonic() + 60.0
-    while time.monotonic() < end:
-        told = capsys.readouterr().err
-        if told:
-            return told.splitlines()[0]
-        time.sleep(0.005)
-    raise AssertionError("nothing is told")
+    return wait_until(lambda: capsys.readouterr().err).splitlines()[0]
 
 
 def test_a_line_comes_by_itself_from_within_a_long_computation(capsys: pytest.CaptureFixture[str]) -> None:
@@ -447,40 +361,33 @@ def test_a_line_comes_by_itself_from_within_a_long_computation(capsys: pytest.Ca
     assert capsys.readouterr().err == ""
 
 
-def test_stages_that_report_are_told(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(heartbeat, "PERIOD", 0.01)
-    with bars() as report:
-        report("matching photographs", 64, 1225)
-        assert wait_for_a_line(capsys).startswith("pop: matching photographs: 64 of 1,225 (")
-
-
 class Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True
 
 
-def test_the_time_that_is_left_is_told(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stages_that_report_are_told_with_the_time_that_is_left(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(heartbeat, "PERIOD", 0.01)
+    with bars() as report:
+        report("matching photographs", 64, 1225)
+        assert wait_for_a_line(capsys).startswith("pop: matching photographs: 64 of 1,225 (")
     clock = [100.0]
     monkeypatch.setattr(heartbeat.time, "monotonic", lambda: clock[0])
     with bars() as report:
         report("matching pairs of photographs", 0, 300)
         clock[0] += 60.0
         report("matching pairs of photographs", 100, 300)
-        end = time.perf_counter() + 60.0
-        told = ""
-        while " left" not in told and time.perf_counter() < end:
-            told = capsys.readouterr().err
+        told = wait_until(lambda: told if " left" in (told := capsys.readouterr().err) else "")
     assert "pop: matching pairs of photographs: 100 of 300, 2 min 0 s left (" in told
 
 
 def test_a_training_whose_steps_are_all_taken_says_what_it_does_then() -> None:
-    assert (
-        heartbeat.so_far(100, 400, 50, 20.0, "") == "step 100 of 400, 50 Gaussians, 5.0 steps a second, 1 min 0 s left"
-    )
-    assert heartbeat.so_far(400, 400, 50, 80.0, ", PSNR 21.00") == (
-        "step 400 of 400, 50 Gaussians, PSNR 21.00, measuring and writing"
-    )
+    left = "step 100 of 400, 50 Gaussians, 5.0 steps a second, 1 min 0 s left"
+    assert heartbeat.so_far(100, 400, 50, 20.0, "") == left
+    done = "step 400 of 400, 50 Gaussians, PSNR 21.00, measuring and writing"
+    assert heartbeat.so_far(400, 400, 50, 80.0, ", PSNR 21.00") == done
 
 
 @pytest.mark.parametrize("quiet", [True, False])
@@ -493,33 +400,21 @@ def test_a_terminal_and_a_quiet_run_are_told_nothing(monkeypatch: pytest.MonkeyP
     assert stream.getvalue() == ""
 
 
-def test_the_bar_of_a_long_stage_is_drawn_anew_in_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bars_of_long_stages_and_of_steps_that_take_long_are_drawn_anew_in_a_terminal(
+    pop: Pop, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("sys.stderr", stream := Terminal())
     monkeypatch.setattr(heartbeat, "TICK", 0.01)
     with bars() as report:
         report("reading photographs", 3, 10)
-        drawn_anew(stream, "3/10")
+        wait_until(lambda: stream.getvalue().count("3/10") >= 4)
     assert "pop: " not in stream.getvalue()
-
-
-def drawn_anew(stream: io.StringIO, words: str) -> None:
-    end = time.monotonic() + 60.0
-    while stream.getvalue().count(words) < 4:
-        assert time.monotonic() < end, stream.getvalue()
-        time.sleep(0.01)
-
-
-def test_the_bar_of_a_step_that_takes_long_is_drawn_anew_in_a_terminal(
-    pop: Pop, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     took = TrainingRun.take_steps
 
     def slowly(training: TrainingRun, last: int) -> Any:
-        drawn_anew(stream, "0/1 [")
+        wait_until(lambda: stream.getvalue().count("0/1 [") >= 4)
         return took(training, last)
 
-    monkeypatch.setattr(heartbeat, "TICK", 0.01)
-    monkeypatch.setattr("sys.stderr", stream := Terminal())
     monkeypatch.setattr(TrainingRun, "take_steps", slowly)
     words = ("--out", tmp_path / "r", "--max-steps", "1", "--skip-checks", "--skip-sizes")
     assert pop("train", shared_capture, *words).status == 0
@@ -537,9 +432,6 @@ def test_training_tells_how_far_it_is(
     assert pop("train", shared_capture, "--out", tmp_path / "q", *TRAIN).err == ""
 
 
-@pytest.mark.parametrize(
-    ("seconds", "words"),
-    [(0.4, "0 s"), (59.4, "59 s"), (59.6, "1 min 0 s"), (3599, "59 min 59 s"), (7860, "2 h 11 min")],
-)
-def test_times_are_written_as_people_say_them(seconds: float, words: str) -> None:
-    assert duration(seconds) == words
+def test_times_are_written_as_people_say_them() -> None:
+    said = {0.4: "0 s", 59.4: "59 s", 59.6: "1 min 0 s", 3599: "59 min 59 s", 7860: "2 h 11 min"}
+    assert {seconds: duration(seconds) for seconds in said} == said

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from pop_fast.cli import main
-from tests.app import tiny_port
 from tests.app.conftest import Pop
 from tests.app.damage import contents, says, truncate
 
@@ -40,12 +39,14 @@ def port(shared_vectors: Path, made_once: Callable[..., Path]) -> Path:
 
     def make(folder: Path) -> None:
         # by its own judgement, from the index alone, nothing fails
-        assert tiny_port.run(shared_vectors, folder / "results") == set()
+        assert run(shared_vectors, folder / "results") == set()
 
     return made_once("port", make) / "results"
 
 
-def test_a_port_written_from_the_index_passes_in_npz(pop: Pop, shared_vectors: Path, port: Path) -> None:
+def test_a_port_written_from_the_index_passes_in_npz_and_in_json(
+    pop: Pop, shared_vectors: Path, port: Path, tmp_path: Path
+) -> None:
     outcome = pop("vectors", "check", shared_vectors, port)
     drawn = len(list(port.iterdir()))
     assert outcome.status == 0, outcome.out
@@ -54,20 +55,17 @@ def test_a_port_written_from_the_index_passes_in_npz(pop: Pop, shared_vectors: P
     assert "not there, not judged: depths, means2d, conics" in outcome.out
     assert "no result for, not judged: harmonics_of_degree_three, inria" in outcome.out
     assert outcome.out.endswith("all that is there passes\n")
-
-
-def test_results_may_be_json(pop: Pop, shared_vectors: Path, port: Path, tmp_path: Path) -> None:
     for path in port.iterdir():
         with np.load(path) as stored:
             text = json.dumps({name: stored[name].tolist() for name in stored.files})
         (tmp_path / f"{path.stem}.json").write_text(text)
-    assert pop("vectors", "check", shared_vectors, tmp_path).status == 0
+    pop.done("vectors", "check", shared_vectors, tmp_path)
 
 
 def test_a_broken_port_is_told_which_array_of_which_vector_and_where(
     pop: Pop, shared_vectors: Path, tmp_path: Path
 ) -> None:
-    own = tiny_port.run(shared_vectors, tmp_path / "results", shift=0.0)
+    own = run(shared_vectors, tmp_path / "results", shift=0.0)
     assert ("one_round_splat", "image") in own
     outcome = pop("vectors", "check", shared_vectors, tmp_path / "results")
     assert outcome.status == 1
@@ -91,10 +89,16 @@ def _split(text: str) -> list:
     return parts
 
 
-def test_one_wrong_entry_is_found_and_named(pop: Pop, shared_vectors: Path, port: Path, tmp_path: Path) -> None:
+def test_one_wrong_entry_is_found_and_what_the_index_does_not_know_is_said(
+    pop: Pop, shared_vectors: Path, port: Path, tmp_path: Path
+) -> None:
     results = shutil.copytree(port, tmp_path / "results")
+    (results / "notes.txt").write_text("mine")
     with np.load(results / "golden.npz") as stored:
-        arrays = dict(stored)
+        arrays = {**stored, "v_mean": np.zeros(3)}
+    np.savez(results / "golden.npz", **arrays)
+    outcome = pop.done("vectors", "check", shared_vectors, results)
+    assert "unknown, not judged: notes.txt, golden.npz: v_mean" in outcome.out
     arrays["image"][3, 5, 1] += 1e-3
     np.savez(results / "golden.npz", **arrays)
     outcome = pop("vectors", "check", shared_vectors, results)
@@ -102,15 +106,11 @@ def test_one_wrong_entry_is_found_and_named(pop: Pop, shared_vectors: Path, port
     (line,) = (line for line in outcome.out.splitlines() if "golden: off by" in line)
     assert re.search(r"off by \S+ of its error_bound, allowed \S+; ", line), line
     assert "at [3, 5, 1]: got " in outcome.out
-
-
-def test_what_the_index_does_not_know_is_said(pop: Pop, shared_vectors: Path, port: Path, tmp_path: Path) -> None:
-    results = shutil.copytree(port, tmp_path / "results")
-    (results / "notes.txt").write_text("mine")
-    with np.load(results / "golden.npz") as stored:
-        np.savez(results / "golden.npz", **{**stored, "v_mean": np.zeros(3)})
-    outcome = pop.done("vectors", "check", shared_vectors, results)
-    assert "unknown, not judged: notes.txt, golden.npz: v_mean" in outcome.out
+    # what is not finite never passes
+    np.savez(results / "golden.npz", T_final=np.full_like(arrays["T_final"], np.nan))
+    outcome = pop("vectors", "check", shared_vectors, results)
+    assert outcome.status == 1
+    assert "golden: off by inf" in outcome.out
 
 
 @pytest.mark.slow  # it makes every vector
@@ -224,14 +224,117 @@ def test_results_that_cannot_be_read_are_refused_by_one_line(
     says(pop("vectors", "check", shared_vectors, results), *parts)
 
 
-def test_what_is_not_finite_never_passes(pop: Pop, shared_vectors: Path, tmp_path: Path) -> None:
-    with np.load(shared_vectors / "golden.npz") as stored:
-        np.savez(tmp_path / "golden.npz", T_final=np.full_like(stored["T_final"], np.nan))
-    outcome = pop("vectors", "check", shared_vectors, tmp_path)
-    assert outcome.status == 1
-    assert "golden: off by inf" in outcome.out
-
-
 @pytest.mark.parametrize("words", [(), ("judge",), ("check", "a"), ("check", "a", "b", "--dtype", "half")])
 def test_bad_usage_has_status_two(pop: Pop, words: tuple[str, ...]) -> None:
     assert pop("vectors", *words).status == 2
+
+
+# A renderer as somebody would port it: written from what `index.json` says, with json and numpy alone, in float32. It
+# draws what it can (no square extents, harmonics to degree 1, no gradients) and judges itself by the index.
+
+Real = np.float32
+Arrays = dict[str, np.ndarray]
+
+
+def rotation(quat: np.ndarray) -> np.ndarray:
+    w, x, y, z = quat / np.linalg.norm(quat)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def splat(a: Arrays, i: int, options: dict) -> tuple | None:
+    """Project Gaussian i: (depth, centre, inverse covariance, opacity, colour), None behind the near plane."""
+    profile, K = options["profile"], a["K"]
+    R, t = a["viewmat"][:3, :3], a["viewmat"][:3, 3]
+    x, y, z = p = R @ a["means"][i] + t
+    if z < profile["near_plane"]:
+        return None
+    slopes = []
+    for axis, size in ((0, options["width"]), (1, options["height"])):
+        f, c, margin = K[axis, axis], K[axis, 2], profile["frustum_margin"] * size / 2
+        slopes.append(np.clip(p[axis] / z, (-c - margin) / f, (size - c + margin) / f))
+    J = np.array([[K[0, 0], 0, -K[0, 0] * slopes[0]], [0, K[1, 1], -K[1, 1] * slopes[1]]], Real) / z
+    half = J @ R @ rotation(a["quats"][i]) * a["scales"][i]
+    raw = half @ half.T
+    blurred = raw + Real(profile["eps2d"]) * np.eye(2, dtype=Real)
+    opacity = a["opacities"][i]
+    if options["antialiased"]:
+        opacity = opacity * np.sqrt(max(Real(0), np.linalg.det(raw) / np.linalg.det(blurred)))
+    direction = a["means"][i] + R.T @ t
+    dx, dy, dz = direction / np.linalg.norm(direction)
+    basis = 0.4886025119029199 * np.array([-dy, dz, -dx])
+    basis = np.array([0.28209479177387814, *basis], Real)[: (options["sh_degree"] + 1) ** 2]
+    color = np.maximum(0, Real(0.5) + basis @ a["sh"][i, : len(basis)])
+    center = np.array([K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]])
+    return z, center, np.linalg.inv(blurred), opacity, color, i
+
+
+def draw(a: Arrays, options: dict, shift: float = 0.5) -> Arrays:
+    """Render a vector; `shift` is where in a pixel its centre lies."""
+    a = {name: value.astype(Real) if value.dtype == np.float64 else value for name, value in a.items()}
+    profile, shape = options["profile"], (options["height"], options["width"])
+    splats = [s for i in range(len(a["means"])) if (s := splat(a, i, options)) is not None]
+    splats.sort(key=lambda s: (s[0], s[5]))
+    image, left = np.zeros((*shape, 3), Real), np.ones(shape, Real)
+    ids, counts = np.full(shape, -1), np.zeros(shape, np.int64)
+    for y, x in np.ndindex(shape):
+        T, best = Real(1), Real(0)
+        for _, center, conic, opacity, color, i in splats:
+            d = center - np.array([x + shift, y + shift], Real)
+            sigma = d @ conic @ d / 2
+            alpha = min(Real(profile["alpha_ceiling"]), opacity * np.exp(-sigma))
+            if sigma < 0 or alpha < profile["alpha_floor"]:
+                continue
+            rest = T * (1 - alpha)
+            if rest < profile["transmittance_stop"] or (
+                profile["stop_inclusive"] and rest == profile["transmittance_stop"]
+            ):
+                break
+            image[y, x] += T * alpha * color
+            if T * alpha > best:
+                best, ids[y, x] = T * alpha, i
+            T, counts[y, x] = rest, counts[y, x] + 1
+        image[y, x] += T * a["background"]
+        left[y, x] = T
+    return {"image": image, "T_final": left, "dominant_ids": ids, "n_blended": counts}
+
+
+def within_reach(vector: dict) -> bool:
+    options = vector["options"]
+    return vector["kind"] == "render" and options["profile"]["extent"] == "opacity_aware" and options["sh_degree"] <= 1
+
+
+def judge(index: dict, wanted: Arrays, name: str, result: np.ndarray) -> bool:
+    """Compare one output as the index says."""
+    (rule,) = index["kinds"]["render"]["arrays"][name]["compare"]
+    mask = wanted[rule["where"]] if rule["where"] else np.array(True)
+    mask = mask.reshape(mask.shape + (1,) * (result.ndim - mask.ndim))
+    if rule["rule"] == "equal":
+        good = result == wanted[name]
+    else:
+        limit = rule["limit"]["float32"] * wanted[rule["error_bound"]] + index["tiny"]["float32"]
+        good = np.abs(result - wanted[name]) <= limit
+    return bool(np.all(good | ~mask))
+
+
+def run(vectors: Path, results: Path, shift: float = 0.5) -> set[tuple[str, str]]:
+    """Draw every vector within reach, write the results, and return which arrays of which vectors fail."""
+    index = json.loads((vectors / "index.json").read_text())
+    results.mkdir()
+    failed = set()
+    for name, vector in index["vectors"].items():
+        if not within_reach(vector):
+            continue
+        with np.load(vectors / vector["file"]) as stored:
+            wanted = {key: stored[key] for key in stored.files}
+        arrays = index["kinds"]["render"]["arrays"]
+        inputs = {key: value for key, value in wanted.items() if arrays[key]["role"] == "input"}
+        drawn = draw(inputs, vector["options"], shift)
+        np.savez(results / f"{name}.npz", **drawn)  # type: ignore[arg-type]
+        failed |= {(name, key) for key, value in drawn.items() if not judge(index, wanted, key, value)}
+    return failed

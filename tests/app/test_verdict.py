@@ -1,20 +1,25 @@
-"""The report's verdict: its numbers, no contradictions, and commands that ask for the run that was judged."""
+"""The report's verdict: its numbers, no contradictions, and commands that ask for the run that was judged and help."""
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
-from pop_fast.cli import parse
+from pop_fast.cli import main, parse
 from pop_fast.cli.data_check import Args as DataCheck
 from pop_fast.cli.export import Args as Export
 from pop_fast.cli.train import arguments as train_arguments
 from pop_fast.train import TrainConfig
-from pop_fast.view.report.checks import Checks
+from pop_fast.view.report.checks import Checks, read_checks
 from pop_fast.view.report.model import Finding, verdict
-from pop_fast.view.report.source import typed
+from pop_fast.view.report.source import read_result, typed
+from tests.app.conftest import Pop
 
 GOOD = Checks(
     photographs=60,
@@ -27,6 +32,14 @@ GOOD = Checks(
     floaters={"a": 0.0, "b": 0.002},
     misfits={"a": 0.0, "b": 0.004},
 )
+
+
+ONE = {"a": 0.3}
+SIX_APART = {"train_psnr": 24.8, "held_out_psnr": 18.6}
+
+
+def orbit(shares: list[float]) -> dict[str, float]:
+    return {f"frame {i}": share for i, share in enumerate(shares)}
 
 
 @pytest.mark.parametrize(
@@ -52,25 +65,10 @@ GOOD = Checks(
         ("Floaters", {"floaters": {"a": 0.0, "b": 0.015}}, "look", "worst b, 1.5 %"),
         ("Floaters", {"floaters": {"a": 0.1, "b": 0.3}}, "bad", "20.0 % of the pixels"),
         # frames of the orbit vanish, and no photograph's view shows anything
-        (
-            "Floaters",
-            {"orbit_floaters": {f"frame {i}": 0.8 * (i > 52) for i in range(60)}},
-            "bad",
-            "hides much of 7 views",
-        ),
-        (
-            "Floaters",
-            {"orbit_floaters": {f"frame {i}": 0.001 for i in range(60)}},
-            "good",
-            "2 photographs' views and 60",
-        ),
-        ("Floaters", {"floaters": {"a": 0.3}, "without_floaters": 29.45}, "bad", "29.45 dB instead of 29.50"),
-        (
-            "Floaters",
-            {"floaters": {"a": 0.3}, "without_floaters": 28.0},
-            "look",
-            "without them held-out views have 28.00",
-        ),
+        ("Floaters", {"orbit_floaters": orbit(53 * [0.0] + 7 * [0.8])}, "bad", "hides much of 7 views"),
+        ("Floaters", {"orbit_floaters": orbit(60 * [0.001])}, "good", "2 photographs' views and 60"),
+        ("Floaters", {"floaters": ONE, "without_floaters": 29.45}, "bad", "29.45 dB instead of 29.50"),
+        ("Floaters", {"floaters": ONE, "without_floaters": 28.0}, "look", "without them held-out views have 28.00"),
         ("Fit", {}, "good", "reach 31.00 dB"),
         ("Fit", {"misfits": {"a": 0.02, "b": 0.05}}, "look", "3.5 % of a photograph is far from its render"),
         ("Fit", {"train_psnr": 21.0, "held_out_psnr": 19.0}, "look", "cameras that are wrong"),
@@ -78,12 +76,7 @@ GOOD = Checks(
         ("Fit", {"train_psnr": 18.09, "held_out_psnr": 17.0, "steps": 90}, "bad", "few steps"),
         ("Overfitting", {"train_psnr": 18.09, "held_out_psnr": 17.0}, "look", "both low"),
         # as close as these are, 6.2 dB say that they are not close enough
-        (
-            "Photographs",
-            {"train_psnr": 24.8, "held_out_psnr": 18.6},
-            "bad",
-            "not enough for what this subject takes, as the 6.2 dB",
-        ),
+        ("Photographs", SIX_APART, "bad", "not enough for what this subject takes, as the 6.2 dB"),
         # hardly a drift, but 1.1 dB
         ("Exposure", {"matched_psnr": 30.6}, "look", "30.60 dB instead of 29.50"),
     ],
@@ -139,9 +132,9 @@ def test_no_verdict_contradicts_another_and_each_fault_ends_in_a_command(
     [(31.0, "good", "very close"), (26.0, "good", "close"), (22.0, "look", "recognisable"), (12.0, "bad", "far from")],
 )
 def test_the_verdict_says_how_close_the_renders_are(psnr: float, kind: str, words: str) -> None:
-    quality = verdict({"psnr": psnr}, None, None)
-    assert [(f.about, f.kind) for f in quality] == [("Quality", kind)]
-    assert words in quality[0].text
+    (quality,) = verdict({"psnr": psnr}, None, None)
+    assert (quality.about, quality.kind) == ("Quality", kind)
+    assert words in quality.text
 
 
 @pytest.mark.parametrize(
@@ -158,12 +151,11 @@ def test_views_that_few_steps_left_as_they_are_ask_for_more_steps(train: float, 
 
 
 def test_a_view_that_spoils_the_mean_is_named() -> None:
-    views = {"edge": 8.05, "a": 19.8, "b": 20.0}
-    (quality, *_) = verdict({}, replace(GOOD, held_out=views, held_out_psnr=15.95), None)
-    assert "edge is the worst, 8.05 dB; the mean without it is 19.90 dB." in quality.text
-    even = {"edge": 19.5, "a": 19.8, "b": 20.0}
-    (quality, *_) = verdict({}, replace(GOOD, held_out=even, held_out_psnr=19.77), None)
-    assert "worst" not in quality.text
+    for edge, mean, named in ((8.05, 15.95, True), (19.5, 19.77, False)):
+        views = {"edge": edge, "a": 19.8, "b": 20.0}
+        (quality, *_) = verdict({}, replace(GOOD, held_out=views, held_out_psnr=mean), None)
+        said = f"edge is the worst, {edge:.2f} dB; the mean without it is 19.90 dB."
+        assert (said in quality.text, "worst" in quality.text) == (named, named)
 
 
 def test_a_run_whose_held_out_views_got_worse_is_told_when_that_began() -> None:
@@ -236,15 +228,124 @@ def test_another_training_is_asked_for_as_the_judged_one_was(name: str, words: t
     again, options = train_arguments(line[1:])
     assert (again.data, again.result_dir) == ("my scene", "out/a_next")
     assert options.minutes == (240.0 if "--minutes" in words else None)
-    assert (again.method, again.seed, again.factor, again.background) == (
-        *(run.method, run.seed, run.factor),
-        run.background,
-    )
-    kept = {"exposure", "depth_lambda", "test_every", "normalize"} - changes
-    assert {key: getattr(again, key) for key in kept} == {key: getattr(run, key) for key in kept}
+    kept = {"method", "seed", "factor", "background", "exposure", "depth_lambda", "test_every", "normalize"} - changes
     if "steps" not in changes:
-        assert (again.max_steps, again.strategy, again.lr) == (run.max_steps, run.strategy, run.lr)
-    elif "--steps-scaler" in words:
+        kept |= {"max_steps", "strategy", "lr"}
+    assert {key: getattr(again, key) for key in kept} == {key: getattr(run, key) for key in kept}
+    if "--steps-scaler" in words:
         assert again.max_steps == 3_600
         assert again.strategy.lambda_pop == run.strategy.lambda_pop
     assert "--preset" not in line or "--minutes" not in words
+
+
+# What the report says to type next helps: commands are taken from reports and typed, and the results are measured.
+
+
+@pytest.fixture(scope="module")
+def demo(made_once: Callable[..., Path]) -> Path:
+    """A still life from all around, in photographs so small that whole trainings take seconds."""
+
+    def make(folder: Path) -> None:
+        assert main(["demo", str(folder / "demo"), "--views", "20", "--width", "64", "--height", "48"]) == 0
+
+    return made_once("small_demo", make) / "demo"
+
+
+def trained(pop: Pop, words: Sequence[object]) -> tuple[Checks, dict[str, Finding]]:
+    """Train as was typed; what its report measured, and what it found, by subject."""
+    pop.done(*words, "--no-progress")
+    folder = Path(str(words[words.index("--out") + 1]))
+    (path,) = (folder / "report_data").glob("checks_step*.json")
+    return read_checks(path), {one.about: one for one in read_result(folder).verdict}
+
+
+def edited(demo: Path, folder: Path, change: Callable[[int, np.ndarray], np.ndarray]) -> Path:
+    """Copy the capture with other photographs."""
+    shutil.copytree(demo, folder)
+    for number, path in enumerate(sorted((folder / "images").iterdir())):
+        image = change(number, cv2.imread(str(path)).astype(np.float64))
+        assert cv2.imwrite(str(path), np.clip(np.rint(image), 0, 255).astype(np.uint8))
+    return folder
+
+
+@pytest.mark.slow
+def test_more_steps_help_where_few_left_all_views_far_off_and_fewer_where_it_learned_them_by_heart(
+    pop: Pop, demo: Path, tmp_path: Path
+) -> None:
+    # noise, which only so many steps learn by heart
+    draw = np.random.default_rng(0)
+    noisy = edited(demo, tmp_path / "noisy", lambda _, image: image + draw.normal(0.0, 25.0, image.shape))
+    short, told = trained(pop, ["train", noisy, "--out", tmp_path / "run", "--steps-scaler", "0.002"])
+    assert {told["Quality"].kind, told["Fit"].kind} == {"bad"}
+    assert told["Quality"].next[:4] == told["Fit"].next[:4] == ("train", str(noisy), "--minutes", "240")
+    long, told = trained(pop, told["Quality"].next)
+    assert long.judged_psnr > short.judged_psnr + 1.0
+    assert long.train_psnr > short.train_psnr + 3.0
+    assert told["Course"].kind == "bad"
+    assert told["Course"].next[:3] == ("train", str(noisy), "--steps-scaler")
+    fewer, told = trained(pop, told["Course"].next)
+    assert fewer.steps < long.steps
+    assert fewer.judged_psnr > long.judged_psnr + 0.3
+    assert "Course" not in told
+
+
+@pytest.mark.slow
+def test_exposures_that_drift_are_learned(pop: Pop, demo: Path, tmp_path: Path) -> None:
+    gains = 0.8 * np.exp2(np.random.default_rng(0).normal(0.0, 0.4, 20))
+    drifting = edited(demo, tmp_path / "drifting", lambda number, image: image * gains[number])
+    before, told = trained(pop, ["train", drifting, "--out", tmp_path / "run", "--steps-scaler", "0.02"])
+    assert told["Exposure"].kind == "bad"
+    assert "--exposure" in told["Exposure"].next
+    after, told = trained(pop, told["Exposure"].next)
+    # both after scaling each render to its photograph's brightness
+    assert after.matched_psnr > before.matched_psnr + 0.5
+    assert after.train_psnr > before.train_psnr + 2.0
+    assert told["Exposure"].kind == "good"
+
+
+@pytest.mark.slow
+def test_views_are_held_out_where_none_were(pop: Pop, demo: Path, tmp_path: Path) -> None:
+    words = ["train", demo, "--out", tmp_path / "run", "--steps-scaler", "0.01", "--test-every", "0"]
+    before, told = trained(pop, words)
+    assert before.judged_psnr is None
+    assert told["Overfitting"].next[:4] == ("train", str(demo), "--test-every", "8")
+    after, told = trained(pop, told["Overfitting"].next)
+    assert after.judged_psnr is not None
+    assert "held-out views" in told["Overfitting"].text
+
+
+@pytest.mark.slow
+def test_photographs_that_are_far_apart_are_looked_over_and_the_gaps_named(
+    pop: Pop, demo: Path, tmp_path: Path
+) -> None:
+    _, told = trained(pop, ["train", demo, "--out", tmp_path / "run", "--steps-scaler", "0.002"])
+    assert "neighbours 27" in told["Photographs"].text
+    assert told["Photographs"].next == ("data", "check", str(demo))
+    (line,) = (line for line in pop(*told["Photographs"].next).out.splitlines() if "spacing" in line)
+    assert "photographs between these would help most" in line
+
+
+@pytest.mark.slow
+def test_what_moved_is_left_out_by_the_masks_that_the_report_asks_for(pop: Pop, demo: Path, tmp_path: Path) -> None:
+    def place(number: int) -> tuple[slice, slice]:
+        return slice(18, 34), slice(4 + 2 * number, 18 + 2 * number)
+
+    def walked(number: int, image: np.ndarray) -> np.ndarray:
+        image[place(number)] = (30.0, 30.0, 220.0)
+        return image
+
+    moving = edited(demo, tmp_path / "moving", walked)
+    words = ["train", moving, "--out", tmp_path / "run", "--steps-scaler", "0.05"]
+    before, told = trained(pop, words)
+    assert told["Fit"].kind != "good"
+    assert told["Fit"].next == ("data", "check", str(moving))
+    for number, path in enumerate(sorted((moving / "images").iterdir())):
+        mask = np.full(cv2.imread(str(path)).shape[:2], 255, np.uint8)
+        mask[place(number)] = 0
+        (moving / "masks").mkdir(exist_ok=True)
+        assert cv2.imwrite(str(moving / "masks" / path.name), mask)
+    found = pop(*told["Fit"].next)
+    assert any("masks" in line and line.startswith("ok") for line in found.out.splitlines())
+    after, told = trained(pop, [*words, "--overwrite"])
+    assert after.train_psnr > before.train_psnr + 2.0
+    assert told["Fit"].kind == "good", told["Fit"].text

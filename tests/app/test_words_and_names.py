@@ -27,7 +27,7 @@ from pop_fast.train import TrainConfig, choose
 from tests.app.captures import edit_transforms, photograph, transforms_capture, write_photograph
 from tests.app.conftest import TRAIN, Pop
 from tests.app.damage import says
-from tests.app.interruptions import interrupt
+from tests.app.tiny import interrupt
 
 
 @pytest.mark.parametrize("name", ["a=b", "x y", "--", "-s"])

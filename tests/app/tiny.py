@@ -1,17 +1,24 @@
-"""A capture that trains in seconds: five 32 x 24 views of coloured points on a ring, and settings to match.
+"""A capture that trains in seconds, five 32 x 24 views of coloured points on a ring, and ways to cut such a run short.
 
 Run as a script it trains, for tests that have to stop a process: `python tests/app/tiny.py FOLDER [resume]`.
 """
 
 from __future__ import annotations
 
+import json
+import os
+import shutil
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
+import torch
 
 from pop_fast.data.capture import Capture, View
 from pop_fast.density import GsplatStrategy, InriaStrategy, POPStrategy
@@ -67,6 +74,26 @@ def last_checkpoint(folder: Path, *without: str) -> dict[str, Any]:
     return flat
 
 
+def records(folder: Path, *without: str) -> list[dict[str, Any]]:
+    """Return the lines of metrics.jsonl, but for some of their entries."""
+    lines = map(json.loads, (folder / "metrics.jsonl").read_text().splitlines())
+    return [{key: value for key, value in line.items() if key not in without} for line in lines]
+
+
+def assert_same_run(folder: Path, reference: Path, *without: str) -> None:
+    """Compare all that two finished runs leave and that depends on no clock, but for some parts of the checkpoint."""
+    ours, theirs = (last_checkpoint(each, "seconds", "metrics_bytes", *without) for each in (folder, reference))
+    assert list(ours) == list(theirs)
+    assert {"splats", "optimizers", "strategy", "view_order"} <= {name.split(".")[1] for name in ours}
+    for name, value in ours.items():
+        if isinstance(value, torch.Tensor):
+            assert value.dtype == theirs[name].dtype, name
+            assert torch.equal(value, theirs[name]), name
+        else:
+            assert value == theirs[name], name
+    assert records(folder, "it_per_s", "seconds") == records(reference, "it_per_s", "seconds")
+
+
 def tiny_config(folder: Path | str, method: str = "pop", **changes: Any) -> TrainConfig:
     """Thirty steps, at high rates, with all density control: growth, blur, pruning, resets, all colour bands."""
     steps = {
@@ -112,6 +139,64 @@ class SlowRun(TrainingRun):
         """Take a step, and a breath."""
         time.sleep(0.02)
         return super().take_steps(last)
+
+
+_TAKE_STEPS = TrainingRun.take_steps
+
+
+class Killed(BaseException):
+    """The process is gone: from here on nothing that it tries has an effect."""
+
+
+def interrupt(monkeypatch: pytest.MonkeyPatch, at: int) -> None:
+    """Let every run be left at once, without a checkpoint, when it has taken `at` steps."""
+
+    def stepping(training: TrainingRun, last: int) -> Any:
+        if training.step == at:
+            raise KeyboardInterrupt
+        # an engine that takes many steps at a time is stopped there too
+        return _TAKE_STEPS(training, min(last, at) if training.step < at else last)
+
+    monkeypatch.setattr(TrainingRun, "take_steps", stepping)
+
+
+@contextmanager
+def interrupted(at: int) -> Iterator[None]:
+    """Let the run in this block be left at once, without a checkpoint, when it has taken `at` steps."""
+    with pytest.MonkeyPatch.context() as patch:
+        interrupt(patch, at)
+        with pytest.raises(KeyboardInterrupt):
+            yield
+
+
+def run_until(training: TrainingRun, at: int | None = None) -> None:
+    """Run to the end, or leave at once, without a checkpoint, when `at` steps are taken."""
+    if at is None:
+        training.run()
+        return
+    with interrupted(at):
+        training.run()
+
+
+@contextmanager
+def killed_after(changes: int) -> Iterator[None]:
+    """Let the first so many renames, removals and new folders happen and raise `Killed` at each one after them."""
+    left = changes
+
+    def counted(function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            nonlocal left
+            if left == 0:
+                raise Killed
+            left -= 1
+            return function(*args, **kwargs)
+
+        return call
+
+    with pytest.MonkeyPatch.context() as patch:
+        for owner, name in ((os, "replace"), (Path, "mkdir"), (Path, "unlink"), (Path, "rmdir"), (shutil, "rmtree")):
+            patch.setattr(owner, name, counted(getattr(owner, name)))
+        yield
 
 
 if __name__ == "__main__":

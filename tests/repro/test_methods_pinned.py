@@ -19,7 +19,7 @@ from pop_fast.density import rows
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.model import KEYS
 from pop_fast.train.presets import METHODS
-from tests.app.test_methods import engine_or_skip, tiny_method
+from tests.app.test_strategies import engine_or_skip, tiny_method
 from tests.app.tiny import tiny_capture
 
 # the other settings of a run: where things lie, which engine takes the steps, how often something is written

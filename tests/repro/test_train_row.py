@@ -40,7 +40,7 @@ from pop_fast.io.images import read_image
 from pop_fast.stages import losses
 from pop_fast.train import TrainingRun
 from pop_fast.train.choose import choose_backend
-from tests.app.interruptions import interrupt, interrupted
+from tests.app.tiny import interrupt, interrupted
 from tests.repro.made import options, toy, values
 
 ROOT = Path(__file__).parents[2]

@@ -33,8 +33,7 @@ from pop_ref.conformance.backends import shipped
 from pop_ref.conformance.mutants.trial import law_named, obeys
 from pop_ref.constants import PAPER
 from pop_ref.settings import PARAMETERS
-from tests.app.interruptions import interrupted
-from tests.app.tiny import HEIGHT, WIDTH, last_checkpoint, tiny_capture, tiny_config
+from tests.app.tiny import HEIGHT, WIDTH, interrupted, last_checkpoint, tiny_capture, tiny_config
 
 REASON = get_backend("compiled").why_not()
 needs_compiled = pytest.mark.skipif(REASON is not None, reason=REASON or "")

@@ -25,8 +25,8 @@ from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.ranks import ALONE, Ranks, join
 from pop_fast.train.training_run import Watch
 from tests.app.conftest import launched
-from tests.app.test_resume import needs_gloo, same
-from tests.app.tiny import last_checkpoint, tiny_capture, tiny_config
+from tests.app.test_resume import needs_gloo
+from tests.app.tiny import assert_same_run, last_checkpoint, tiny_capture, tiny_config
 from tests.cuda.conftest import FOLDER, emulated_engine
 from tests.cuda.gpu.test_device_training import masked, mixed_sizes, records
 
@@ -137,7 +137,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Alone]:
 @needs_gloo
 @pytest.mark.parametrize("name", RUNS)
 def test_two_gpus_train_to_the_bits_of_one(gpu, together: Path, alone, name: str) -> None:
-    same(together / name, alone(name).folder)
+    assert_same_run(together / name, alone(name).folder)
     assert records_of(together / name) == records_of(alone(name).folder)
     # density control had something to decide, and both owned Gaussians
     assert len(last_checkpoint(together / name)[".splats.means"]) > 70
@@ -201,7 +201,7 @@ def test_one_gpu_continues_what_two_began(gpu, together: Path, tmp_path: Path) -
     assert (ckpt.list_checkpoints(folder)[-1][0] + 1) % 4
     assert kept
     train(tmp_path, "window", resume=True)
-    same(folder, together / "window")
+    assert_same_run(folder, together / "window")
 
 
 def test_buffers_that_overflow_in_a_step_of_several_views_lose_nothing(gpu, alone, tmp_path: Path, monkeypatch) -> None:

@@ -1,4 +1,4 @@
-"""`benchmarks/run.py`'s training steps: tables from results, floors from counts, busy processes that end."""
+"""`benchmarks/`: tables from results, floors of training steps from counts, busy processes that end, pairs of runs."""
 
 from __future__ import annotations
 
@@ -14,12 +14,20 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
+from benchmarks import estimates
+from benchmarks.few_photographs import left_of, table_of
 from pop_fast import compiled
+from pop_fast.io.heartbeat import duration
+from pop_fast.train import TrainConfig, automatic
+from pop_fast.train.automatic import Choice
+from tests.app.conftest import ROOT
+from tests.app.tiny import tiny_capture
 
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+BENCHMARKS = ROOT / "benchmarks"
 PARTS = ("project", "list", "blend", "loss", "image_gradient", "transpose", "update")
 COUNTS = {"visible": 90, "entries": 640, "walked": 600, "chunks": 40, "pairs": 4096, "marked": 128, "reached": 64}
 
@@ -36,14 +44,10 @@ def script(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 def case(name: str, **changed: Any) -> dict[str, Any]:
     ms = {"fast": 90.0, "compiled": 30.0, "native": 12.25, "native, 1 thread": 22.0}
+    size = {"width": 64, "height": 32, "degree": 3, "num_gaussians": 100, "threads": 2, "target_ms": 12.0}
     return {
         "name": name,
-        "width": 64,
-        "height": 32,
-        "degree": 3,
-        "num_gaussians": 100,
-        "threads": 2,
-        "target_ms": 12.0,
+        **size,
         "ms": {engine: {"median": value, "minimum": value - 1.0} for engine, value in ms.items()},
         "ratios": {"compiled / fast": 0.33, "native / compiled": 0.41, "efficiency": 0.9},
         "parts_ms": dict.fromkeys(PARTS, 1.5),
@@ -57,38 +61,18 @@ def case(name: str, **changed: Any) -> dict[str, Any]:
 def results() -> dict[str, Any]:
     beside = {"alone_ms": 10.0, "beside_ms": 60.0, "of_fair_share": 1.2}
     memory = {"width": 64, "height": 32, "n": 100, "before_gib": 0.5, "peak_gib": 0.75}
+    busy = {"name": "64x32-100", "processes": 8, "threads": 2, "cores": 2, "fair_factor": 5.0}
+    commands = {"pop --help": {"wall_s": 0.2, "cpu_s": 0.1}}
+    first_step = {"capture": "fox", "factor": 4, "wall_s": 1.75, "step_s": 0.02}
+    even = {"1": {"even share": 12.0, "handing over": 0.0}, "16": {"even share": 0.75, "handing over": 0.25}}
     return {
         "steps": {
             "peak": {"threads": 2, "vector_ops_per_s": 16e9, "bytes_per_s": 40e9},
             "cases": [case("64x32-100"), case("fox", degree=0, target_ms=None)],
         },
-        "busy": [
-            {
-                "name": "64x32-100",
-                "processes": 8,
-                "threads": 2,
-                "cores": 2,
-                "fair_factor": 5.0,
-                "engines": {"compiled": beside, "native": beside},
-            }
-        ],
-        "first-step": {
-            "repeats": 5,
-            "commands": {"pop --help": {"wall_s": 0.2, "cpu_s": 0.1}},
-            "first_step": {"capture": "fox", "factor": 4, "wall_s": 1.75, "step_s": 0.02},
-        },
-        "cores": [
-            {
-                "name": "64x32-100",
-                "num_gaussians": 100,
-                "width": 64,
-                "height": 32,
-                "machines": {
-                    "1": {"even share": 12.0, "handing over": 0.0},
-                    "16": {"even share": 0.75, "handing over": 0.25},
-                },
-            }
-        ],
+        "busy": [{**busy, "engines": {"compiled": beside, "native": beside}}],
+        "first-step": {"repeats": 5, "commands": commands, "first_step": first_step},
+        "cores": [{"name": "64x32-100", "num_gaussians": 100, "width": 64, "height": 32, "machines": even}],
         "memory": [
             {"what": "render", "by": "fast", **memory},
             {"what": "step", "by": "native", "working_gib": 0.25, **memory},
@@ -96,13 +80,15 @@ def results() -> dict[str, Any]:
     }
 
 
-def test_notes_hold_the_tables_of_the_results(script: Any) -> None:
+def test_notes_hold_the_tables_of_the_results_and_the_curves_of_preset_quick(script: Any) -> None:
     assert script("step_tables").main(["--check"]) == 0, "run 'python benchmarks/step_tables.py --write'"
+    assert script("quick_curve").main(["--json", str(BENCHMARKS / "results" / "quick.json"), "--check"]) == 0
 
 
-def test_every_table_says_what_was_measured(script: Any) -> None:
-    tables, timed = script("step_tables"), results()
-    notes = tables.with_tables((BENCHMARKS / "NOTES.md").read_text(), timed)
+def test_every_table_says_what_was_measured_and_what_was_not(script: Any) -> None:
+    tables, text = script("step_tables"), (BENCHMARKS / "NOTES.md").read_text()
+    assert tables.with_tables(text, {}).count(tables.NOT_YET) == len(tables.TABLES)
+    notes = tables.with_tables(text, results())
     assert tables.NOT_YET not in notes
     for row in (
         "| 64x32, 100 Gaussians | 90 ms | 30 ms | 12.2 ms (11.2) | 0.41 |",
@@ -116,12 +102,6 @@ def test_every_table_says_what_was_measured(script: Any) -> None:
         "| two training steps, 64x32, 100 Gaussians | `compiled`, native | 0.50 GiB | 0.75 GiB | 0.25 GiB |",
     ):
         assert row in notes, row
-
-
-def test_what_was_not_measured_is_said_so(script: Any) -> None:
-    tables = script("step_tables")
-    notes = tables.with_tables((BENCHMARKS / "NOTES.md").read_text(), {})
-    assert notes.count(tables.NOT_YET) == len(tables.TABLES)
 
 
 def test_the_readme_takes_the_steps_with_the_renders(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -150,16 +130,12 @@ def test_floors_follow_the_counts_and_the_machine(script: Any, monkeypatch: pyte
     assert more["transpose"]["floor_ms"] - found["transpose"]["floor_ms"] == pytest.approx(8 * 37 / 4e4)
     # one band has fewer numbers than four
     assert parts.works({**row, "degree": 0})["update"].bytes < parts.works(row)["update"].bytes
-
-
-def test_peaks_that_a_step_surpasses_are_no_peaks(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    parts = script("parts")
-    # the projection of this case alone would then need 3.68 ms
+    # peaks that a step surpasses are no peaks: the projection of this case alone would need 3.68 ms
     monkeypatch.setattr(parts, "vector_ops_per_s", lambda threads: 5e5 * threads)
     monkeypatch.setattr(parts, "bytes_per_s", lambda moved, threads: 1e12)
     too_little = r"project took 1.50 ms, and operations alone need .*: peak.cpp measures too little"
     with pytest.raises(SystemExit, match=too_little):
-        parts.floors(case("64x32-100"))
+        parts.floors(row)
 
 
 def test_steps_on_more_cores_are_simulated_from_what_their_parts_take(script: Any) -> None:
@@ -224,8 +200,15 @@ def counting() -> int:
     return len(re.findall("getppid", shown.stdout))
 
 
-def test_busy_processes_end_with_their_block(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    busy = script("processes")
+def test_busy_processes_end_with_their_block_and_with_who_started_them(
+    script: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    busy = script("busy")
+    alone = subprocess.Popen([sys.executable, "-S", "-c", busy.LOOP, "0"])
+    try:
+        assert alone.wait(timeout=60) == 0
+    finally:
+        alone.kill()
     monkeypatch.setattr(busy.time, "sleep", lambda _: None)
 
     def interrupted() -> None:
@@ -236,21 +219,8 @@ def test_busy_processes_end_with_their_block(script: Any, monkeypatch: pytest.Mo
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert counting() == 0
-
-
-def test_busy_processes_end_with_who_started_them(script: Any) -> None:
-    loop = script("processes").LOOP
-    alone = subprocess.Popen([sys.executable, "-S", "-c", loop, "0"])
-    try:
-        assert alone.wait(timeout=60) == 0
-    finally:
-        alone.kill()
-
-
-def test_a_fair_share_is_that_of_all_who_want_a_core(script: Any) -> None:
-    busy = script("processes")
-    assert busy.fair_factor(2, 2) == 5.0
-    assert busy.fair_factor(1, 16) == 1.0
+    # a fair share is that of all who want a core
+    assert (busy.fair_factor(2, 2), busy.fair_factor(1, 16)) == (5.0, 1.0)
 
 
 def test_turns_change_order_and_keep_what_counts(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -264,12 +234,10 @@ def test_turns_change_order_and_keep_what_counts(script: Any, monkeypatch: pytes
 
 # `benchmarks/ab_benchmark.py`: ratios come from pairs of runs, and nothing is timed where the images differ.
 
-SCRIPT = Path(__file__).resolve().parents[2] / "benchmarks" / "ab_benchmark.py"
-
 
 @pytest.fixture(scope="module")
 def ab_benchmark():
-    spec = importlib.util.spec_from_file_location("ab_benchmark", SCRIPT)
+    spec = importlib.util.spec_from_file_location("ab_benchmark", BENCHMARKS / "ab_benchmark.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -297,14 +265,11 @@ def test_each_repeat_gives_one_ratio_whatever_the_machine_does_between_repeats(a
     assert log[6:10] == [its, mine, mine, its] or log[6:10] == [mine, its, its, mine]
 
 
-def test_nothing_is_timed_where_the_images_differ(ab_benchmark):
+def test_nothing_is_timed_where_the_images_differ_or_there_is_no_checkout(ab_benchmark, tmp_path):
     log = []
     with pytest.raises(SystemExit, match=r"images differ by 5.0e-01, more than 1e-04; nothing was timed"):
         ab_benchmark.compare(timed([1.0], log), timed([1.0], log, torch.full((2, 2, 3), 0.5)), ("step",), 1)
     assert not log
-
-
-def test_a_folder_that_is_no_checkout_is_named(ab_benchmark, tmp_path):
     with pytest.raises(SystemExit, match=rf"{tmp_path} has no pop_fast/__init__.py"):
         ab_benchmark.Checkout(tmp_path)
 
@@ -329,11 +294,6 @@ def test_what_a_function_imports_when_it_is_called_is_its_own_checkouts(ab_bench
 
 
 # Preset quick against the longer schedule: curves of held-out PSNR over seconds.
-
-
-def test_notes_hold_the_curves_of_preset_quick(script: Any) -> None:
-    kept = BENCHMARKS / "results" / "quick.json"
-    assert script("quick_curve").main(["--json", str(kept), "--check"]) == 0
 
 
 def test_a_curve_is_read_between_its_points_and_nowhere_else(script: Any) -> None:
@@ -365,3 +325,52 @@ def test_the_tables_of_quick_are_means_of_the_seeds_that_have_both(script: Any) 
     assert row.startswith("| toy |  /  |")
     # after half of the time one seed of quick has ended: there is no mean
     assert "| 29.00 /  |" in row
+
+
+# Settings for few photographs, and what was foretold of runs that choose for themselves.
+
+
+def test_few_photographs_are_left_evenly_with_the_points_that_two_of_them_see() -> None:
+    capture = tiny_capture(n_views=17)
+    left = left_of(capture, 4)
+    assert [view.name for view in left.test_views()] == [view.name for view in capture.test_views()]
+    assert [view.name for view in left.train_views()] == ["01.png", "05.png", "11.png", "15.png"]
+    assert 0 < len(left.points) < len(capture.points)
+    seen = np.bincount(np.concatenate([view.seen for view in left.train_views()]), minlength=len(left.points))
+    assert seen.min() >= 2
+    was = {view.name: {*map(tuple, capture.points[view.seen])} for view in capture.views}
+    assert all({*map(tuple, left.points[view.seen])} <= was[view.name] for view in left.views)
+
+
+def test_a_table_of_settings_compares_the_same_seeds_alone() -> None:
+    rows = {
+        "a / 2, 8 photographs, 9 steps, seed 1: plain": {"psnr": 20.0, "ssim": 0.5},
+        "a / 2, 8 photographs, 9 steps, seed 2: plain": {"psnr": 30.0, "ssim": 0.7},
+        "a / 2, 8 photographs, 9 steps, seed 2: --x": {"psnr": 31.0, "ssim": 0.6},
+    }
+    last = table_of({"machine": {}, **rows}).splitlines()[-1]
+    assert last == "| a / 2, 8 photographs, 9 steps | 25.00 / 0.600 (2) | +1.00 / -0.100 (1) |"
+
+
+def test_the_line_before_the_first_step_is_read_back_for_the_table_of_estimates() -> None:
+    choice = Choice(scaler=0.01, gaussians=34_900.0, seconds=3_725.0, memory_bytes=1.27e9)
+    config = TrainConfig.of(preset="auto", steps_scaler=0.01, factor=2, backend="fast")
+    row = estimates.foretold(f"before\n{automatic.line_of(choice, config, (256, 512))}\n")
+    foretold = {"gaussians": 35_000, "seconds": 3_720.0, "memory": 1.3}
+    assert row == {"size": "256x512", "steps": 300, "foretold": foretold}
+    assert estimates.seconds_of(duration(62.0)) == 62.0
+    came = {"gaussians": 40_000, "seconds": 1_860.0, "memory": 1.21}
+    table = estimates.table_of({"machine": {}, "toy, 60": {**row, "minutes": 60.0, "came": came}})
+    assert table.splitlines()[2:] == ["| toy, 60 | 256x512, 300 | 3720 s, 1860 s | 0.50 | 35,000, 40,000 | 1.3, 1.2 |"]
+    with pytest.raises(ValueError, match="no line says"):
+        estimates.foretold("trained")
+
+
+def test_what_was_foretold_of_four_captures_came_within_thirty_percent() -> None:
+    known = json.loads((ROOT / "benchmarks" / "results" / "estimates.json").read_text(encoding="utf-8"))
+    rows = [row for name, row in known.items() if name != "machine"]
+    assert len(rows) == 4
+    for row in rows:
+        for name, said in row["foretold"].items():
+            assert said / 1.3 < row["came"][name] < 1.3 * said, (row, name)
+    assert "What was foretold came within 30 % on the four captures" in (ROOT / "docs" / "guide.md").read_text()
