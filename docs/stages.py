@@ -91,8 +91,8 @@ LAWS_ELSEWHERE = {
     "render": "pop_ref/conformance/laws/test_whole.py",
     "depth": "pop_ref/conformance/laws/test_signature_depth.py",
     "training": "tests/golden",
-    "appearance": "tests/oracle/test_appearance.py",
-    "refinement": "tests/oracle/test_appearance.py",
+    "appearance": "tests/oracle/test_losses.py",
+    "refinement": "tests/oracle/test_losses.py",
     "regularizers": "tests/oracle/test_losses.py",
     "margins": "tests/oracle/test_margins.py",
 }
