@@ -14,7 +14,7 @@ from cuda_ext.gpu_check.shared import NOTHING, ROOT, StageContext, skipped
 from pop_fast.children import python_command
 
 LAWS = ("test_laws.py",)
-STEPS = tuple(f"test_{name}.py" for name in ("ten_steps", "instances", "rows", "device_training", "passes"))
+STEPS = tuple(f"test_{name}.py" for name in ("ten_steps", "instances", "kernels", "device_training"))
 SMOKE = tuple(
     f"test_ten_steps.py::test_{name}"
     for name in (
