@@ -7,7 +7,6 @@ POP_EMULATED_LAWS=1 (`make emulate`) runs them too.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +35,7 @@ def card() -> Any:
 
 
 @pytest.fixture
-def emulated_card(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+def emulated_card(monkeypatch: pytest.MonkeyPatch, _threads_of_torch: None) -> Any:
     """Return the device of the emulated GPU, or skip with the reason why there is none."""
     import torch
 
@@ -45,10 +44,8 @@ def emulated_card(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
         pytest.skip(reason)
     emulate.install(monkeypatch, emulate.build(FOLDER))
     # threads of the CPU run that is compared with are not what is tested
-    before = torch.get_num_threads()
     torch.set_num_threads(1)
-    yield torch.device("cpu")
-    torch.set_num_threads(before)
+    return torch.device("cpu")
 
 
 @pytest.fixture

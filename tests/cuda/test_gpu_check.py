@@ -25,7 +25,7 @@ from paper_repro.record import from_line
 from pop_fast.cli import main as pop
 from pop_fast.data import load_capture
 from tests.app.captures import colmap_capture
-from tests.cuda.bare_node import stand_in_gsplat
+from tests.cuda.test_bare_node import stand_in_gsplat
 
 
 def check(folder: Path, **changes: object) -> StageContext:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import importlib.util
+import inspect
 import subprocess
 import sys
 from contextlib import contextmanager
@@ -16,10 +17,16 @@ import torch
 import cuda_ext
 from cuda_ext import build as build_module
 from cuda_ext.build import BuildError
-from cuda_ext.machine_code.check_ptxas import KernelUse, as_table, offenders, parse_ptxas
+from cuda_ext.machine_code.check_ptxas import KernelUse, as_table, check, offenders, parse_ptxas
 from cuda_ext.render.lists import GROWTH, MOST, Capacity
 from cuda_ext.toolkit import find_nvcc
 from cuda_ext.training.train_step import Watch, captured
+from pop_fast.api import backends
+from pop_fast.api import rasterization as on_every_backend
+from pop_fast.cuda import rasterization
+from pop_ref.conformance.capabilities import ANTIALIASING, PROFILES
+from tests.cuda.gpu.conftest import FOLDER, cuda_backends
+from tests.cuda.gpu.conftest import pytest_collection_modifyitems as put_graphs_first
 
 PTXAS = """
 ptxas info    : Compiling entry function '_ZN3pop20blend_forward_kernelE' for 'sm_90'
@@ -43,10 +50,23 @@ def test_an_extension_that_is_not_built_says_how_to_build_it(monkeypatch):
     assert not cuda_ext.available()
 
 
-def test_a_cpu_build_of_torch_is_named(monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
-    monkeypatch.setattr(cuda_ext, "load", lambda: type("Kernels", (), {"ARCHS": "90"}))
-    monkeypatch.setattr(torch.version, "cuda", None)
+@pytest.fixture
+def built(monkeypatch):
+    """Let the extension be built, for a runtime and a driver, next to a torch for so new a CUDA."""
+
+    def seem(torchs: str | None = "13.0", runtime: int = 13000, driver: int = 13000) -> list[str]:
+        asked: list[str] = []
+        kernels = {"ARCHS": "90", "RUNTIME": runtime, "driver_version": staticmethod(lambda: driver)}
+        monkeypatch.setattr(importlib.util, "find_spec", lambda name: asked.append(name) or object())
+        monkeypatch.setattr(cuda_ext, "load", lambda: type("Kernels", (), kernels))
+        monkeypatch.setattr(torch.version, "cuda", torchs)
+        return asked
+
+    return seem
+
+
+def test_a_cpu_build_of_torch_is_named(built):
+    built(torchs=None)
     assert "is a CPU build" in str(cuda_ext.why_not())
 
 
@@ -58,26 +78,19 @@ def test_a_cpu_build_of_torch_is_named(monkeypatch):
         (13010, "torch finds no usable GPU (the driver on your system is too old); check `nvidia-smi`"),
     ],
 )
-def test_a_missing_or_wrong_driver_is_named(monkeypatch, driver, words):
+def test_a_missing_or_wrong_driver_is_named(built, monkeypatch, driver, words):
     def init():
         raise RuntimeError("the driver on your system is too old. Please update it.")
 
-    kernels = {"ARCHS": "90", "RUNTIME": 13000, "driver_version": staticmethod(lambda: driver)}
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
-    monkeypatch.setattr(cuda_ext, "load", lambda: type("Kernels", (), kernels))
-    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    built(driver=driver)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.cuda, "init", init)
     assert words in str(cuda_ext.why_not())
 
 
-def test_a_machine_that_can_run_it_is_asked_once(monkeypatch):
-    kernels = {"ARCHS": "90", "RUNTIME": 12040, "driver_version": staticmethod(lambda: 13000)}
-    asked = []
+def test_a_machine_that_can_run_it_is_asked_once(built, monkeypatch):
+    asked = built(runtime=12040)
     monkeypatch.setattr(cuda_ext, "_could_run", [])
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: asked.append(name) or object())
-    monkeypatch.setattr(cuda_ext, "load", lambda: type("Kernels", (), kernels))
-    monkeypatch.setattr(torch.version, "cuda", "13.0")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda: (9, 0))
     assert cuda_ext.available()
@@ -103,11 +116,11 @@ def test_a_gpu_runs_code_of_its_generation_or_newer_ptx(capability, archs, runs)
         assert f"--arch sm_{capability[0]}{capability[1]}" in reason
 
 
-def test_a_module_that_does_not_load_asks_to_be_built_again(monkeypatch):
+def test_a_module_that_does_not_load_asks_to_be_built_again(built, monkeypatch):
     def fails():
         raise ImportError("undefined symbol")
 
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    built()
     monkeypatch.setattr(cuda_ext, "load", fails)
     assert "build it again" in str(cuda_ext.why_not())
 
@@ -143,21 +156,9 @@ def test_a_failing_compiler_is_quoted():
 
 
 def test_rasterization_refuses_what_it_does_not_support_and_names_what_is_wrong(monkeypatch):
-    from pop_fast.cuda import rasterization
-
-    rows = {
-        "means": torch.zeros(1, 3),
-        "quats": torch.ones(1, 4),
-        "scales": torch.ones(1, 3),
-        "opacities": torch.ones(1),
-        "colors": torch.ones(1, 3),
-        "viewmats": torch.eye(4)[None],
-        "Ks": torch.eye(3)[None],
-        "width": 4,
-        "height": 4,
-    }
-    from pop_fast.api import backends
-
+    ones = {"quats": (1, 4), "scales": (1, 3), "opacities": (1,), "colors": (1, 3)}
+    rows = {"means": torch.zeros(1, 3), **{name: torch.ones(shape) for name, shape in ones.items()}}
+    rows |= {"viewmats": torch.eye(4)[None], "Ks": torch.eye(3)[None], "width": 4, "height": 4}
     monkeypatch.setattr(backends.cuda_ext, "why_not", lambda: None)
     with pytest.raises(NotImplementedError, match=r"covars=.* by backend 'cuda': the kernels start from quats"):
         rasterization(**rows, covars=torch.zeros(1, 3, 3))
@@ -170,25 +171,17 @@ def test_rasterization_refuses_what_it_does_not_support_and_names_what_is_wrong(
 
 
 def test_the_signature_is_the_cpus():
-    import inspect
-
-    from pop_fast.api import rasterization as on_every_backend
-    from pop_fast.cuda import rasterization as on_gpu
-
-    assert inspect.signature(on_gpu) == inspect.signature(on_every_backend)
+    assert inspect.signature(rasterization) == inspect.signature(on_every_backend)
 
 
 def test_the_laws_of_antialiased_mode_judge_every_kind_of_the_cuda_backend():
-    from pop_ref.conformance.capabilities import ANTIALIASING, PROFILES
-    from tests.cuda.gpu.conftest import cuda_backends
-
     backends = cuda_backends("cpu", "cuda")
-    assert {backend.name for backend in backends} == {
+    assert {backends.name for backend in backends} == {
         "cuda32-pixel_parallel",
         "cuda32-gaussian_parallel",
         "cuda32-atomics",
     }
-    assert all(backend.has(need) for backend in backends for need in (ANTIALIASING, PROFILES))
+    assert all(backends.has(need) for backend in backends for need in (ANTIALIASING, PROFILES))
 
 
 def test_spills_and_registers_are_read_from_the_compilers_words():
@@ -213,8 +206,6 @@ def test_every_kernel_file_is_built():
 @pytest.mark.slow
 @pytest.mark.skipif(find_nvcc() is None, reason="no nvcc: the kernels are not compiled here (install a CUDA toolkit)")
 def test_the_blend_kernels_compile_for_turing_without_spills():
-    from cuda_ext.machine_code.check_ptxas import check
-
     assert offenders(check(["sm_75"], only="blend")) == []
 
 
@@ -286,8 +277,7 @@ def test_a_population_that_doubles_has_room_before_it_overflows():
 
 
 def test_a_room_that_would_overflow_soon_grows_before_it_does():
-    capacity = Capacity([BIG])
-    capacity.settle(1000)
+    capacity = of_one_view(10_000)
     capacity.overflowed(0, 10_000)
     capacity.note(0, 14_900)
     capacity.settle(1000)
@@ -317,9 +307,7 @@ def test_a_need_beyond_the_kernels_numbers_stays_what_it_is_and_one_below_gets_w
 
 
 def test_what_a_doubled_population_may_need_is_not_refused_before_it_is_needed():
-    capacity = Capacity([BIG])
-    capacity.settle(1000)
-    capacity.note(0, MOST - 5)
+    capacity = of_one_view(MOST - 5)
     capacity.settle(2000)
     assert capacity.room(BIG) == MOST
 
@@ -462,15 +450,12 @@ def test_flags_come_in_the_order_of_the_steps_and_no_copy_is_overwritten_before_
 
 @pytest.mark.parametrize(("reason", "first"), [(None, ["graph", "other"]), ("no GPU", ["other", "graph"])])
 def test_graph_tests_go_first_where_there_is_a_gpu(monkeypatch, reason, first):
-    import cuda_ext
-    from tests.cuda.gpu.conftest import FOLDER, pytest_collection_modifyitems
-
     def item(name, folder=FOLDER):
         return SimpleNamespace(name=name, path=folder / "test.py", get_closest_marker=lambda kind: name == kind or None)
 
     monkeypatch.setattr(cuda_ext, "why_not", lambda: reason)
     items = [item("other"), item("graph"), item("graph", FOLDER.parent / "emulated")]
     emulated = items[2]
-    pytest_collection_modifyitems(items)
+    put_graphs_first(items)
     assert [each.name for each in items[:2]] == first
     assert items[2] is emulated

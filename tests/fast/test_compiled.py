@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import dedent
@@ -18,6 +18,9 @@ from pop_fast import compiled
 from pop_fast.api.backend import get_backend
 from pop_fast.api.checks import check_sizes
 from pop_fast.compiled import compositing as in_cpp
+from pop_fast.compiled import library
+from pop_fast.compiled.compositing import composite as native
+from pop_fast.compiled.compositing import tile_lists as native_lists
 from pop_fast.density.passes import Passes
 from pop_fast.stages import splatting
 from pop_fast.stages.compositing import Composite
@@ -27,7 +30,7 @@ from pop_fast.stages.splatting import ProjectionSettings
 from pop_fast.stages.splatting import Splats as Rows
 from pop_fast.stages.tiles import TileLists, tile_lists
 from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER, PROFILES, Profile
-from tests.fast.pass_scenes import raw_params, views
+from tests.fast.test_passes import raw_params, views
 
 pytestmark = pytest.mark.skipif(not compiled.available(), reason=compiled.why_not() or "")
 
@@ -83,13 +86,7 @@ def blended(
     return found, [leaf.grad for leaf in leaves]
 
 
-def native(*args, **kwargs) -> Composite:
-    from pop_fast.compiled.compositing import composite
-
-    return composite(*args, **kwargs)
-
-
-def assert_as_in_torch(given: Splats, profile: Profile = PAPER) -> None:
+def assert_blends_as_in_torch(given: Splats, profile: Profile) -> None:
     sinks = [torch.zeros_like(given.means2d) for _ in range(2)]
     (mine, gradients), (its, expected) = (
         blended(composite, given, profile, sink=sink)
@@ -105,65 +102,92 @@ def assert_as_in_torch(given: Splats, profile: Profile = PAPER) -> None:
         torch.testing.assert_close(mine_v, v, rtol=0.0, atol=1e-12 * float(v.abs().max()))
 
 
-@pytest.mark.parametrize("tile_size", [1, 4, 5, 8, 16, 64])
-def test_any_tile_size_blends_as_in_torch(tile_size: int) -> None:
-    assert_as_in_torch(splats(tile_size))
+BACKGROUND = torch.tensor([0.3, 0.1, 0.2], dtype=torch.float64)
+PIXEL_MAP = torch.rand(HEIGHT, WIDTH, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
 
 
-@pytest.mark.parametrize("channels", [1, 2, 3, 4, 9])
-def test_any_number_of_channels_blends_as_in_torch(channels: int) -> None:
-    assert_as_in_torch(splats(channels=channels))
+def as_splats(drawn: Splats) -> Rows:
+    n, dtype = len(drawn.means2d), drawn.means2d.dtype
+    radii = torch.ones((n, 2), dtype=torch.int32)
+    return Rows(drawn.means2d, torch.zeros(n, dtype=dtype), drawn.conics, drawn.opacities, radii, None, drawn.colors)
 
 
-CEILINGS = [PAPER, replace(PAPER, alpha_ceiling=0.7), replace(INRIA, alpha_ceiling=0.7)]
+def sums(functions: tuple[Callable, Callable, Callable], drawn: Splats, profile: Profile) -> dict[str, Tensor]:
+    """Take all sums of a view."""
+    of_view = (as_splats(drawn), drawn.lists, WIDTH, HEIGHT, drawn.lists.tile_size)
+    contributions, sensitivities, screen_moments = functions
+    found = contributions(*of_view, PIXEL_MAP, profile)
+    return {
+        **{name: getattr(found, name) for name in ("weight_sum", "n_pixels", "map_sum", "distance_sum")},
+        "sensitivities": sensitivities(*of_view, BACKGROUND, profile),
+        "moments": screen_moments(*of_view, BACKGROUND, profile),
+    }
 
 
-@pytest.mark.parametrize("profile", CEILINGS, ids=["paper", "low ceiling, no gradient", "low ceiling, passed through"])
-def test_every_profile_blends_as_in_torch(profile: Profile) -> None:
-    assert_as_in_torch(splats(), profile)
+def passes_native() -> tuple[Callable, Callable, Callable]:
+    stages = get_backend("compiled").stages()
+    return stages.contributions, stages.sensitivities, stages.screen_moments
 
 
-def test_lists_longer_than_a_chunk_blend_as_in_torch() -> None:
-    given = splats(16, n=900)
-    assert int(given.lists.lengths.max()) > 200
-    faint = replace_opacities(given, 0.05)
-    assert_as_in_torch(faint)
-    assert_as_in_torch(given)
+def assert_sums_as_in_torch(drawn: Splats, profile: Profile) -> None:
+    mine = sums(passes_native(), drawn, profile)
+    its = sums((contributions, sensitivities, screen_moments), drawn, profile)
+    for name, expected in its.items():
+        # a column of moments at a time: their units differ
+        size = expected.double().abs().amax(0)
+        assert float(size.min()) > 0.0, name
+        assert float(((mine[name] - expected).abs() / size).max()) < 1e-12, name
 
 
-def replace_opacities(given: Splats, factor: float) -> Splats:
-    return replace(given, opacities=given.opacities * factor)
+CEILINGS = (PAPER, replace(PAPER, alpha_ceiling=0.7), replace(INRIA, alpha_ceiling=0.7))
+CASES = {
+    **{f"tiles of {size} px": ({"tile_size": size}, PAPER) for size in (1, 4, 5, 8, 16, 64)},
+    **{f"{n} channels": ({"channels": n}, PAPER) for n in (1, 2, 4, 9)},
+    "low ceiling, no gradient": ({}, CEILINGS[1]),
+    "low ceiling, passed through": ({}, CEILINGS[2]),
+    "lists longer than a chunk": ({"tile_size": 16, "n": 900}, PAPER),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_blends_and_sums_over_pixels_are_those_of_torch(name: str) -> None:
+    options, profile = CASES[name]
+    given = splats(**options)
+    assert_blends_as_in_torch(given, profile)
+    if given.colors.shape[1] == 3:
+        assert_sums_as_in_torch(given, profile)
+    if int(given.lists.lengths.max()) > 200:
+        # where nothing stops
+        faint = replace(given, opacities=0.05 * given.opacities + 0.01)
+        assert_blends_as_in_torch(faint, profile)
+        assert_sums_as_in_torch(faint, profile)
+    else:
+        assert "chunk" not in name
+
+
+def assert_alike(found: Callable[[], Sequence[Tensor]], numbers: Sequence[int] = (2, 3, 7)) -> None:
+    """Assert that so many threads give the bits of one."""
+    torch.set_num_threads(1)
+    first = found()
+    for number in numbers:
+        torch.set_num_threads(number)
+        assert all(torch.equal(a, b) for a, b in zip(first, found(), strict=True)), number
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_bits_do_not_depend_on_the_number_of_threads(dtype: torch.dtype) -> None:
-    given, before = splats(n=400, dtype=dtype), torch.get_num_threads()
-    results = []
-    try:
-        for threads in (1, 2, 3, 7):
-            torch.set_num_threads(threads)
-            found, gradients = blended(native, given)
-            results.append([found.image.detach(), found.alphas.detach(), found.dominant_ids, *gradients])
-    finally:
-        torch.set_num_threads(before)
-    for others in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], others, strict=True))
+def test_the_bits_do_not_depend_on_the_number_of_threads(dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = splats(n=400, dtype=dtype)
 
+    def made() -> list[Tensor]:
+        found, gradients = blended(native, given)
+        return [found.image.detach(), found.alphas.detach(), found.dominant_ids, *gradients]
 
-def test_threads_of_its_own_give_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
-    from pop_fast.compiled import library
-
-    given, without_torchs = splats(n=400), replace(library.this_library(), fork=None)
-    found, gradients = blended(native, given)
-    before = torch.get_num_threads()
-    torch.set_num_threads(3)
-    try:
-        monkeypatch.setattr(library, "this_library", lambda: without_torchs)
-        own, of_own = blended(native, given)
-    finally:
-        torch.set_num_threads(before)
-    assert torch.equal(found.image, own.image)
-    assert all(torch.equal(a, b) for a, b in zip(gradients, of_own, strict=True))
+    assert_alike(made)
+    with_torchs = made()
+    # threads of its own
+    without_torchs = replace(library.this_library(), fork=None)
+    monkeypatch.setattr(library, "this_library", lambda: without_torchs)
+    assert all(torch.equal(a, b) for a, b in zip(with_torchs, made(), strict=True))
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the limit on memory is Linux's")
@@ -230,25 +254,9 @@ def test_nothing_to_blend_is_black() -> None:
     assert not any(v.any() for v in gradients)
 
 
-def test_a_second_transpose_of_the_same_graph_gives_the_same_bits() -> None:
-    given = splats()
-    leaves = [tensor.clone().requires_grad_() for tensor in given.tensors]
-    loss = native(*leaves, given.lists, WIDTH, HEIGHT).image.square().sum()
-    first = torch.autograd.grad(loss, leaves, retain_graph=True)
-    assert all(torch.equal(a, b) for a, b in zip(first, torch.autograd.grad(loss, leaves), strict=True))
-
-
-def test_the_light_alone_has_a_gradient() -> None:
-    given = splats()
-    leaf = given.opacities.clone().requires_grad_()
-    inputs = (given.means2d, given.conics, leaf, given.colors)
-    (mine,) = torch.autograd.grad(native(*inputs, given.lists, WIDTH, HEIGHT).alphas.sum(), leaf)
-    (its,) = torch.autograd.grad(composite_in_torch(*inputs, given.lists, WIDTH, HEIGHT).alphas.sum(), leaf)
-    torch.testing.assert_close(mine, its, rtol=0.0, atol=1e-12 * float(its.abs().max()))
-
-
 def test_pairs_are_counted_where_pixels_are_lit() -> None:
-    faint = replace_opacities(splats(8, n=30), 0.01)
+    few = splats(8, n=30)
+    faint = replace(few, opacities=0.01 * few.opacities)
     found, _ = blended(native, faint)
     # nothing stops, so that every entry meets every row of its tile that lies in the image, eight pixels at a time
     rows = [min(8, HEIGHT - 8 * (tile // faint.lists.tiles_x)) for tile in range(len(faint.lists.lengths))]
@@ -262,8 +270,6 @@ def test_pairs_are_counted_where_pixels_are_lit() -> None:
 @pytest.mark.parametrize("exact", [True, False], ids=["entries that reach no pixel left out", "whole rectangles"])
 @pytest.mark.parametrize("tile_size", [4, 8, 16])
 def test_tile_lists_are_those_of_torch(tile_size: int, exact: bool, profile: Profile) -> None:
-    from pop_fast.compiled.compositing import tile_lists as native_lists
-
     generator = torch.Generator().manual_seed(3)
     given = splats(n=700)
     # a quarter of equal depths, and culled splats among the others
@@ -271,108 +277,28 @@ def test_tile_lists_are_those_of_torch(tile_size: int, exact: bool, profile: Pro
     radii = torch.randint(-3, 24, (700, 2), generator=generator, dtype=torch.int32).clamp_min(0)
     shapes = {"conics": given.conics, "opacities": given.opacities} if exact else {}
     arguments = (given.means2d, radii, depths, WIDTH, HEIGHT, tile_size, profile)
-    its, before = tile_lists(*arguments, **shapes), torch.get_num_threads()
+    its = tile_lists(*arguments, **shapes)
     assert len(its.ids) > 500
-    try:
-        for threads in (1, 2, 5):
-            torch.set_num_threads(threads)
-            mine = native_lists(*arguments, **shapes)
-            assert torch.equal(mine.ids, its.ids)
-            assert torch.equal(mine.offsets, its.offsets)
-    finally:
-        torch.set_num_threads(before)
-
-
-def test_no_splat_on_the_screen_makes_empty_lists() -> None:
-    from pop_fast.compiled.compositing import tile_lists as native_lists
-
-    given = splats(n=5)
-    lists = native_lists(given.means2d, torch.zeros(5, 2, dtype=torch.int32), torch.ones(5), WIDTH, HEIGHT, 8)
-    assert len(lists.ids) == 0
-    assert lists.offsets.tolist() == [0] * (6 * 5 + 1)
-
-
-# The compiled sums over pixels against torch's: any tile size, long lists, clamped alphas, any number of threads.
-
-BACKGROUND = torch.tensor([0.3, 0.1, 0.2], dtype=torch.float64)
-PIXEL_MAP = torch.rand(HEIGHT, WIDTH, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
-
-
-def as_splats(drawn: Splats) -> Rows:
-    n, dtype = len(drawn.means2d), drawn.means2d.dtype
-    radii = torch.ones((n, 2), dtype=torch.int32)
-    return Rows(drawn.means2d, torch.zeros(n, dtype=dtype), drawn.conics, drawn.opacities, radii, None, drawn.colors)
-
-
-def sums(functions: tuple[Callable, Callable, Callable], drawn: Splats, profile: Profile) -> dict[str, Tensor]:
-    """Take all sums of a view."""
-    of_view = (as_splats(drawn), drawn.lists, WIDTH, HEIGHT, drawn.lists.tile_size)
-    contributions, sensitivities, screen_moments = functions
-    found = contributions(*of_view, PIXEL_MAP, profile)
-    return {
-        **{name: getattr(found, name) for name in ("weight_sum", "n_pixels", "map_sum", "distance_sum")},
-        "sensitivities": sensitivities(*of_view, BACKGROUND, profile),
-        "moments": screen_moments(*of_view, BACKGROUND, profile),
-    }
-
-
-def passes_native() -> tuple[Callable, Callable, Callable]:
-    stages = get_backend("compiled").stages()
-    return stages.contributions, stages.sensitivities, stages.screen_moments
-
-
-def passes_assert_as_in_torch(drawn: Splats, profile: Profile = PAPER) -> None:
-    mine = sums(passes_native(), drawn, profile)
-    its = sums((contributions, sensitivities, screen_moments), drawn, profile)
-    for name, expected in its.items():
-        # a column of moments at a time: their units differ
-        size = expected.double().abs().amax(0)
-        assert float(size.min()) > 0.0, name
-        assert float(((mine[name] - expected).abs() / size).max()) < 1e-12, name
-
-
-@pytest.mark.parametrize("tile_size", [1, 4, 5, 8, 16, 64])
-def test_any_tile_size_sums_as_in_torch(tile_size: int) -> None:
-    passes_assert_as_in_torch(splats(tile_size))
-
-
-@pytest.mark.parametrize("profile", CEILINGS, ids=["paper", "low ceiling, no gradient", "low ceiling, passed through"])
-def test_clamped_alphas_sum_as_in_torch(profile: Profile) -> None:
-    passes_assert_as_in_torch(splats(16), profile)
-
-
-def test_lists_longer_than_a_chunk_sum_as_in_torch() -> None:
-    drawn = splats(16, n=900)
-    assert int(drawn.lists.lengths.max()) > 200
-    passes_assert_as_in_torch(replace(drawn, opacities=0.05 * drawn.opacities + 0.01))
-
-
-def test_the_scores_of_a_tile_size_are_those_of_any_other() -> None:
-    small, large = (sums(passes_native(), splats(size), PAPER) for size in (4, 32))
-    for name, expected in large.items():
-        size = expected.double().abs().amax(0)
-        assert float(((small[name] - expected).abs() / size).max()) < 1e-12, name
+    for number in (1, 2, 5):
+        torch.set_num_threads(number)
+        mine = native_lists(*arguments, **shapes)
+        assert torch.equal(mine.ids, its.ids)
+        assert torch.equal(mine.offsets, its.offsets)
 
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_any_number_of_threads_gives_the_same_bits(profile: str) -> None:
-    params, before = raw_params(400, torch.float32), torch.get_num_threads()
+    params = raw_params(400, torch.float32)
     pixel_map = torch.rand(22, 37, generator=torch.Generator().manual_seed(9))
 
-    def found(threads: int) -> list[Tensor]:
-        torch.set_num_threads(threads)
-        try:
-            made = Passes("compiled", views(torch.float32), profile, (0.1, 0.2, 0.3))
-            all_sums = made.contributions(params, 0, 3, pixel_map)
-            names = ("weight_sum", "n_pixels", "map_sum", "distance_sum", "dominant_counts", "image")
-            rest = [made.sensitivities(params, 0, 3), made._open(made._shot(params, 0, 3))._moments()]
-            return [*(getattr(all_sums, name) for name in names), *rest, *made.dominant_points(params, 0, 3)]
-        finally:
-            torch.set_num_threads(before)
+    def found() -> list[Tensor]:
+        made = Passes("compiled", views(torch.float32), profile, (0.1, 0.2, 0.3))
+        all_sums = made.contributions(params, 0, 3, pixel_map)
+        names = ("weight_sum", "n_pixels", "map_sum", "distance_sum", "dominant_counts", "image")
+        rest = [made.sensitivities(params, 0, 3), made._open(made._shot(params, 0, 3))._moments()]
+        return [*(getattr(all_sums, name) for name in names), *rest, *made.dominant_points(params, 0, 3)]
 
-    one = found(1)
-    for threads in (2, 3, 5):
-        assert all(torch.equal(a, b) for a, b in zip(one, found(threads), strict=True))
+    assert_alike(found)
 
 
 def test_an_empty_view_sums_to_nothing() -> None:
@@ -443,15 +369,7 @@ def test_projections_are_those_of_torch(profile: Profile, antialiased: bool) -> 
 
 
 def test_the_cameras_gradient_does_not_depend_on_the_number_of_threads() -> None:
-    before, results = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 5):
-            torch.set_num_threads(threads)
-            results.append(projected(in_cpp, PAPER, antialiased=False)[2])
-    finally:
-        torch.set_num_threads(before)
-    for others in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], others, strict=True))
+    assert_alike(lambda: projected(in_cpp, PAPER, antialiased=False)[2], (2, 5))
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

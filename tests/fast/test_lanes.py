@@ -18,8 +18,8 @@ from pop_fast.density.passes import Passes
 from pop_fast.train import TrainingRun
 from pop_ref.constants import INRIA, PAPER
 from tests.app.tiny import last_checkpoint, tiny_capture, tiny_config
-from tests.fast.pass_scenes import raw_params, views
 from tests.fast.test_compiled import blended, native, splats
+from tests.fast.test_passes import raw_params, views
 
 LEVELS = [level for level, _ in building.LEVELS["x86_64"]]
 # every primitive of lanes.h against the same thing said number by number; prints what differs

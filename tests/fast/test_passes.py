@@ -1,25 +1,23 @@
-"""Passes over views: every backend against the oracle, and what the front end promises."""
+"""Passes over views: every backend against the oracle, and what the front end promises; with a scene of two views."""
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from pop_fast import compiled
+from pop_fast.api.backend import get_backend
 from pop_fast.density.passes import Passes, ViewContributions
 from pop_fast.errors import PopError
 from pop_fast.stages.density import pixel_weights
 from pop_fast.train import TrainConfig
-from pop_fast.train.views import render_view
+from pop_fast.train.views import ViewTensors, render_view
 from pop_ref.constants import PROFILES
-from pop_ref.fisher import log_det_scores
-from pop_ref.records import Camera, Gaussians
-from tests.fast.pass_scenes import HEIGHT, WIDTH, raw_params, views
 
+WIDTH, HEIGHT = 37, 22
 BACKENDS = [
     "fast",
     pytest.param("compiled", marks=pytest.mark.skipif(not compiled.available(), reason=compiled.why_not() or "")),
@@ -27,61 +25,70 @@ BACKENDS = [
 BACKGROUND = (0.2, 0.4, 0.1)
 
 
+def raw_params(n: int = 60, dtype: torch.dtype = torch.float64) -> dict[str, Tensor]:
+    """Scatter Gaussians before the cameras: some opaque, some hardly visible, two behind and beside them."""
+    generator = torch.Generator().manual_seed(1)
+
+    def normal(*size: int) -> Tensor:
+        return torch.randn(size, generator=generator, dtype=torch.float64)
+
+    means = normal(n, 3) * torch.tensor([1.0, 1.0, 0.5]) + torch.tensor([0.0, 0.0, 4.0])
+    means[0], means[1] = torch.tensor([0.1, 0.0, -4.0]), torch.tensor([40.0, 0.0, 4.0])
+    params = {
+        "means": means,
+        "scales": 0.6 * normal(n, 3) - 1.5,
+        "quats": normal(n, 4),
+        "opacities": 3.0 * normal(n) + 1.0,
+        "sh0": normal(n, 1, 3),
+        "shN": 0.2 * normal(n, 15, 3),
+    }
+    return {name: value.to(dtype) for name, value in params.items()}
+
+
+def views(dtype: torch.dtype = torch.float64) -> list[ViewTensors]:
+    """Look along z, and from a little to the side with a mask."""
+    photos = torch.randint(0, 256, (2, HEIGHT, WIDTH, 3), generator=torch.Generator().manual_seed(2)).to(torch.uint8)
+    K = torch.tensor([[40.0, 0.0, 20.0], [0.0, 42.0, 12.0], [0.0, 0.0, 1.0]], dtype=dtype)[None]
+    viewmat = torch.eye(4, dtype=dtype)[None]
+    first = ViewTensors("first", photos[0], None, viewmat, K)
+    turned = viewmat.clone()
+    turned[0, :3, :3] = torch.tensor([[0.96, 0.0, -0.28], [0.0, 1.0, 0.0], [0.28, 0.0, 0.96]], dtype=dtype)
+    turned[0, :3, 3] = torch.tensor([1.0, 0.2, 0.1], dtype=dtype)
+    mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    mask[:, 20:] = False
+    return [first, replace(first, name="second", photo=photos[1], mask=mask, viewmat=turned)]
+
+
 def passes(backend: str, profile: str = "paper", dtype: torch.dtype = torch.float64, **more) -> Passes:
     return Passes(backend, views(dtype), profile, BACKGROUND, **more)
 
 
-def assert_as_in(expected: Tensor, found: Tensor, tolerance: float = 1e-10) -> None:
+def assert_as_in(expected: Tensor, found: Tensor) -> None:
     size = float(expected.abs().max())
     assert size > 0.0
-    torch.testing.assert_close(found, expected, rtol=0.0, atol=tolerance * size)
+    torch.testing.assert_close(found, expected, rtol=0.0, atol=1e-10 * size)
 
 
-@pytest.mark.parametrize("index", [0, 1])
+# the laws judge passes under the paper's constants
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_contributions_are_the_oracles(backend: str, profile: str, index: int) -> None:
+def test_passes_are_the_oracles_in_every_profile(backend: str, profile: str) -> None:
     pixel_map = torch.rand(HEIGHT, WIDTH, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-    expected, found = (
-        passes(name, profile).contributions(raw_params(), index, 3, pixel_map) for name in ("ref", backend)
-    )
+    ref, own, params = passes("ref", profile), passes(backend, profile), raw_params()
+    expected, found = (made.contributions(params, 1, 3, pixel_map) for made in (ref, own))
     for name in ("weight_sum", "map_sum", "distance_sum", "image"):
         assert_as_in(getattr(expected, name), getattr(found, name))
     for name in ("n_pixels", "dominant_counts", "radii", "visible"):
         assert torch.equal(getattr(found, name), getattr(expected, name)), name
     assert_as_in(expected.depths[expected.visible], found.depths[expected.visible])
     assert not bool(found.visible.all())
-
-
-@pytest.mark.parametrize("profile", PROFILES)
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_antialiased_contributions_are_the_oracles(backend: str, profile: str) -> None:
-    expected, found = (
-        passes(name, profile, antialiased=True).contributions(raw_params(), 0, 1) for name in ("ref", backend)
-    )
-    assert_as_in(expected.weight_sum, found.weight_sum)
-    assert torch.equal(found.n_pixels, expected.n_pixels)
-    assert not bool(found.map_sum.any())
-
-
-@pytest.mark.parametrize("profile", PROFILES)
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_sensitivities_are_the_oracles(backend: str, profile: str) -> None:
-    expected, found = (passes(name, profile).sensitivities(raw_params(), 1, 2) for name in ("ref", backend))
-    assert_as_in(expected, found)
-
-
-@pytest.mark.parametrize("divisor", [1, 4])
-@pytest.mark.parametrize("profile", PROFILES)
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_fisher_blocks_are_the_oracles(backend: str, profile: str, divisor: int) -> None:
-    expected, found = (passes(name, profile).fisher(raw_params(), 1, 3, divisor) for name in ("ref", backend))
+    assert_as_in(ref.sensitivities(params, 1, 2), own.sensitivities(params, 1, 2))
+    expected, found = (made.fisher(params, 1, 3, 4) for made in (ref, own))
     # parameters differ in unit: every entry against the roots of its row's and column's
     sizes = expected.diagonal(dim1=1, dim2=2).sqrt()
     units = sizes[:, :, None] * sizes[:, None, :]
     assert int((units > 0.0).all(2).all(1).sum()) > 20
     assert float(((found - expected).abs() - 1e-10 * units).max()) <= 0.0
-    assert torch.equal(found, found.transpose(1, 2))
 
 
 @pytest.mark.parametrize("profile", PROFILES)
@@ -120,31 +127,15 @@ def test_in_float32_the_same_pixels_count(backend: str) -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_weights_and_remaining_light_sum_to_one(backend: str) -> None:
-    made = passes(backend)
-    weights = made.contributions(raw_params(), 0, 0).weight_sum.sum()
-    left = made.dominant_points(raw_params(), 0, 0)[2].sum()
-    torch.testing.assert_close(weights + left, torch.tensor(float(WIDTH * HEIGHT), dtype=torch.float64))
-
-
-@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("profile", ["paper", "inria"])
 def test_a_pass_draws_what_a_training_draws(backend: str, profile: str) -> None:
-    from pop_fast.api.backend import get_backend
-
     config = TrainConfig(profile=profile, background=BACKGROUND)
     found = Passes.of(get_backend(backend), views(), config).contributions(raw_params(), 1, 2)
     drawn = render_view(get_backend(backend), raw_params(), views()[1], config, 2, dominance=True)
     torch.testing.assert_close(found.image, drawn.image, rtol=0.0, atol=1e-14)
     assert torch.equal(found.dominant_counts, drawn.info["dominant_counts"][0])
     assert torch.equal(found.radii, drawn.info["radii"][0])
-
-
-def test_pixels_that_the_mask_ignores_dominate_nothing() -> None:
-    masked = passes("fast").contributions(raw_params(), 1, 0)
-    mask = views()[1].mask
-    assert mask is not None
-    assert 0 < int(masked.dominant_counts.sum()) <= int(mask.sum())
+    assert not bool(found.map_sum.any())
 
 
 def test_a_map_may_be_made_of_the_image() -> None:
@@ -154,55 +145,6 @@ def test_a_map_may_be_made_of_the_image() -> None:
     found = made.contributions(raw_params(), 0, 3, lambda image: pixel_weights(image, made.photo(0)))
     assert float(expected.map_sum.max()) > 0.0
     assert torch.equal(found.map_sum, expected.map_sum)
-
-
-def test_a_smaller_view_keeps_the_field_of_view() -> None:
-    shot = passes("fast")._shot(raw_params(), 0, 3, divisor=4)
-    camera, K = shot.camera, views()[0].K[0]
-    assert (camera.width, camera.height) == (10, 6)
-    for at, small, large in ((0, camera.width, WIDTH), (1, camera.height, HEIGHT)):
-        torch.testing.assert_close(small / camera.K[at, at], large / K[at, at])
-        torch.testing.assert_close(camera.K[at, 2] / small, K[at, 2] / large)
-
-
-def test_fisher_blocks_are_sums_of_outer_products_of_derivatives() -> None:
-    # by differences of the oracle's images, a pixel and a channel at a time
-    from pop_ref.render import render
-
-    made = passes("fast")
-    shot = made._shot(raw_params(12), 0, 2, divisor=4)
-    g, c = shot.gaussians, shot.camera
-    arrays = [t.numpy() for t in (g.means, g.quats, g.scales, g.opacities, g.sh)]
-    camera = Camera(c.viewmat.numpy(), c.K.numpy(), c.width, c.height)
-
-    def drawn(i: int, k: int, step: float) -> np.ndarray:
-        means, scales = arrays[0].copy(), arrays[2].copy()
-        if k < 3:
-            means[i, k] += step
-        else:
-            scales[i, k - 3] *= np.exp(step)
-        moved = Gaussians(means, arrays[1], scales, *arrays[3:])
-        return render(moved, camera, background=np.array(BACKGROUND), sh_degree=2).image
-
-    found = made.fisher(raw_params(12), 0, 2).numpy()
-    i = int(np.argmax(np.linalg.norm(found, axis=(1, 2))))
-    step = 1e-5
-    slopes = np.stack([(drawn(i, k, step) - drawn(i, k, -step)).ravel() / (2.0 * step) for k in range(6)])
-    np.testing.assert_allclose(found[i], slopes @ slopes.T, rtol=1e-4, atol=1e-4 * np.max(np.abs(found[i])))
-
-
-def test_scores_of_blocks_are_the_oracles() -> None:
-    from pop_fast.stages.contributions import log_det_scores as in_torch
-
-    made = passes("fast")
-    one = made.fisher(raw_params(), 0, 3)
-    both = one + made.fisher(raw_params(), 1, 3)
-    both[5] = 0.0
-    expected, found = log_det_scores(both.numpy()), in_torch(both).numpy()
-    assert np.isneginf(expected[5])
-    assert np.array_equal(np.isneginf(found), np.isneginf(expected))
-    assert int(np.isfinite(expected).sum()) > 20
-    np.testing.assert_allclose(found[np.isfinite(expected)], expected[np.isfinite(expected)], atol=1e-6)
 
 
 def test_what_cannot_be_is_said() -> None:

@@ -2,6 +2,21 @@
 
 from __future__ import annotations
 
-from tests.judged import LAW_MODULES, law_classes
+from collections.abc import Iterator
+
+import pytest
+
+pytest.register_assert_rewrite("pop_ref.conformance.laws")
+
+from pop_ref.conformance.poison import poisoned_allocations  # noqa: E402  asserts must be rewritten first
+
+from tests.judged import LAW_MODULES, judge_own_backends, law_classes  # noqa: E402
 
 globals().update(law_classes(LAW_MODULES))
+pytest_generate_tests = judge_own_backends
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _allocations_are_poisoned() -> Iterator[None]:
+    with poisoned_allocations("pop_fast"):
+        yield

@@ -125,7 +125,7 @@ FUNCTIONS = public_functions()
 
 STEP = "gradients:a_step_along_any_direction_changes_the_image_as_the_gradient_says"
 FLOOR_MARGIN = "test_margins.test_d5_is_near_where_alpha_is_next_to_the_floor"
-SCHEDULE = "test_density.test_schedule_has_144_densification_steps_41_with_blur_and_4_resets"
+SCHEDULE = "test_training.test_schedule_has_144_densification_steps_41_with_blur_and_4_resets"
 VISIBLE = "density:the_density_statistic_averages_ndc_gradients_over_the_views_that_showed_the_gaussian"
 OUTCOME = "thresholds:at_a_depth_tie_the_order_is_one_of_the_two_and_by_index_where_the_tie_is_exact"
 IMPORTANCE = "selection:importance_is_weight_indoors_and_weight_a_pixel_for_who_dominates_outdoors"
@@ -255,25 +255,25 @@ LAWS = {
     "tiles.tile_lists": "tiles:lists_run_front_to_back_and_equal_depths_keep_index_order",
 }
 TESTS = {
-    "optimizer.is_updated": "test_density.test_a_step_that_edits_the_population_moves_nothing_in_inrias_loop",
-    "optimizer.update_numbers": "test_density.test_taming_moves_upper_bands_each_16_steps_and_opacities_until_15_000",
+    "optimizer.is_updated": "test_training.test_a_step_that_edits_the_population_moves_nothing_in_inrias_loop",
+    "optimizer.update_numbers": "test_training.test_taming_moves_upper_bands_each_16_steps_and_opacities_until_15_000",
     "harmonics.lower_degree": (
         "test_projection.test_a_lower_degree_loses_least_where_views_show_it_and_little_elsewhere"
     ),
     "taming.taming_scores": "test_methods.test_scores_of_a_population_add_over_views_that_are_rendered_and_weighed",
     "fisher.screen_moments": "test_methods.test_the_view_direction_counts_and_channels_do_not_leak_into_each_other",
     "fisher.fisher_blocks": "test_methods.test_the_view_direction_counts_and_channels_do_not_leak_into_each_other",
-    "density.densifies_at": SCHEDULE,
-    "density.resets_at": SCHEDULE,
-    "density.blurs_at": "test_density.test_split_only_blur_splits_small_ones_and_may_clone_them_as_well",
-    "appearance.expose": "test_appearance.test_an_exposure_mixes_channels_row_by_row",
-    "appearance.centred_exposures": "test_appearance.test_centred_exposures_have_the_identity_as_mean",
-    "appearance.color_correct": "test_appearance.test_correction_takes_back_gain_and_offset_by_channel",
-    "appearance.over_background": "test_appearance.test_a_photograph_over_another_background_is_as_if_laid_over_it",
-    "appearance.background_at": "test_appearance.test_the_stream_is_splitmix64_by_its_published_numbers",
-    "refinement.rotmat_from_vector": "test_appearance.test_a_rotation_is_the_exponential_of_its_generator",
-    "refinement.without_common_motion": "test_appearance.test_what_is_taken_out_is_orthogonal_to_what_is_left",
-    "refinement.refined_viewmat": "test_appearance.test_a_corrected_camera_is_rigid_and_moves_points_in_its_own_axes",
+    "density_config.densifies_at": SCHEDULE,
+    "density_config.resets_at": SCHEDULE,
+    "density_config.blurs_at": "test_training.test_split_only_blur_splits_small_ones_and_may_clone_them_as_well",
+    "appearance.expose": "test_losses.test_an_exposure_mixes_channels_row_by_row",
+    "appearance.centred_exposures": "test_losses.test_centred_exposures_have_the_identity_as_mean",
+    "appearance.color_correct": "test_losses.test_correction_takes_back_gain_and_offset_by_channel",
+    "appearance.over_background": "test_losses.test_a_photograph_over_another_background_is_as_if_laid_over_it",
+    "appearance.background_at": "test_losses.test_the_stream_is_splitmix64_by_its_published_numbers",
+    "refinement.rotmat_from_vector": "test_losses.test_a_rotation_is_the_exponential_of_its_generator",
+    "refinement.without_common_motion": "test_losses.test_what_is_taken_out_is_orthogonal_to_what_is_left",
+    "refinement.refined_viewmat": "test_losses.test_a_corrected_camera_is_rigid_and_moves_points_in_its_own_axes",
     "regularizers.depth_samples": "test_losses.test_samples_are_the_points_that_a_camera_shows_where_it_shows_them",
     "regularizers.sparse_depth_loss": "test_losses.test_depth_at_points_is_interpolated_and_compared_inverse",
     "regularizers.mean_activation": "test_losses.test_means_of_activations_are_numpys_and_none_is_zero",

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pop_ref import INRIA, PAPER, PROFILES, Gaussians, Profile, margins, render
+from pop_ref import INRIA, PAPER, PROFILES, Camera, Gaussians, Profile, margins, render
 from pop_ref.alpha import sigma_at_pixel
 from pop_ref.ambiguities import AMBIGUITIES, Ambiguity
 from pop_ref.conformance import thresholds as threshold_strategies
@@ -26,8 +26,7 @@ from pop_ref.magnitudes import Rounded, splat_magnitudes
 from pop_ref.margins import Margins
 from pop_ref.recipes import Recipe
 from pop_ref.splatting import geometry
-from tests.oracle.dense import dense_render
-from tests.oracle.scenes import camera, dyadic_camera, grey, random_gaussians, tilted_camera
+from tests.oracle.scenes import camera, dense_render, dyadic_camera, grey, random_gaussians, tilted_camera
 
 EPS32 = 2.0**-24
 TINY = 1e-9
@@ -106,11 +105,15 @@ def test_d4_is_infinite_for_coincident_copies_and_for_exact_ties() -> None:
     assert math.isinf(margins(grey([0.5, 0.5], means=means), dyadic_camera(3, 3)).gaussians["D4"][0])
 
 
+def rolled(view: Camera, centre: np.ndarray) -> Camera:
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = [[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]], centre
+    return replace(view, viewmat=viewmat)
+
+
 def test_d4_is_zero_for_a_tie_of_different_centres_that_rounding_may_break() -> None:
     means = [[0.1, 0.0, 4.1], [0.0, 0.1, 4.1]]
-    rolled = tilted_camera().viewmat
-    rolled[:3, :3] = [[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]]
-    view = replace(camera(), viewmat=rolled)
+    view = rolled(camera(), tilted_camera().viewmat[:3, 3])
     assert margins(grey([0.5, 0.5], means=means), view).gaussians["D4"][0] == 0.0
 
 
@@ -121,12 +124,7 @@ def test_d5_is_near_where_alpha_is_next_to_the_floor() -> None:
     assert got.pixels["D5"][1, 0] < 1e-7
     assert got.pixels["D5"][1, 1] > 1e-3
     aimed = [close.where for close in got.near_threshold(1e-7) if close.decision == "D5"]
-    assert aimed == [(1, 0, 0), (0, 1, 0), (2, 1, 0), (1, 2, 0)] or sorted(aimed) == [
-        (0, 1, 0),
-        (1, 0, 0),
-        (1, 2, 0),
-        (2, 1, 0),
-    ]
+    assert sorted(aimed) == [(0, 1, 0), (1, 0, 0), (1, 2, 0), (2, 1, 0)]
     assert np.argwhere(~got.safe_pixels(1e-7)).tolist() == [[0, 1], [1, 0], [1, 2], [2, 1]]
 
 
@@ -272,9 +270,7 @@ def test_rounded_numbers_inherit_errors_as_their_derivatives_say() -> None:
 def test_d4_touches_the_pixels_that_see_both_splats_and_not_those_that_stopped_before() -> None:
     # an inexact tie behind one opaque splat (the pixel continues) and behind two (it stops)
     tied = [[0.0, 0.1, 4.1], [0.1, 0.0, 4.1]]
-    rolled = camera().viewmat.copy()
-    rolled[:3, :3] = [[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0], [0.0, 0.0, 1.0]]
-    view = replace(dyadic_camera(3, 3), viewmat=rolled)
+    view = rolled(dyadic_camera(3, 3), np.zeros(3))
     front = [[0.0, 0.0, 1.0], [0.0, 0.0, 2.0], [0.0, 0.0, 3.0]]
     goes_on = margins(grey([1.0, 0.5, 0.5], means=front[:1] + tied, scale=8.0), view)
     assert np.all(goes_on.pixels["D4"] == 0.0)
@@ -337,7 +333,6 @@ def test_of_a_gaussian_too_large_for_numbers_nothing_is_sure(power: int, profile
 # The table of open questions against the code: every place exists and says so, every alternative can be chosen.
 
 SETTINGS = {"Recipe": Recipe(), "DensityConfig": DensityConfig()}
-by_id = pytest.mark.parametrize("ambiguity", AMBIGUITIES, ids=lambda a: a.id)
 
 
 def source_of(where: str) -> str:
@@ -358,18 +353,10 @@ def test_there_are_32_questions_in_order() -> None:
     assert [a.id for a in AMBIGUITIES] == [f"A{k}" for k in range(1, 33)]
 
 
-@by_id
-def test_the_place_that_decides_exists_and_names_the_question(ambiguity: Ambiguity) -> None:
+@pytest.mark.parametrize("ambiguity", AMBIGUITIES, ids=lambda a: a.id)
+def test_a_question_has_a_place_that_names_it_and_alternatives_that_are_settings(ambiguity: Ambiguity) -> None:
     assert (ambiguity.mark or ambiguity.id) in source_of(ambiguity.where)
-
-
-@by_id
-def test_a_question_that_matters_can_be_answered_otherwise(ambiguity: Ambiguity) -> None:
     assert ambiguity.alternatives or ambiguity.impact != "H"
-
-
-@by_id
-def test_every_alternative_is_a_setting_with_another_default(ambiguity: Ambiguity) -> None:
     for alternative in ambiguity.alternatives:
         setting, _, text = alternative.partition(" = ")
         owner, name = setting.split(".")

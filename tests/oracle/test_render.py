@@ -1,19 +1,50 @@
-"""The whole oracle against a renderer without tiles, and at the edges of its domain."""
+"""Whole renders against one without tiles, pixels against exact rationals, maps against lists of what is blended."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
-from pop_ref import GSPLAT_1_6, INRIA, PAPER, Camera, Profile, margins, render
+from pop_ref import (
+    GSPLAT_1_5,
+    GSPLAT_1_6,
+    INRIA,
+    PAPER,
+    SPEEDY_SPLAT,
+    Camera,
+    Gaussians,
+    Profile,
+    Splats,
+    dominance,
+    margins,
+    render,
+    tiles,
+)
+from pop_ref.chord import chord_midpoint, dominant_points
+from pop_ref.compositing import composite, composite_vjp
+from pop_ref.contributions import contributions
+from pop_ref.depth import expected_depth, expected_depth_vjp, with_depth_channel
+from pop_ref.pixel import Pixel, SplatRows, composite_pixel, composite_pixel_vjp, stops, zero_gradients
 from pop_ref.splatting import geometry
-from tests.oracle.dense import dense_render
-from tests.oracle.scenes import camera, dyadic_camera, grey, random_gaussians, tilted_camera
+from pop_ref.tight_tiles import accutile, tight_tile_lists
+from pop_ref.tiles import tile_rects
+from tests.oracle.scenes import (
+    blended_pixels,
+    camera,
+    dense_render,
+    dyadic_camera,
+    grey,
+    random_gaussians,
+    rotations,
+    safe_gaussians,
+    tilted_camera,
+)
 
 BACKGROUND = np.array([0.5, 0.25, 1.0])
 
@@ -30,17 +61,6 @@ def test_a_render_equals_one_without_tiles(seed: int, n: int, profile: Profile, 
     assert np.mean(safe) > 0.99
     assert np.array_equal(got.dominant_ids[safe], want.dominant_ids[safe])
     assert np.array_equal(got.n_blended[safe], want.n_blended[safe])
-
-
-@given(st.integers(0, 10**6), st.sampled_from([PAPER, GSPLAT_1_6]))
-def test_any_tile_size_gives_the_same_bits(seed: int, profile: Profile) -> None:
-    gaussians, view = random_gaussians(seed, 8), tilted_camera(11, 9)
-    whole = render(gaussians, view, BACKGROUND, profile=profile, tile_size=16)
-    for tile_size in (1, 4):
-        tiled = render(gaussians, view, BACKGROUND, profile=profile, tile_size=tile_size)
-        for name in ("image", "T_final", "dominant_ids", "dominant_weights", "dominant_counts", "n_blended"):
-            assert np.array_equal(getattr(tiled, name), getattr(whole, name)), name
-        assert np.all(tiled.n_traversed <= whole.n_traversed)
 
 
 def test_inria_s_tile_grid_is_part_of_its_meaning() -> None:
@@ -61,54 +81,6 @@ def test_inria_s_cull_reads_the_tile_grid_that_is_asked_for() -> None:
     assert not render(gaussians, view, profile=INRIA, tile_size=4).splats.visible[0]
 
 
-def test_one_pixel_sees_a_gaussian_at_its_centre_at_its_opacity() -> None:
-    out = render(grey([0.5]), dyadic_camera(1, 1), background=np.array([0.0, 1.0, 2.0]))
-    assert out.image.tolist() == [[[0.25, 0.75, 1.25]]]
-    assert out.T_final.tolist() == [[0.5]]
-    assert out.dominant_ids.tolist() == [[0]]
-    assert out.dominant_counts.tolist() == [1]
-
-
-def test_in_inria_an_opacity_under_the_floor_is_listed_but_never_blended() -> None:
-    out = render(grey([1.0 / 512.0]), dyadic_camera(1, 1), profile=INRIA)
-    assert out.splats.visible[0]
-    assert (out.n_traversed[0, 0], out.n_blended[0, 0]) == (1, 0)
-
-
-def test_an_opacity_of_one_leaves_a_thousandth() -> None:
-    out = render(grey([1.0]), dyadic_camera(1, 1))
-    assert out.dominant_weights[0, 0] == 0.999
-    np.testing.assert_allclose(out.T_final[0, 0], 1e-3, rtol=1e-12)
-
-
-def test_of_coincident_opaque_copies_only_the_front_one_is_drawn() -> None:
-    out = render(grey([1.0] * 4), dyadic_camera(3, 3))
-    assert (out.n_blended[1, 1], out.n_traversed[1, 1]) == (1, 2)
-    # every pixel goes to the copy of lowest index, however faint it is there
-    assert out.dominant_counts.tolist() == [9, 0, 0, 0]
-
-
-def test_a_gaussian_behind_the_camera_is_not_drawn_however_large() -> None:
-    out = render(grey([1.0, 1.0], means=[[0.0, 0.0, -1.0], [0.0, 0.0, 0.0]], scale=100.0), dyadic_camera(3, 3))
-    assert np.all(out.T_final == 1.0)
-    assert not np.any(out.splats.visible)
-
-
-def test_a_gaussian_straddling_the_near_plane_is_kept_or_culled_whole_by_its_centre() -> None:
-    near = PAPER.near_plane
-    for z, kept in ((near, True), (math.nextafter(near, 0.0), False)):
-        out = render(grey([0.5], means=[[0.0, 0.0, z]], scale=1.0), dyadic_camera(3, 3))
-        assert bool(out.splats.visible[0]) is kept
-        assert np.all(np.isfinite(out.image))
-        assert np.all((out.T_final < 1.0) == kept)
-
-
-def test_a_huge_gaussian_covers_every_pixel_alike() -> None:
-    out = render(grey([0.5], scale=1e6), dyadic_camera(5, 5))
-    np.testing.assert_allclose(out.T_final, 0.5, rtol=1e-9)
-    assert out.dominant_counts.tolist() == [25]
-
-
 def test_a_needle_so_long_that_its_determinant_is_lost_is_culled_without_a_warning() -> None:
     n_culled = 0
     for quat in ([1.0, 0.1, 0.2, 0.3], [4.0, 0.0, 0.0, 1.0], [3.0, 0.0, 0.0, 2.0], [1.0, 0.2, 0.1, 0.4]):
@@ -120,21 +92,6 @@ def test_a_needle_so_long_that_its_determinant_is_lost_is_culled_without_a_warni
         assert np.all((out.T_final == 1.0) | out.splats.visible[0])
         n_culled += not out.splats.visible[0]
     assert n_culled > 0
-
-
-def test_a_needle_is_as_thin_as_the_low_pass_and_as_long_as_itself() -> None:
-    needle = replace(grey([1.0]), scales=np.array([[64.0, 0.0, 0.0]]))
-    out = render(needle, dyadic_camera(9, 9))
-    np.testing.assert_allclose(out.splats.conics[0], [1.0 / (4096.0 + 0.3), 0.0, 1.0 / 0.3], rtol=1e-12)
-    assert np.all(out.n_blended[4] == 1)
-    # exp(-d^2 / 0.6) falls under 1/255 between 1 and 2 px
-    assert out.n_blended[:, 4].tolist() == [0, 0, 0, 1, 1, 1, 0, 0, 0]
-
-
-def test_a_gaussian_of_no_size_is_the_low_pass_itself() -> None:
-    out = render(grey([1.0], scale=0.0), dyadic_camera(5, 5))
-    np.testing.assert_allclose(out.splats.conics[0], [1.0 / 0.3, 0.0, 1.0 / 0.3], rtol=1e-14)
-    assert np.sum(out.n_blended) == 9
 
 
 def test_antialiased_mode_dims_small_splats_by_the_energy_they_gained() -> None:
@@ -162,18 +119,300 @@ def test_a_degree_beyond_the_coefficients_is_refused() -> None:
         render(random_gaussians(0), tilted_camera(), sh_degree=3)
 
 
-def test_renders_are_values_that_repeat_bit_for_bit_and_leave_their_arguments_alone() -> None:
+def test_a_render_leaves_its_arguments_alone() -> None:
     gaussians, view = random_gaussians(6, 8), tilted_camera()
-    before = [a.copy() for a in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)]
-    one, two = render(gaussians, view, BACKGROUND), render(gaussians, view, BACKGROUND)
-    assert np.array_equal(one.image, two.image)
-    after = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
-    assert all(np.array_equal(a, b) for a, b in zip(before, after, strict=True))
+    before = {name: array.copy() for name, array in vars(gaussians).items()}
+    render(gaussians, view, BACKGROUND)
+    assert all(np.array_equal(array, before[name]) for name, array in vars(gaussians).items())
 
 
-def test_a_camera_inside_the_cloud_renders_without_a_warning() -> None:
-    gaussians = replace(random_gaussians(7, 12), means=np.random.default_rng(7).normal(size=(12, 3)))
-    view = Camera(np.eye(4), camera().K, 6, 5)
-    out = render(gaussians, view)
-    assert 0 < np.sum(out.splats.visible) < 12
-    assert np.all(np.isfinite(out.image))
+# Blending against exact rationals: every equality is decided as the profile says.
+
+# floats hold every sum and product below exactly, so that the comparison is too
+DYADIC = replace(PAPER, alpha_floor=1 / 8, alpha_ceiling=7 / 8, transmittance_stop=1 / 64)
+DYADIC_STRICT = replace(DYADIC, stop_inclusive=False, ceiling_gradient="pass")
+NO_STOP = replace(DYADIC, transmittance_stop=-1.0)
+
+eighths = st.integers(0, 8).map(lambda k: k / 8.0)
+stacks = st.lists(st.tuples(eighths, st.integers(-4, 4).map(float)), max_size=7)
+backgrounds = st.integers(-4, 4).map(float)
+profiles = st.sampled_from([DYADIC, DYADIC_STRICT, NO_STOP])
+
+
+def blend(stack: list[tuple[float, float]], background: float, profile: Profile) -> tuple[Pixel, SplatRows]:
+    """Blend splats that all sit on the pixel's centre, where exp(-sigma) = 1 and alpha is the opacity."""
+    n = len(stack)
+    rows = SplatRows([[0.5, 0.5]] * n, [[1.0, 0.0, 1.0]] * n, [o for o, _ in stack], [[c] for _, c in stack])
+    return composite_pixel(range(n), rows, 0.5, 0.5, [background], profile), rows
+
+
+class Exact:
+    """The same pixel from the definition, in rationals: which splats take part, prefix products, first stop, sums."""
+
+    def __init__(self, stack: list[tuple[float, float]], background: float, profile: Profile) -> None:
+        floor, ceiling, stop = map(Fraction, (profile.alpha_floor, profile.alpha_ceiling, profile.transmittance_stop))
+        part = [i for i, (o, _) in enumerate(stack) if Fraction(o) >= floor]
+        alphas = [min(Fraction(stack[i][0]), ceiling) for i in part]
+        T = [math.prod((1 - a for a in alphas[:k]), start=Fraction(1)) for k in range(len(part) + 1)]
+        ends = [k for k in range(len(part)) if T[k + 1] < stop or (profile.stop_inclusive and T[k + 1] == stop)]
+        m = ends[0] if ends else len(part)
+        self.ids, self.alphas, self.T = part[:m], alphas[:m], T[: m + 1]
+        self.n_traversed = part[m] + 1 if ends else len(stack)
+        self.colors = [Fraction(stack[i][1]) for i in self.ids]
+        self.background = Fraction(background)
+        weighted = [t * a * c for t, a, c in zip(self.T, self.alphas, self.colors, strict=False)]
+        self.color = sum(weighted, start=self.T[m] * self.background)
+
+    def gradient_of_alpha(self, k: int) -> Fraction:
+        """Differentiate by alpha_k as the papers write it, with the division by 1 - alpha_k."""
+        behind = self.T[-1] * self.background
+        for j in range(k + 1, len(self.ids)):
+            behind += self.T[j] * self.alphas[j] * self.colors[j]
+        return self.T[k] * self.colors[k] - behind / (1 - self.alphas[k])
+
+
+# T: 1, 1/8, then 1/64, which is the stop itself
+AT_THE_STOP = [(7 / 8, 1.0), (1 / 16, 3.0), (7 / 8, 2.0), (1 / 2, 4.0)]
+
+
+@given(stacks, backgrounds, profiles)
+@example(AT_THE_STOP, 1.0, DYADIC)
+@example(AT_THE_STOP, 1.0, DYADIC_STRICT)
+def test_a_pixel_equals_the_exact_rational_one(
+    stack: list[tuple[float, float]], background: float, profile: Profile
+) -> None:
+    pixel, _ = blend(stack, background, profile)
+    exact = Exact(stack, background, profile)
+    assert pixel.ids == exact.ids
+    assert pixel.n_traversed == exact.n_traversed
+    assert Fraction(pixel.T_final) == exact.T[-1]
+    assert [Fraction(a) for a in pixel.alphas] == exact.alphas
+    assert [Fraction(t) for t in pixel.transmittances] == exact.T[:-1]
+    assert Fraction(pixel.color[0]) == exact.color
+
+
+@given(stacks, backgrounds, profiles)
+def test_a_pixel_s_gradient_equals_the_exact_rational_one(
+    stack: list[tuple[float, float]], background: float, profile: Profile
+) -> None:
+    pixel, rows = blend(stack, background, profile)
+    exact = Exact(stack, background, profile)
+    totals = zero_gradients(len(stack), 1)
+    composite_pixel_vjp(pixel, rows, 0.5, 0.5, [background], [1.0], 0.0, totals, profile)
+    for k, i in enumerate(exact.ids):
+        passes = Fraction(stack[i][0]) <= Fraction(profile.alpha_ceiling) or profile.ceiling_gradient == "pass"
+        assert Fraction(totals.v_opacities[i]) == (exact.gradient_of_alpha(k) if passes else 0)
+        assert Fraction(totals.v_colors[i, 0]) == exact.T[k] * exact.alphas[k]
+    others = [i for i in range(len(stack)) if i not in exact.ids]
+    assert np.all(totals.v_opacities[others] == 0.0)
+    assert Fraction(totals.v_background[0]) == exact.T[-1]
+
+
+@pytest.mark.parametrize(("profile", "left"), [(PAPER, 1e-3), (GSPLAT_1_5, 1e-3), (GSPLAT_1_6, 1e-2), (INRIA, 1e-2)])
+def test_the_second_of_two_opaque_splats_ends_the_pixel_unblended(profile: Profile, left: float) -> None:
+    pixel, _ = blend([(1.0, 1.0), (1.0, 1.0), (1.0, 1.0)], 0.0, profile)
+    assert (pixel.ids, pixel.n_traversed) == ([0], 2)
+    np.testing.assert_allclose(pixel.T_final, left, rtol=1e-6)
+    # float32 kernels decide the same
+    T = np.float32(1.0) - np.float32(profile.alpha_ceiling)
+    assert stops(float(T * T), profile)
+    assert not stops(float(T), profile)
+
+
+def one_splat() -> Splats:
+    return Splats(
+        means2d=np.array([[0.5, 0.5]]),
+        depths=np.array([1.0]),
+        conics=np.array([[1.0, 0.0, 1.0]]),
+        opacities=np.array([0.5]),
+        colors=np.array([[1.0, 2.0]]),
+        radii=np.array([[3, 3]]),
+    )
+
+
+def test_a_pixel_outside_every_list_is_the_background() -> None:
+    out = composite(one_splat(), [[0], []], 4, 2, 2, np.array([3.0, 5.0]))
+    assert out.image[0, 0].tolist() == [2.0, 3.5]
+    assert np.all(out.image[:, 2:] == [3.0, 5.0])
+    assert np.all(out.T_final[:, 2:] == 1.0)
+    assert np.all(out.dominant_ids[:, 2:] == -1)
+    assert np.all(out.dominant_weights[:, 2:] == 0.0)
+    assert np.all(out.n_blended[:, 2:] == 0)
+    assert np.all(out.n_traversed[:, 2:] == 0)
+
+
+def test_lists_and_backgrounds_that_do_not_fit_are_refused() -> None:
+    with pytest.raises(ValueError, match="lists has 1 tiles; 4 x 2 px in 2 px tiles need 2"):
+        composite(one_splat(), [[0]], 4, 2, 2)
+    with pytest.raises(ValueError, match=r"background has shape \[3\]; it must be \[2\]"):
+        composite(one_splat(), [[0], []], 4, 2, 2, np.zeros(3))
+    with pytest.raises(ValueError, match="lists has 1 tiles"):
+        composite_vjp(one_splat(), [[0]], 4, 2, 2, np.zeros((2, 4, 2)))
+
+
+def test_a_weight_of_zero_never_wins() -> None:
+    assert dominance.dominant_id([3, 4], [0.0, 0.0]) == -1
+
+
+# The depth modes: by hand for one splat, and as a colour channel that holds depths.
+
+VIEW = tilted_camera()
+
+
+def test_one_splat_accumulates_its_depth_times_its_alpha_and_is_expected_at_its_depth() -> None:
+    g = Gaussians([[0, 0, 4]], [[1, 0, 0, 0]], [[1, 1, 1]], [0.5], [[[0, 0, 0]]])
+    camera = Camera(np.eye(4), np.array([[8.0, 0.0, 0.5], [0.0, 8.0, 0.5], [0.0, 0.0, 1.0]]), 1, 1)
+    seen = {mode: render(g, camera, np.ones(3), render_mode=mode).image[0, 0].tolist() for mode in ("D", "RGB+ED")}
+    assert seen == {"D": [2.0], "RGB+ED": [0.75, 0.75, 0.75, 4.0]}
+
+
+def test_the_accumulated_depth_is_a_colour_that_holds_depths() -> None:
+    g = safe_gaussians(VIEW)
+    plain = render(g, VIEW)
+    as_colour = render(g, VIEW, colors=plain.splats.depths[:, None])
+    both = render(g, VIEW, np.ones(3), render_mode="RGB+D")
+    np.testing.assert_array_equal(both.image[..., 3:], as_colour.image)
+    np.testing.assert_array_equal(both.image[..., :3], render(g, VIEW, np.ones(3)).image)
+    np.testing.assert_array_equal(render(g, VIEW, np.ones(3), render_mode="D").image, as_colour.image)
+    assert both.splats.colors.shape[1] == 3
+
+
+def test_an_empty_pixel_has_no_depth_and_passes_none_to_its_opacity() -> None:
+    empty = np.zeros((1, 1)), np.ones((1, 1))
+    assert expected_depth(*empty).item() == 0.0
+    assert [v.item() for v in expected_depth_vjp(*empty, np.ones((1, 1)))] == [1e10, 0.0]
+
+
+def test_a_mode_that_is_none_and_a_background_with_depth_are_refused() -> None:
+    g = safe_gaussians(VIEW)
+    with pytest.raises(ValueError, match="render_mode is 'depth'; it must be one of RGB, D, ED, RGB\\+D, RGB\\+ED"):
+        with_depth_channel(render(g, VIEW).splats, "depth")
+    with pytest.raises(ValueError, match=r"background has shape \[4\]; it must be \[3\]"):
+        render(g, VIEW, np.ones(4), render_mode="RGB+D")
+
+
+# Contributions against lists of what each pixel blends, made from the definition.
+
+TILE = 4
+
+
+@pytest.mark.parametrize("profile", [PAPER, INRIA, SPEEDY_SPLAT], ids=lambda p: p.name)
+@pytest.mark.parametrize("view", [camera(), tilted_camera(9, 7)], ids=["straight", "tilted"])
+def test_the_sums_are_those_over_every_pixels_list(profile: Profile, view) -> None:
+    gaussians = random_gaussians(5, 12)
+    drawn = render(gaussians, view, profile=profile, tile_size=TILE)
+    shown = np.random.default_rng(0).uniform(size=drawn.T_final.shape)
+    n = len(gaussians)
+    weights, counts, of_map, distances = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    for (x, y), blended in blended_pixels(drawn, TILE, profile).items():
+        for i, T, a in blended:
+            weights[i] += T * a
+            counts[i] += 1
+            of_map[i] += shown[y, x]
+            distances[i] += np.linalg.norm(np.array([x + 0.5, y + 0.5]) - drawn.splats.means2d[i])
+    found = contributions(drawn.splats, drawn.tile_lists, view.width, view.height, TILE, shown, profile)
+    assert np.sum(counts) > 20
+    assert found.n_pixels.tolist() == counts.tolist()
+    for have, want in ((found.weight_sum, weights), (found.map_sum, of_map), (found.distance_sum, distances)):
+        np.testing.assert_allclose(have, want, rtol=1e-12)
+
+
+def test_without_a_map_its_sum_is_zero_and_a_terminating_splat_is_not_counted() -> None:
+    # under 0.999 twice nothing would be left: the second ends the pixel and the third is never reached
+    drawn = render(grey([1.0, 1.0, 0.5]), dyadic_camera(1, 1))
+    found = contributions(drawn.splats, drawn.tile_lists, 1, 1, 16)
+    assert found.n_pixels.tolist() == [1, 0, 0]
+    assert found.weight_sum.tolist() == [PAPER.alpha_ceiling, 0.0, 0.0]
+    assert found.map_sum.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_a_map_of_another_size_is_told() -> None:
+    drawn = render(grey([0.5]), dyadic_camera(3, 2))
+    with pytest.raises(ValueError, match=r"pixel_map has shape \[3, 2\]; it must be \[2, 3\]"):
+        contributions(drawn.splats, drawn.tile_lists, 3, 2, 16, np.zeros((3, 2)))
+
+
+def test_a_tile_size_of_zero_is_refused() -> None:
+    with pytest.raises(ValueError, match="tile_size is 0; it must be >= 1"):
+        tiles.grid_size(4, 4, 0)
+
+
+def test_a_conic_that_vanished_is_everywhere_and_an_ellipse_that_is_a_point_in_its_tile() -> None:
+    assert len(accutile(np.array([9.0, 9.0]), np.zeros(3), 1.0, (1, 1, 3, 4), 4)) == 6
+    # at the floor itself nothing but the centre is left; in profile inria it is listed, and blended at the centre
+    round_ = np.array([1.0, 0.0, 1.0])
+    assert accutile(np.array([9.5, 6.5]), round_, INRIA.alpha_floor, (0, 0, 4, 4), 4, INRIA) == [(2, 1)]
+
+
+def test_squares_cut_the_ellipse_off() -> None:
+    # at o = 1 the ellipse reaches 3.33 standard deviations and Inria's square 3: its tiles are those of both
+    means2d, conics, opacities = np.array([[10.0, 10.0]]), np.array([[1 / 9.0, 0.0, 1 / 9.0]]), np.ones(1)
+    radii, depths = np.array([[9, 9]]), np.ones(1)
+    tight = tight_tile_lists(means2d, conics, opacities, radii, depths, 20, 20, 1, INRIA)
+    rect = tuple(tile_rects(means2d, radii, 20, 20, 1, INRIA)[0].tolist())
+    ellipse = set(accutile(means2d[0], conics[0], 1.0, (0, 0, 20, 20), 1, INRIA))
+    square = {(x, y) for x in range(rect[0], rect[2]) for y in range(rect[1], rect[3])}
+    listed = {(k % 20, k // 20) for k, ids in enumerate(tight) if ids}
+    assert listed == ellipse & square
+    assert ellipse - square
+    assert square - ellipse
+
+
+# Points on rays, each pixel by its list.
+
+
+def test_a_scale_of_zero_is_told() -> None:
+    with pytest.raises(ValueError, match=r"scale is \[1.0, 0.0, 1.0\]; each must be > 0"):
+        chord_midpoint(np.zeros(3), np.ones(4), np.array([1.0, 0.0, 1.0]), np.zeros(3), np.ones(3))
+
+
+def points_by_list(gaussians: Gaussians, view: Camera, profile: Profile, tile_size: int):
+    """Make the three maps pixel by pixel, rays by inverting the whole projection."""
+    drawn = render(gaussians, view, profile=profile, tile_size=tile_size)
+    shape = drawn.T_final.shape
+    points, ids, T_final = np.zeros((*shape, 3)), np.full(shape, -1), np.ones(shape)
+    K = view.K.copy()
+    if profile.principal_point == "centred":
+        K[:2, 2] = 0.5 * view.width, 0.5 * view.height
+    to_world = np.linalg.inv(view.viewmat)
+    origin = to_world[:3, 3]
+    R = rotations(gaussians.quats)
+    for (x, y), blended in blended_pixels(drawn, tile_size, profile).items():
+        end = to_world @ np.append(np.linalg.solve(K, [x + 0.5, y + 0.5, 1.0]), 1.0)
+        direction = (end[:3] - origin) / np.linalg.norm(end[:3] - origin)
+        best = 0.0
+        for i, T, alpha in blended:
+            precision = R[i] @ np.diag(gaussians.scales[i] ** -2.0) @ R[i].T
+            t = direction @ precision @ (gaussians.means[i] - origin) / (direction @ precision @ direction)
+            T_final[y, x] *= 1.0 - alpha
+            if t >= 0.0 and T * alpha > best:
+                best, ids[y, x], points[y, x] = T * alpha, i, origin + t * direction
+    return drawn, points, ids, T_final
+
+
+@pytest.mark.parametrize("profile", [PAPER, INRIA], ids=lambda p: p.name)
+@pytest.mark.parametrize("view", [camera(), tilted_camera(9, 7)], ids=["straight", "tilted"])
+def test_each_pixel_has_the_point_of_its_heaviest_gaussian(profile: Profile, view: Camera) -> None:
+    gaussians = random_gaussians(5, 12)
+    drawn, points, ids, T_final = points_by_list(gaussians, view, profile, 4)
+    found = dominant_points(drawn.splats, drawn.tile_lists, gaussians, view, 4, profile)
+    assert len(set(ids.ravel().tolist())) > 3
+    assert np.array_equal(found.ids, ids)
+    np.testing.assert_allclose(found.points, points, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(found.T_final, drawn.T_final, rtol=0, atol=0)
+    np.testing.assert_allclose(found.T_final, T_final, rtol=1e-12)
+    if profile is PAPER:
+        # every Gaussian here is ahead of the camera, so that those who compete are those who dominate
+        assert np.array_equal(found.ids, drawn.dominant_ids)
+
+
+def test_a_flat_gaussian_does_not_compete_and_an_empty_pixel_has_no_point() -> None:
+    gaussians, view = grey([0.75, 0.25]), dyadic_camera(17, 1)
+    flat = replace(gaussians, scales=np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0]]))
+    drawn = render(flat, view)
+    found = dominant_points(drawn.splats, drawn.tile_lists, flat, view, 16)
+    assert drawn.dominant_ids[0, 8] == 0
+    assert found.ids[0, 8] == 1
+    assert found.ids[0, 0] == -1
+    assert found.points[0, 0].tolist() == [0.0, 0.0, 0.0]
+    assert found.T_final[0, 0] == 1.0

@@ -1,9 +1,8 @@
-"""Whole training steps: the loss falls, the ladder of ten losses stands, every recipe does what its name says."""
+"""Training: the ladder of ten losses stands, recipes and density control do what their names say, Adam is torch's."""
 
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -13,17 +12,42 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from pop_ref import density, losses
 from pop_ref.activations import opacities_from_logits, opacities_from_logits_vjp
 from pop_ref.ambiguities import AMBIGUITIES
+from pop_ref.conformance.backends import shipped
 from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER, Profile
-from pop_ref.optimizer import LEARNING_RATES, adam_step, learning_rates, means_learning_rate, sh_degree_at
+from pop_ref.density import (
+    GSPLAT,
+    POP,
+    Rows,
+    Statistics,
+    accumulate,
+    average_grads,
+    blurs_at,
+    densifies_at,
+    grow_masks,
+    resets_at,
+    rows_from_params,
+    split_rows,
+    zero_statistics,
+)
+from pop_ref.optimizer import (
+    LEARNING_RATES,
+    adam_step,
+    is_updated,
+    learning_rates,
+    means_learning_rate,
+    sh_degree_at,
+    update_numbers,
+)
 from pop_ref.polarization import pop_loss, pop_loss_vjp
-from pop_ref.recipes import L1_DIVIDED, RECIPES, Recipe
+from pop_ref.recipes import BASELINES, L1_DIVIDED, RECIPES, Recipe
 from pop_ref.records import Render
 from pop_ref.render import render, render_vjp
-from pop_ref.settings import LearningRates
+from pop_ref.settings import LearningRates, UpdateRules
 from pop_ref.training import Training, control, gaussians_from_params, objective, params_vjp, start, train_step, update
 from tests.golden import ten_losses
 
@@ -44,20 +68,10 @@ def trained(params: dict[str, np.ndarray], steps: int, recipe: Recipe) -> tuple[
     return state, losses
 
 
-def objective_at(step: int, recipe: Recipe, statistics: density.Statistics | None = None):
+def objective_at(step: int, recipe: Recipe):
     gaussians = gaussians_from_params(PARAMS)
     view = render(gaussians, CAMERAS[0])
-    state = replace(start(PARAMS), step=step)
-    state = state if statistics is None else replace(state, statistics=statistics)
-    return gaussians, view, objective(view, gaussians, PHOTOS[0], state, recipe)
-
-
-# the other recipes part from these two only later than step 30
-@pytest.mark.parametrize("name", ["POP", "3DGS"])
-def test_thirty_steps_lower_the_loss_of_every_view(name: str) -> None:
-    _, losses = trained(PARAMS, 30, RECIPES[name])
-    for view in range(3):
-        assert losses[27 + view] < 0.95 * losses[view]
+    return gaussians, view, objective(view, gaussians, PHOTOS[0], replace(start(PARAMS), step=step), recipe)
 
 
 def test_ten_losses_are_those_written_down() -> None:
@@ -116,13 +130,6 @@ def test_statistics_come_from_the_same_forward_pass_as_the_loss() -> None:
     assert np.any(state.statistics.grad_sum > 0.0)
 
 
-def test_bands_above_the_scheduled_degree_stay_untouched() -> None:
-    state, _ = trained(PARAMS, 4, replace(RECIPES["POP"], sh_interval=4))
-    assert np.array_equal(state.rows.params["shN"], PARAMS["shN"])
-    state, _ = train_step(state, CAMERAS[0], PHOTOS[0], 1.0, ten_losses.draws, replace(RECIPES["POP"], sh_interval=4))
-    assert not np.array_equal(state.rows.params["shN"], PARAMS["shN"])
-
-
 def test_pop_term_is_there_from_its_first_step_to_the_one_before_its_last() -> None:
     recipe = replace(RECIPES["POP"], pop_start_iter=3, pop_stop_iter=5)
     base = objective_at(2, recipe)[2]
@@ -133,31 +140,6 @@ def test_pop_term_is_there_from_its_first_step_to_the_one_before_its_last() -> N
         assert loss - base[0] == pytest.approx(there * 1e-3 * pop_loss(gaussians.opacities, mask), abs=1e-16)
         np.testing.assert_array_equal(v_image, base[1])
         assert np.any(v_opacities) == there
-
-
-def test_importance_may_be_taken_from_the_window_instead_of_the_view() -> None:
-    view = render(gaussians_from_params(PARAMS), CAMERAS[0])
-    lost = int(np.flatnonzero(view.dominant_counts == 0)[0])
-    seen_before = replace(density.zero_statistics(len(view.dominant_counts)), n_views=1)
-    seen_before.dominant_sum[lost] = 5
-    *_, current = objective_at(0, RECIPES["POP"], seen_before)[2]
-    *_, window = objective_at(0, replace(RECIPES["POP"], pop_views="window"), seen_before)[2]
-    assert current[lost] > 0.0
-    assert window[lost] < 0.0
-    assert np.array_equal(current < 0.0, view.dominant_counts > 0)
-
-
-def test_the_pop_term_may_leave_out_what_the_view_does_not_show() -> None:
-    params = {name: array.copy() for name, array in PARAMS.items()}
-    params["means"][0] = [50.0, 0.0, 0.0]
-    gaussians = gaussians_from_params(params)
-    view = render(gaussians, CAMERAS[1])
-    assert not view.splats.visible[0]
-    state = start(params)
-    *_, everyone = objective(view, gaussians, PHOTOS[1], state, RECIPES["POP"])
-    *_, shown = objective(view, gaussians, PHOTOS[1], state, replace(RECIPES["POP"], pop_over="visible"))
-    assert everyone[0] > 0.0
-    assert shown[0] == 0.0
 
 
 def test_l2_may_give_way_to_the_objective_of_3dgs() -> None:
@@ -212,50 +194,17 @@ def test_a_population_may_die_out_during_training() -> None:
     assert np.all(np.isfinite(losses))
 
 
-# Adam against a scalar loop and against torch, and the two schedules.
+# Adam against torch, and its schedules.
 
 
-def scalar_adam(x: float, gradients: list[float], lr: float, betas: tuple[float, float], eps: float) -> list[float]:
-    """Kingma and Ba's algorithm 1, one number at a time."""
-    m = v = 0.0
-    path = []
-    for t, g in enumerate(gradients, start=1):
-        m = betas[0] * m + (1.0 - betas[0]) * g
-        v = betas[1] * v + (1.0 - betas[1]) * g**2
-        m_hat, v_hat = m / (1.0 - betas[0] ** t), v / (1.0 - betas[1] ** t)
-        x = x - lr * m_hat / (math.sqrt(v_hat) + eps)
-        path.append(x)
-    return path
-
-
-def run(x: np.ndarray, gradients: np.ndarray, lr: float, **options) -> list[np.ndarray]:
-    params, m, v = {"x": x}, {"x": np.zeros_like(x)}, {"x": np.zeros_like(x)}
-    path = []
-    for t, g in enumerate(gradients, start=1):
-        params, m, v = adam_step(params, {"x": g}, m, v, t, {"x": lr}, **options)
-        path.append(params["x"])
-    return path
-
-
-gradients_st = st.lists(st.sampled_from([0.0, 1.0, -1.0, 0.5]) | st.floats(-8.0, 8.0), min_size=1, max_size=12)
-
-
-@given(gradients_st, st.sampled_from([1e-15, 1e-8, 0.125]), st.sampled_from([(0.9, 0.999), (0.5, 0.75)]))
-def test_adam_is_the_published_algorithm_number_by_number(
-    gradients: list[float], eps: float, betas: tuple[float, float]
-) -> None:
-    path = run(np.array([[0.5]]), np.array(gradients).reshape(-1, 1, 1), 0.25, betas=betas, eps=eps)
-    expected = scalar_adam(0.5, gradients, 0.25, betas, eps)
-    np.testing.assert_allclose(np.ravel(path), expected, rtol=1e-12, atol=1e-12)
-
-
-def test_adam_equals_torch_on_rows_of_several_shapes() -> None:
+@pytest.mark.parametrize(("betas", "eps"), [((0.9, 0.999), 1e-15), ((0.5, 0.75), 0.125)])
+def test_adam_equals_torch_on_rows_of_several_shapes(betas: tuple[float, float], eps: float) -> None:
     rng = np.random.default_rng(3)
     params = {"means": rng.normal(size=(5, 3)), "opacities": rng.normal(size=5), "sh0": rng.normal(size=(5, 1, 3))}
     lr = {"means": 1e-3, "opacities": 0.05, "sh0": 0.0025}
     tensors = {name: torch.tensor(array, requires_grad=True) for name, array in params.items()}
     groups = [{"params": [tensors[name]], "lr": lr[name]} for name in params]
-    reference = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15, foreach=False)
+    reference = torch.optim.Adam(groups, betas=betas, eps=eps, foreach=False)
     m = {name: np.zeros_like(array) for name, array in params.items()}
     v = {name: np.zeros_like(array) for name, array in params.items()}
     for step in range(1, 26):
@@ -264,29 +213,13 @@ def test_adam_equals_torch_on_rows_of_several_shapes() -> None:
         for name, g in grads.items():
             g[step % 5] = 0.0
             tensors[name].grad = torch.tensor(g)
-        params, m, v = adam_step(params, grads, m, v, step, lr)
+        params, m, v = adam_step(params, grads, m, v, step, lr, betas=betas, eps=eps)
         reference.step()
         for name in params:
             state = reference.state[tensors[name]]
             np.testing.assert_allclose(params[name], tensors[name].detach().numpy(), rtol=1e-13, atol=1e-15)
             np.testing.assert_allclose(m[name], state["exp_avg"].numpy(), rtol=1e-13, atol=1e-25)
             np.testing.assert_allclose(v[name], state["exp_avg_sq"].numpy(), rtol=1e-13, atol=1e-30)
-
-
-def test_a_steady_gradient_moves_a_parameter_by_the_learning_rate_however_small_it_is() -> None:
-    for size in (1.0, 1e-6, 1e-12):
-        path = run(np.array([0.0]), np.full((4, 1), size), 0.25)
-        np.testing.assert_allclose(np.ravel(path), [-0.25, -0.5, -0.75, -1.0], rtol=2e-3)
-
-
-def test_a_parameter_that_never_had_a_gradient_keeps_its_bits() -> None:
-    x = np.array([0.1, -7.25])
-    assert run(x, np.zeros((3, 2)), 0.25)[-1].tolist() == x.tolist()
-
-
-def test_a_parameter_without_a_gradient_coasts_on_its_moments() -> None:
-    path = np.ravel(run(np.array([0.0]), np.array([[1.0], [0.0], [0.0]]), 0.25))
-    assert path[0] > path[1] > path[2]
 
 
 def test_an_update_decays_second_moments_as_its_recipe_says() -> None:
@@ -302,11 +235,6 @@ def test_adam_leaves_its_arguments_alone() -> None:
     adam_step(x, g, zero, zero, 1, {"x": 0.5})
     assert x["x"].tolist() == g["x"].tolist() == [1.0, 1.0]
     assert zero["x"].tolist() == [0.0, 0.0]
-
-
-def test_adam_of_no_rows_is_no_rows() -> None:
-    none = {"x": np.zeros((0, 3))}
-    assert adam_step(none, none, none, none, 1, {"x": 0.5})[0]["x"].shape == (0, 3)
 
 
 def test_updates_count_from_one() -> None:
@@ -333,26 +261,8 @@ def test_positions_start_at_their_rate_and_end_at_a_hundredth_of_it() -> None:
     assert means_learning_rate(30_000, 3.0) == pytest.approx(1.6e-6 * 3.0, rel=1e-14)
     assert means_learning_rate(99_999, 3.0) == means_learning_rate(30_000, 3.0)
     assert means_learning_rate(-1, 3.0) == means_learning_rate(0, 3.0)
-
-
-@given(st.integers(0, 29_999), st.sampled_from([0.5, 1.0, 4.0]))
-def test_positions_rate_falls_by_one_factor_a_step(step: int, scene_scale: float) -> None:
-    ratio = means_learning_rate(step + 1, scene_scale) / means_learning_rate(step, scene_scale)
-    assert ratio == pytest.approx(0.01 ** (1 / 30_000), rel=1e-12)
-
-
-def test_only_the_positions_rate_changes() -> None:
-    early, late = learning_rates(0, 2.0), learning_rates(20_000, 2.0)
-    assert [name for name in early if early[name] != late[name]] == ["means"]
-    assert early["shN"] == early["sh0"] / 20
-    assert learning_rates(500, 2.0, max_steps=1000)["means"] == pytest.approx(0.1 * early["means"], rel=1e-14)
-
-
-def test_harmonics_gain_a_band_each_thousand_steps_up_to_three() -> None:
-    degrees = [sh_degree_at(step) for step in range(30_000)]
-    assert [degrees.index(d) for d in range(4)] == [0, 1000, 2000, 3000]
-    assert max(degrees) == 3
-    assert [sh_degree_at(step, interval=2, max_degree=1) for step in range(5)] == [0, 0, 1, 1, 1]
+    halfway = learning_rates(500, 2.0, max_steps=1000)["means"]
+    assert halfway == pytest.approx(0.1 * learning_rates(0, 2.0)["means"], rel=1e-14)
 
 
 # Every setting of a recipe is seen in a training step: the loss and the next Gaussians are those found by hand.
@@ -496,3 +406,186 @@ def test_3dgs_is_inrias_code_of_october_2024() -> None:
 def test_gsplat_is_its_default_strategy() -> None:
     assert_same_step(RECIPES["gsplat"], ByHand(**L1, weights={"lambda_ssim": 0.2}, important=None))
     assert not RECIPES["gsplat"].density.inclusive
+
+
+# Density control.
+
+STEPS = range(30_000)
+SMALL = 0.005
+
+
+def population(logits: list[float]) -> Rows:
+    n = len(logits)
+    params = {"means": np.zeros((n, 3)), "scales": np.zeros((n, 3)), "quats": np.ones((n, 4))}
+    return rows_from_params({**params, "opacities": np.array(logits)})
+
+
+def window(grads: list[float], blurred: list[bool] | None = None) -> Statistics:
+    n = len(grads)
+    flags = np.array([False] * n if blurred is None else blurred, dtype=bool)
+    return replace(zero_statistics(n), grad_sum=np.array(grads), n_visible=np.ones(n, np.int64), blurred=flags)
+
+
+def test_the_average_may_divide_by_the_views_of_the_window() -> None:
+    s = replace(zero_statistics(3), grad_sum=np.array([6.0, 2.0, 0.0]), n_visible=np.array([3, 1, 0]), n_views=4)
+    by_window = replace(POP, grad_denominator="window")
+    assert average_grads(s, by_window).tolist() == [1.5, 0.5, 0.0]
+    assert average_grads(zero_statistics(1), by_window).tolist() == [0.0]
+
+
+def test_blur_threshold_is_each_views_own() -> None:
+    s, config = zero_statistics(1), replace(POP, theta_blur=0.055)
+    for height, blurred in ((20, False), (10, True)):
+        s = accumulate(s, np.zeros((1, 2)), np.ones(1, bool), np.array([6]), 10, height, config)
+        assert s.blurred.tolist() == [blurred]
+
+
+@pytest.mark.parametrize("backend", ["oracle", "fast64"])
+def test_thresholds_are_strict_as_in_gsplat_and_not_as_in_inria_and_the_largest_axis_decides(backend: str) -> None:
+    masks = shipped(backend).stage("grow_masks")
+    s, scales = window([2e-4, np.nextafter(2e-4, 1.0)]), np.full((2, 3), SMALL)
+    assert masks(s, scales, 1.0, 600, POP)[0].tolist() == [False, True]
+    assert masks(s, scales, 1.0, 600, replace(POP, inclusive=True))[0].tolist() == [True, True]
+    # a size that is the threshold is small
+    scales = np.array([[0.25, 0.0, 0.0], [0.0, 0.0, np.nextafter(0.25, 1.0)]])
+    clone, split = masks(window([1.0, 1.0]), scales, 1.0, 600, replace(POP, grow_scale3d=0.25))
+    assert (clone.tolist(), split.tolist()) == ([True, False], [False, True])
+
+
+def test_gradient_growth_beside_the_blur_rule_can_be_chosen() -> None:
+    s, scales = window([1.0, 0.0], [False, True]), np.full((2, 3), SMALL)
+    chosen = {
+        POP: ([True, False], [True, True]),
+        replace(POP, grow_on_gradient_in_blur_window=False): ([True, False], [False, True]),
+        replace(POP, grow_on_gradient=False): ([False, False], [False, True]),
+    }
+    for config, (before, inside) in chosen.items():
+        assert grow_masks(s, scales, 1.0, 2900, config)[0].tolist() == before
+        assert grow_masks(s, scales, 1.0, 3000, config)[0].tolist() == inside
+
+
+def test_split_only_blur_splits_small_ones_and_may_clone_them_as_well() -> None:
+    s = window([1.0, 1.0, 0.0, 0.0], [True, False, True, False])
+    clone, split = grow_masks(s, np.full((4, 3), SMALL), 1.0, 3000, replace(POP, blur_rule="split"))
+    assert clone.tolist() == [True, True, False, False]
+    assert split.tolist() == [True, False, True, False]
+
+
+def test_schedule_has_144_densification_steps_41_with_blur_and_4_resets() -> None:
+    densified = [s for s in STEPS if densifies_at(s, POP)]
+    assert (len(densified), densified[0], densified[-1]) == (144, 600, 14_900)
+    blurred = [s for s in densified if blurs_at(s, POP)]
+    assert (len(blurred), blurred[0], blurred[-1]) == (41, 3000, 7000)
+    assert [s for s in STEPS if resets_at(s, POP)] == []
+    assert [s for s in STEPS if resets_at(s, GSPLAT)] == [3000, 6000, 9000, 12_000]
+    assert resets_at(0, replace(GSPLAT, reset_at_zero=True))
+    assert not any(blurs_at(s, GSPLAT) for s in STEPS)
+
+
+@pytest.mark.parametrize("backend", ["oracle", "fast64"])
+def test_children_are_drawn_from_their_parent_and_1_6_times_smaller(backend: str) -> None:
+    rng, mask = np.random.default_rng(4), np.array([False, True, False, True])
+    shapes = {"means": (4, 3), "scales": (4, 3), "quats": (4, 4), "opacities": (4,), "sh0": (4, 1, 3)}
+    rows = rows_from_params({name: rng.normal(size=shape) for name, shape in shapes.items()})
+    eps = rng.normal(size=(2, 2, 3))
+    parents = {name: array[mask] for name, array in rows.params.items()}
+    split = shipped(backend).stage("split_rows")(rows, mask, eps).params
+    rotation, scales = Rotation.from_quat(parents["quats"], scalar_first=True), np.exp(parents["scales"])
+    for child in range(2):
+        here = slice(2 + 2 * child, 4 + 2 * child)
+        expected = parents["means"] + rotation.apply(scales * eps[child])
+        np.testing.assert_allclose(split["means"][here], expected, rtol=1e-13, atol=1e-15)
+        np.testing.assert_allclose(np.exp(split["scales"][here]), scales / 1.6, rtol=1e-14)
+        for name in ("quats", "opacities", "sh0"):
+            np.testing.assert_array_equal(split[name][here], parents[name])
+
+
+@pytest.mark.parametrize("backend", ["oracle", "fast64"])
+@given(logit=st.sampled_from([-40.0, 0.0, 40.0]) | st.floats(-30.0, 30.0))
+def test_two_revised_children_are_as_opaque_as_their_parent(logit: float, backend: str) -> None:
+    split = (population([logit]), np.array([True]), np.zeros((2, 1, 3)), True)
+    child = shipped(backend).stage("split_rows")(*split).params["opacities"][0]
+    # 1 - o = 1 / (1 + e^logit) on both sides, in logarithms so that neither end is rounded away
+    assert 2.0 * np.logaddexp(0.0, child) == pytest.approx(np.logaddexp(0.0, logit), rel=1e-12)
+
+
+def test_unfit_rows_and_draws_are_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="lengths"):
+        rows_from_params({"means": np.zeros((2, 3)), "opacities": np.zeros(3)})
+    with pytest.raises(ValueError, match="at least one key"):
+        rows_from_params({})
+    with pytest.raises(ValueError, match=r"v\['means'\]"):
+        Rows({"means": np.zeros((2, 3))}, {"means": np.zeros((2, 3))}, {"means": np.zeros((2, 2))})
+    with pytest.raises(Exception, match="normals"):
+        split_rows(population([0.0, 0.0]), np.array([True, False]), np.zeros((2, 2, 3)))
+
+
+# What Adam moves at which step: numbers of updates and rates of every method's schedule, against counts by hand.
+
+NAMES = ("means", "opacities", "shN")
+
+
+def moved(recipe: Recipe, name: str) -> list[int]:
+    return [step for step in range(recipe.max_steps) if is_updated(name, step, recipe)]
+
+
+def test_a_step_that_edits_the_population_moves_nothing_in_inrias_loop() -> None:
+    quiet = sorted(set(range(30_000)) - set(moved(RECIPES["3DGS"], "means")))
+    assert quiet == list(range(600, 15_000, 100))
+    assert len(quiet) == 144
+    assert moved(RECIPES["gsplat"], "means") == list(range(30_000))
+
+
+def test_a_round_of_pup_loses_the_update_that_its_pruning_replaces_and_starts_adam_anew() -> None:
+    recipe = BASELINES["PUP-3DGS"]
+    late = [step for step in moved(recipe, "means") if step >= 30_000]
+    assert late == [*range(30_001, 35_000), *range(35_001, 40_000)]
+    assert update_numbers(NAMES, 30_001, recipe) == dict.fromkeys(NAMES, 1)
+    assert update_numbers(NAMES, 34_999, recipe)["means"] == 4_999
+
+
+def test_taming_moves_upper_bands_each_16_steps_and_opacities_until_15_000() -> None:
+    recipe = replace(BASELINES["Taming-3DGS"], updates=replace(BASELINES["Taming-3DGS"].updates))
+    bands = moved(recipe, "shN")
+    assert bands[:3] == [15, 31, 47]
+    assert all((step + 1) % 16 == 0 for step in bands)
+    assert max(moved(recipe, "opacities")) == 14_999
+    assert max(moved(recipe, "means")) == 29_999
+    assert update_numbers(["shN"], 47, recipe) == {"shN": 3}
+
+
+def test_the_positions_rate_of_mini_splatting_goes_back_to_what_it_was() -> None:
+    rules, plain = BASELINES["Mini-Splatting"].updates, UpdateRules()
+    for step, like in ((14_999, 14_999), (15_000, 5_000), (29_999, 19_999)):
+        assert learning_rates(step, 1.0, rules=rules)["means"] == learning_rates(like, 1.0, rules=plain)["means"]
+    steps = (14_999, 15_999, 16_000, 17_000, 18_000)
+    assert [sh_degree_at(step, start=rules.sh_start_iter) for step in steps] == [0, 0, 1, 2, 3]
+
+
+def test_in_a_round_of_pup_rates_fall_from_where_the_training_ended() -> None:
+    rules = BASELINES["PUP-3DGS"].updates
+    first, last = (learning_rates(step, 1.0, 40_000, rules=rules) for step in (30_000, 34_999))
+    assert first["means"] == pytest.approx(1.6e-4 * 0.01 ** (30_001 / 35_000), rel=1e-14)
+    assert last["means"] == pytest.approx(1.6e-6, rel=1e-14)
+    # twelve times, 0.95 each
+    assert last["scales"] / first["scales"] == pytest.approx(0.95**12, rel=1e-14)
+    assert learning_rates(35_000, 1.0, 40_000, rules=rules) == first
+    before = learning_rates(29_999, 1.0, 40_000, rules=rules)
+    assert before["means"] == pytest.approx(1.6e-4 * 0.01 ** (29_999 / 30_000), rel=1e-14)
+    assert before["scales"] == first["scales"]
+
+
+def test_gradients_that_wait_are_spent_at_once() -> None:
+    recipe = Recipe(updates=UpdateRules(sh_rest_every=3))
+    rows = rows_from_params({"means": np.zeros((1, 3)), "shN": np.zeros((1, 3, 3))})
+    state = Training(rows, zero_statistics(1))
+    for step, size in enumerate((1.0, 2.0, 4.0)):
+        state = replace(state, step=step)
+        grads = {"means": np.ones((1, 3)), "shN": np.full((1, 3, 3), size)}
+        rows, waiting = update(state.rows, grads, state, 1.0, recipe)
+        state = replace(state, rows=rows, waiting=waiting)
+        assert (state.rows.params["shN"] != 0.0).any() == (step == 2)
+    assert not state.waiting
+    # m = (1 - beta1) g of the sum of all three
+    np.testing.assert_allclose(state.rows.m["shN"], 0.1 * 7.0, rtol=1e-14)
+    assert (state.rows.params["means"] != 0.0).all()

@@ -26,8 +26,5 @@ def engine(request: pytest.FixtureRequest) -> Any:
 
 
 @pytest.fixture(autouse=True)
-def _one_thread() -> Any:
-    before = torch.get_num_threads()
+def _one_thread(_threads_of_torch: None) -> None:
     torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)

@@ -6,7 +6,7 @@ import math
 import re
 import threading
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from pop_fast.train.model import KEYS
 from pop_fast.train.schedule import steady_updates
 from pop_fast.train.stepper import Engine
 from pop_fast.train.steps import Phase, StepSettings
+from pop_fast.train.views import ViewTensors
 from pop_ref.conformance.backends import shipped
 from pop_ref.conformance.mutants.trial import law_named, obeys
 from pop_ref.constants import PAPER
@@ -248,10 +249,7 @@ def test_how_many_steps_are_taken_at_a_time_changes_no_bit(
         assert longest == 1 if seconds == 0.0 else 1 < longest <= most, blocks
         found.append(last_checkpoint(folder, "seconds", "metrics_bytes"))
     assert found[0][".strategy.count"].any()
-    for other in found[1:]:
-        for name, value in found[0].items():
-            same = torch.equal(value, other[name]) if isinstance(value, torch.Tensor) else value == other[name]
-            assert same, name
+    assert [name for other in found[1:] for name, value in found[0].items() if not same(value, other[name])] == []
 
 
 @needs_compiled
@@ -359,19 +357,6 @@ def test_a_stepper_takes_rows_on_the_cpu_in_single_precision_only(tmp_path: Path
 WIDE, HIGH, TILE, CHUNK = 40, 24, 16, 16
 
 
-@dataclass(frozen=True)
-class Photo:
-    """A photograph in front of which the Gaussians lie."""
-
-    photo: torch.Tensor
-    viewmat: torch.Tensor
-    K: torch.Tensor
-    mask: None = None
-
-    def depth_samples(self) -> None:
-        """None of its sparse points is known."""
-
-
 def gaussians(n: int = 400) -> dict[str, torch.Tensor]:
     rng = np.random.default_rng(5)
     z = rng.uniform(2.0, 6.0, n)
@@ -392,28 +377,17 @@ def gaussians(n: int = 400) -> dict[str, torch.Tensor]:
     return {name: torch.tensor(value, dtype=torch.float32) for name, value in made.items()}
 
 
-def view() -> Photo:
+def view() -> ViewTensors:
     K = torch.tensor([[[30.0, 0.0, WIDE / 2], [0.0, 30.0, HIGH / 2], [0.0, 0.0, 1.0]]])
-    photo = torch.zeros(HIGH, WIDE, 3, dtype=torch.uint8)
-    return Photo(photo, torch.eye(4)[None], K)
+    return ViewTensors("black", torch.zeros(HIGH, WIDE, 3, dtype=torch.uint8), None, torch.eye(4)[None], K)
 
 
 def listed(params: dict[str, torch.Tensor]) -> tuple[dict[str, np.ndarray], TileLists]:
     """Return splats in double precision, and their lists for the step's tiles."""
     p, seen = {name: value.double() for name, value in params.items()}, view()
-    _, _, meta = get_backend("fast").rasterization(
-        means=p["means"],
-        quats=p["quats"],
-        scales=p["scales"].exp(),
-        opacities=p["opacities"].sigmoid(),
-        colors=torch.cat((p["sh0"], p["shN"]), 1),
-        viewmats=seen.viewmat.double(),
-        Ks=seen.K.double(),
-        width=WIDE,
-        height=HIGH,
-        sh_degree=3,
-        packed=False,
-    )
+    rows = (p["means"], p["quats"], p["scales"].exp(), p["opacities"].sigmoid(), torch.cat((p["sh0"], p["shN"]), 1))
+    cameras = (seen.viewmat.double(), seen.K.double(), WIDE, HIGH)
+    _, _, meta = get_backend("fast").rasterization(*rows, *cameras, sh_degree=3, packed=False)
     exact = {"conics": meta["conics"][0], "opacities": meta["opacities"][0]}
     lists = tile_lists(meta["means2d"][0], meta["radii"][0], meta["depths"][0], WIDE, HIGH, TILE, **exact)
     return {name: meta[name][0].numpy() for name in ("means2d", "conics", "opacities")}, lists
@@ -448,18 +422,14 @@ def walked(splats: dict[str, np.ndarray], lists: TileLists) -> dict[str, int]:
     return did
 
 
+@needs_compiled
 def test_counts_are_those_of_a_walk_through_the_lists() -> None:
-    reason = get_backend("compiled").why_not()
-    if reason is not None:
-        pytest.skip(reason)
-    from pop_fast.compiled.native_step import NativeTrainer
-
     params = gaussians()
     splats, lists = listed(params)
     expected = walked(splats, lists)
     m, v = ({name: torch.zeros_like(value) for name, value in params.items()} for _ in range(2))
     settings = StepSettings(steady_updates(dict.fromkeys(PARAMETERS, 1e-3), 10), profile=PAPER)
-    trainer = NativeTrainer(params, m, v, [view()], [0] * 10, settings, threads=2)
+    trainer = native_step.NativeTrainer(params, m, v, [view()], [0] * 10, settings, threads=2)
     assert set(trainer.counts().values()) == {0}
     trainer.run(1, Phase(3, pop=True, statistics=True, blur=True))
     found = trainer.counts()

@@ -1,15 +1,42 @@
-"""The emulator itself: it reads launches, and it sees what it is there to see."""
+"""The emulator sees what it is there to see; what a step asks of a GPU, and what the fused step collects, under it."""
 
 from __future__ import annotations
 
 import subprocess
+import sys
+from collections import Counter
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+import torch
 
+from cuda_ext.arrays import Settings
 from cuda_ext.host import emulate
 from cuda_ext.host.emulate import FLAGS, HERE, translated
-from tests.cuda.conftest import FOLDER
+from cuda_ext.render.lists import WARP_TILE, make_lists, splat_struct
+from cuda_ext.training import train_step
+from pop_fast.api.backend import get_backend
+from pop_fast.cuda import rasterization
+from pop_fast.density.passes import Passes
+from pop_fast.train.steps import Phase
+from pop_ref.conformance.mutants.trial import every_law, law_named
+from pop_ref.conformance.torch_short_training import Watcher
+from pop_ref.constants import PAPER
+from tests.cuda.conftest import FOLDER, emulated_engine
+from tests.cuda.gpu.scene import (
+    HEIGHT,
+    STEPS,
+    WIDTH,
+    assert_same_bits,
+    drawn,
+    fused_trainer,
+    leaves_of,
+    training_scene,
+)
+from tests.fast.test_passes import raw_params, views
 
 PROGRAM = r"""
 #include <cuda_runtime.h>
@@ -99,3 +126,178 @@ def test_what_was_compiled_is_not_among_the_sources_of_what_is(monkeypatch: pyte
     finally:
         leftover.unlink()
         leftover.parent.rmdir()
+
+
+POP = Phase(3, True, True, True)
+SORTS_AND_SCANS = {"DeviceRadixSort", "DeviceScan", "memset"}
+
+
+def nodes_of_a_step(gpu, phase, **settings):
+    _, trainer = fused_trainer(training_scene(), gpu, **settings)
+    trainer.run(1, phase)
+    emulate.nodes(emulate.build(FOLDER))
+    trainer.run(2, phase)
+    return emulate.nodes(emulate.build(FOLDER))
+
+
+def test_a_step_is_few_kernels_each_launched_once(gpu):
+    found = nodes_of_a_step(gpu, POP)
+    own = {name: times for name, times in found.items() if name not in SORTS_AND_SCANS}
+    assert set(own.values()) == {1}
+    # with 22 of sorts and scan, whatever a photograph's size: it was 44 with clears, a total and a packing of their own
+    assert len(own) <= 15, sorted(own)
+    # nothing is cleared by a launch of its own: all memsets are those of the sorts, of depths by 32 bits, and of the
+    # scene's 15 tiles by 4
+    assert found["memset"] == (2 + 4) + (2 + 1)
+    assert found["DeviceRadixSort"] == (2 + 4) + (2 + 1)
+    assert found["DeviceScan"] == 2
+    # a step without dominance does not count importance
+    assert "count_important_kernel" not in nodes_of_a_step(gpu, Phase(3, False, False, False))
+
+
+def test_a_step_is_captured_when_its_kind_comes_again_and_once(gpu, monkeypatch):
+    captured, captures = train_step.captured, []
+
+    def counting(launch, device):
+        captures.append(launch)
+        return captured(launch, device)
+
+    monkeypatch.setattr(train_step, "captured", counting)
+    scene = training_scene()
+    # three views of three sizes: a kind is a size and a phase
+    scene.photographs = [image[: HEIGHT - k, : WIDTH - k].contiguous() for k, image in enumerate(scene.photographs)]
+    (params, m, v), trainer = fused_trainer(scene, gpu)
+    trainer.run(3, POP)
+    assert len(captures) == 0
+    trainer.run(4, POP)
+    assert len(captures) == 1
+    trainer.run(7, POP)
+    assert len(captures) == 3
+    trainer.rebind(params, m, v)
+    trainer.run(STEPS, POP)
+    assert len(captures) == 3
+    assert Counter(map(scene.order[7:].count, range(3))) == {1: 3}
+
+
+@pytest.fixture
+def guarded(gpu, monkeypatch):
+    """Fail on a launch outside of `torch.cuda.device_of(a tensor)`, as a launch on another GPU would."""
+    kernels, depth = sys.modules["cuda_ext._kernels"], []
+
+    @contextmanager
+    def device_of(tensor):
+        assert isinstance(tensor, torch.Tensor)
+        depth.append(tensor)
+        yield
+        depth.pop()
+
+    class Guarded:
+        def __getattr__(self, name):
+            found = getattr(kernels, name)
+            if not callable(found) or isinstance(found, type) or name in emulate.QUERIES:
+                return found
+
+            def launch(*arguments):
+                assert depth, f"{name} is launched on whatever device is current"
+                return found(*arguments)
+
+            return launch
+
+    monkeypatch.setitem(sys.modules, "cuda_ext._kernels", Guarded())
+    monkeypatch.setattr(torch.cuda, "device_of", device_of)
+    return gpu
+
+
+def test_fused_steps_are_launched_on_the_tensors_device(guarded):
+    for replay in (True, False):
+        _, trainer = fused_trainer(training_scene(), guarded, replay=replay)
+        trainer.run(STEPS, POP)
+
+
+def test_a_render_and_its_gradients_are_launched_on_the_tensors_device(guarded):
+    scene = training_scene()
+    leaves = leaves_of(scene.params, guarded)
+    image, _, meta = drawn(rasterization, leaves, scene, 0, [0])
+    image.sum().backward()
+    assert bool(leaves["means"].grad.any())
+    for key in ("isect_offsets", "n_traversed", "dominant_counts"):
+        assert meta[key] is not None
+
+
+def test_passes_are_launched_on_the_tensors_device(guarded):
+    made = Passes("cuda", views(torch.float32), device=guarded)
+    params = raw_params(dtype=torch.float32)
+    assert bool(made.contributions(params, 0, 3, torch.ones(made.photo(0).shape[:2])).map_sum.any())
+    assert bool(made.sensitivities(params, 0, 3).any())
+    assert bool(made.fisher(params, 0, 3).any())
+    assert bool((made.dominant_points(params, 0, 3)[1] >= 0).any())
+
+
+# What the blend does besides blending.
+
+BIN_WIDTH = 8  # lists whose lengths differ by less may stand in any order
+
+
+def corner_lists(n: int):
+    # all in one corner, so that lists there are long and most others empty
+    g = torch.Generator().manual_seed(n)
+    rows = {
+        "means2d": 30.0 * torch.rand((n, 2), generator=g) ** 2,
+        "depths": 1.0 + torch.rand((n,), generator=g),
+        "conics": torch.tensor([[0.02, 0.0, 0.02]]).repeat(n, 1),
+        "opacities": torch.full((n,), 0.5),
+        "radii": torch.full((n, 2), 22, dtype=torch.int32),
+    }
+    settings = Settings(90, 50, PAPER, PAPER.tile_size)
+    return make_lists(settings, splat_struct(**rows, colors=None), n, torch.device("cpu"), WARP_TILE, True)
+
+
+@pytest.mark.parametrize("n", [1, 60, 300])
+def test_tiles_are_taken_longest_list_first_and_each_once(gpu, n):
+    lists = corner_lists(n)
+    order, begin, end = (lists.tensor(name).long() for name in ("tile_order", "tile_begin", "tile_end"))
+    assert sorted(order.tolist()) == list(range(lists.n_tiles))
+    lengths = (end - begin)[order] // BIN_WIDTH
+    assert lengths.tolist() == sorted(lengths.tolist(), reverse=True)
+    assert n == 1 or lengths[0] > lengths[-1]
+
+
+def told(gpu, counts: bool):
+    (params, _, _), trainer = fused_trainer(training_scene(), gpu, steps=2, replay=False, counts=counts)
+    trainer.run(2, Phase(0, True, True, True))
+    ((_, maps),) = trainer.render_stats().items()
+    return maps, params
+
+
+def test_training_tells_the_same_winners_without_the_counts(gpu):
+    (lean, after), (full, after_full) = told(gpu, counts=False), told(gpu, counts=True)
+    assert set(full) - set(lean) == {"n_blended", "n_traversed"}
+    assert_same_bits(full, lean)
+    assert (lean["dominant_ids"] >= 0).any()
+    assert int(lean["dominant_counts"].sum()) == int((lean["dominant_ids"] >= 0).sum())
+    assert_same_bits(after_full, after)
+
+
+LAWS = [path for path, law in every_law().items() if law.needs == ("collected_statistics",)]
+
+
+class FusedStep(Watcher):
+    """Takes the steps of a `Watch` on the emulated GPU, as an adapter that offers nothing else."""
+
+    name, dtype = "the fused step", np.float32
+
+    def stage(self, name: str) -> Any:
+        return getattr(self, name)
+
+    def _engine(self, config: Any) -> Any:
+        step = get_backend("cuda").whole_step()
+        assert step is not None
+        setting = step.unknown_setting(config)
+        if setting is not None:
+            pytest.skip(f"the fused step has no {setting}; `pop train` refuses it")
+        return emulated_engine()
+
+
+@pytest.mark.parametrize("path", LAWS)
+def test_the_fused_step_collects_as_the_laws_say(gpu: Any, path: str) -> None:
+    law_named(path).sentence(FusedStep("pop_fast", "cuda", "float32"))

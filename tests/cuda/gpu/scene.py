@@ -7,6 +7,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from cuda_ext.training.step_buffers import ResidentViews
+from cuda_ext.training.train_step import FusedTrainer
+from pop_fast.api.rasterize import rasterization
+from pop_fast.density import POPStrategy
+from pop_fast.stages.losses import photometric_pop
+from pop_fast.train.schedule import steady_updates
+from pop_fast.train.steps import Phase, StepSettings
+
 WIDTH, HEIGHT, N, VIEWS, STEPS = 48, 36, 96, 3, 10
 LR = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "shN": 1.25e-4}
 
@@ -53,30 +61,39 @@ def training_scene(seed: int = 3) -> TrainingScene:
     return TrainingScene(params, viewmats, K.repeat(VIEWS, 1, 1), photographs, [k % VIEWS for k in range(STEPS)])
 
 
+def leaves_of(params: dict[str, Tensor], device) -> dict[str, Tensor]:
+    """Return copies on a device that ask for gradients."""
+    return {name: value.detach().to(device).clone().requires_grad_() for name, value in params.items()}
+
+
+def drawn(function, params: dict[str, Tensor], scene: TrainingScene, degree: int = 3, views=slice(None), **options):
+    """Call a rasterization with raw parameters and some of the scene's cameras, where the parameters lie."""
+    device = params["means"].device
+    sh = options.pop("sh", None)
+    if sh is None:
+        sh = torch.cat((params["sh0"], params["shN"]), 1) if degree else params["sh0"]
+    rows = (params["means"], params["quats"], params["scales"].exp(), torch.sigmoid(params["opacities"]), sh)
+    cameras = (scene.viewmats[views].to(device), scene.Ks[views].to(device))
+    return function(*rows, *cameras, WIDTH, HEIGHT, sh_degree=degree, **options)
+
+
 # Ten steps of training: fused ones on a device, and the same on the CPU by what `pop train` takes there.
 
 # share of the image that a blurred Gaussian dominates
 THETA = 0.02
 
 
-def fused_trainer(scene: TrainingScene, device, masks=None, **options):
-    """Return rows (parameters and moments) and the trainer of them."""
-    from cuda_ext.training.step_buffers import ResidentViews
-    from cuda_ext.training.train_step import FusedTrainer
-    from pop_fast.train.schedule import steady_updates
-    from pop_fast.train.steps import StepSettings
-
-    params = {name: value.to(device).clone() for name, value in scene.params.items()}
-    m, v = ({name: torch.zeros_like(value) for name, value in params.items()} for _ in range(2))
+def fused_trainer(scene: TrainingScene, device, masks=None, steps: int = STEPS, placed=torch.clone, **options):
+    """Return rows (parameters and moments), each put in its place by `placed`, and the trainer of them."""
+    params = {name: placed(value.to(device)) for name, value in scene.params.items()}
+    m, v = ({name: placed(torch.zeros_like(value)) for name, value in params.items()} for _ in range(2))
     views = ResidentViews(scene.photographs, scene.viewmats, scene.Ks, masks, "valid", device)
-    settings = StepSettings(steady_updates(LR, STEPS), **options)
-    return (params, m, v), FusedTrainer(params, m, v, views, scene.order, settings)
+    settings = StepSettings(steady_updates(LR, steps), **options)
+    return (params, m, v), FusedTrainer(params, m, v, views, scene.order[:steps], settings)
 
 
 def fused(scene: TrainingScene, device, window: bool = False, **options):
     """Take the steps of one phase; return objectives, parameters and the trainer."""
-    from pop_fast.train.steps import Phase
-
     (params, _, _), trainer = fused_trainer(scene, device, **options)
     losses = []
     for step in range(STEPS):
@@ -91,24 +108,15 @@ def on_the_cpu(scene: TrainingScene, **readings):
     Returns:
         Losses, POP terms, parameters and the strategy's state.
     """
-    from pop_fast.api.rasterize import rasterization
-    from pop_fast.density import POPStrategy
-    from pop_fast.stages.losses import photometric_pop
-
     strategy = POPStrategy(refine_start_iter=STEPS, blur_start_iter=0, theta_blur=THETA, **readings)
-    params = {name: value.clone().requires_grad_() for name, value in scene.params.items()}
+    params = leaves_of(scene.params, "cpu")
     optimizer = torch.optim.Adam([{"params": [params[name]], "lr": LR[name]} for name in params], eps=1e-15)
     state, losses, terms = strategy.initialize_state(), [], []
     for step in range(STEPS):
         view = scene.order[step]
-        opacities = torch.sigmoid(params["opacities"])
-        image, _, meta = rasterization(
-            params["means"], params["quats"], params["scales"].exp(), opacities,
-            torch.cat((params["sh0"], params["shN"]), 1), scene.viewmats[view][None], scene.Ks[view][None],
-            WIDTH, HEIGHT, sh_degree=3, packed=False, dominance=True,
-        )  # fmt: skip
+        image, _, meta = drawn(rasterization, params, scene, views=[view], packed=False, dominance=True)
         loss = photometric_pop(image[0], scene.photographs[view].float() / 255.0)
-        term = strategy.regularizer(opacities, state, step, meta)
+        term = strategy.regularizer(torch.sigmoid(params["opacities"]), state, step, meta)
         assert term is not None
         losses.append(loss.item())
         terms.append(term.item())
@@ -125,4 +133,16 @@ def apart(found, wanted, name) -> float:
 
     Where a gradient is rounding, Adam turns its sign into a whole step: what nearly all rows do is compared.
     """
-    return float(((found.cpu() - wanted).abs() > 0.1 * LR[name] * STEPS).float().mean())
+    return float(((found.cpu() - wanted.cpu()).abs() > 0.1 * LR[name] * STEPS).float().mean())
+
+
+def assert_same_bits(found: dict[str, Tensor], wanted: dict[str, Tensor]) -> None:
+    """Assert that all arrays of one name are equal."""
+    for name, value in wanted.items():
+        assert torch.equal(found[name], value), name
+
+
+def assert_gradients_close(found: dict[str, Tensor], wanted: dict[str, Tensor], rtol: float = 1e-3) -> None:
+    """Assert that the gradients that there are differ by little of the largest of their name."""
+    for name, value in wanted.items():
+        torch.testing.assert_close(found[name], value, rtol=rtol, atol=1e-4 * float(value.abs().max()))

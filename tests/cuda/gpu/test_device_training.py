@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from dataclasses import replace
 
@@ -10,14 +9,20 @@ import numpy as np
 import pytest
 import torch
 
+from cuda_ext.render import lists
+from pop_fast.api.backend import get_backend
+from pop_fast.cuda import training
 from pop_fast.density import GsplatStrategy, POPStrategy
-from pop_fast.train import TrainingRun
-from pop_fast.train import checkpoint as ckpt
-from tests.app.tiny import HEIGHT, WIDTH, tiny_capture, tiny_config
-from tests.train import test_steps as rules
-from tests.train.scene import RECIPE, SHORT, STEPS
-from tests.train.test_steps import EVERYTHING, agree, climb, judged, run_of
-from tests.train.test_steps import ladder_agree as climbed
+from pop_fast.train import TrainingRun, training_run
+from pop_ref.conformance.laws import test_whole_steps as laws
+from pop_ref.conformance.mutants.trial import every_law, law_named
+from pop_ref.conformance.short_training import ShortTraining
+from pop_ref.conformance.torch_short_training import Trainee
+from pop_ref.optimizer import is_updated
+from pop_ref.short_training import Trained
+from tests.app.tiny import HEIGHT, WIDTH, last_checkpoint, run_until, tiny_capture, tiny_config
+from tests.cuda.gpu.scene import assert_same_bits
+from tests.train.test_steps import climb, ladder_agree
 
 COMPARED = ("loss", "pop", "psnr", "d_ssim", "l1", "l2", "lr_means", "num_gaussians")
 STILL = {"refine_stop_iter": 0}
@@ -26,49 +31,36 @@ STILL = {"refine_stop_iter": 0}
 def masked(capture):
     mask = np.ones((HEIGHT, WIDTH), dtype=bool)
     mask[:, 20:] = False
-    views = [dataclasses.replace(view, mask=mask if k != 2 else None) for k, view in enumerate(capture.views)]
-    return dataclasses.replace(capture, views=tuple(views))
+    views = [replace(view, mask=mask if k != 2 else None) for k, view in enumerate(capture.views)]
+    return replace(capture, views=tuple(views))
 
 
 def mixed_sizes(capture):
-    small = dataclasses.replace(capture.views[2], image=np.ascontiguousarray(capture.views[2].image[:-5, :-3]))
-    return dataclasses.replace(capture, views=(*capture.views[:2], small, *capture.views[3:]))
+    small = replace(capture.views[2], image=np.ascontiguousarray(capture.views[2].image[:-5, :-3]))
+    return replace(capture, views=(*capture.views[:2], small, *capture.views[3:]))
 
 
+WINDOW = {"pop_views": "window", "refine_start_iter": 8, "refine_stop_iter": 7}
+ENTROPY = {"lambda_pop": 0.0, "lambda_entropy": 0.05}
+REGULARIZERS = {"opacity_reg": 0.1, "scale_reg": 0.05}
+# settings, of the strategy too, and what becomes of the capture
 CASES = {
-    "plain": ({}, lambda capture: capture),
-    "masks": ({}, masked),
-    "sizes": ({}, mixed_sizes),
-    "background": ({"background": (0.25, 0.5, 1.0), "antialiased": True}, lambda capture: capture),
-    "losses": ({"l2_stop_iter": 4, "d_ssim_halved": True, "ssim_padding": "same"}, lambda capture: capture),
-    "inria": ({"profile": "inria", "photometric_divisor": 2.0}, lambda capture: capture),
-    "gsplat": ({"profile": "gsplat_1_6", "sh_interval": 2}, lambda capture: capture),
-    "visible": ({"strategy": {"pop_over": "visible"}}, lambda capture: capture),
-    "window": (
-        {"strategy": {"pop_views": "window", "refine_start_iter": 8, "refine_stop_iter": 7}},
-        lambda capture: capture,
-    ),
-    "entropy": ({"strategy": {"lambda_pop": 0.0, "lambda_entropy": 0.05}}, lambda capture: capture),
-    "regularizers": (
-        {"opacity_reg": 0.1, "scale_reg": 0.05, "strategy": {"lambda_entropy": 0.05}},
-        lambda capture: capture,
-    ),
-    "batch, regularizers": (
-        {
-            "batch_size": 2,
-            "opacity_reg": 0.1,
-            "scale_reg": 0.05,
-            "strategy": {"lambda_pop": 0.0, "lambda_entropy": 0.05},
-        },
-        lambda capture: capture,
-    ),
-    "any view": ({"strategy": {"blur_window": "any_view"}}, masked),
-    "batch": ({"batch_size": 3}, lambda capture: masked(mixed_sizes(capture))),
-    "batch, window": (
-        {"batch_size": 2, "strategy": {"pop_views": "window", "refine_start_iter": 8, "refine_stop_iter": 7}},
-        lambda capture: capture,
-    ),
-    "batch, visible": ({"batch_size": 2, "sh_interval": 2, "strategy": {"pop_over": "visible"}}, masked),
+    "plain": {},
+    "masks": {"edit": masked},
+    "sizes": {"edit": mixed_sizes},
+    "background": {"background": (0.25, 0.5, 1.0), "antialiased": True},
+    "losses": {"l2_stop_iter": 4, "d_ssim_halved": True, "ssim_padding": "same"},
+    "inria": {"profile": "inria", "photometric_divisor": 2.0},
+    "gsplat": {"profile": "gsplat_1_6", "sh_interval": 2},
+    "visible": {"strategy": {"pop_over": "visible"}},
+    "window": {"strategy": WINDOW},
+    "entropy": {"strategy": ENTROPY},
+    "regularizers": {**REGULARIZERS, "strategy": {"lambda_entropy": 0.05}},
+    "batch, regularizers": {"batch_size": 2, **REGULARIZERS, "strategy": ENTROPY},
+    "any view": {"strategy": {"blur_window": "any_view"}, "edit": masked},
+    "batch": {"batch_size": 3, "edit": lambda capture: masked(mixed_sizes(capture))},
+    "batch, window": {"batch_size": 2, "strategy": WINDOW},
+    "batch, visible": {"batch_size": 2, "sh_interval": 2, "strategy": {"pop_over": "visible"}, "edit": masked},
 }
 
 
@@ -78,11 +70,11 @@ def records(folder):
 
 @pytest.mark.parametrize("case", CASES)
 def test_steps_are_the_cpus_under_every_setting(engine, case, tmp_path):
-    changes, edit = CASES[case]
+    changes = dict(CASES[case])
+    capture = changes.pop("edit", lambda capture: capture)(tiny_capture())
     # Gaussians that stay, and rates at which rounding does not grow
     strategy = POPStrategy(**{**STILL, "pop_stop_iter": 6, **changes.get("strategy", {})})
     settings = {"max_steps": 8, "log_every": 1, "checkpoint_every": 0, **changes, "strategy": strategy}
-    capture = edit(tiny_capture())
     rates = replace(tiny_config("x").lr, quats=0.0)
     expected = TrainingRun(tiny_config(tmp_path / "cpu", lr=rates, **settings), capture).run()
     on_gpu = tiny_config(tmp_path / "gpu", lr=rates, **settings)
@@ -109,49 +101,30 @@ def test_densification_steps_come_when_the_cpus_come_and_change_about_as_many(en
 
 
 @pytest.mark.parametrize("method", ["pop", "gsplat"])
-def test_an_interrupted_run_goes_on_to_the_same_bits(engine, method, tmp_path, monkeypatch):
+def test_an_interrupted_run_goes_on_to_the_same_bits(engine, method, tmp_path):
     settings = {"method": method, "strategy": replace(tiny_config("x", method="gsplat").strategy, reset_every=7)}
-    TrainingRun(tiny_config(tmp_path / "whole", **settings), tiny_capture(), engine=engine).run()
-    for stop_after in (8, 16, 23):
-        trainer = TrainingRun(
-            tiny_config(tmp_path / "parts", **settings), tiny_capture(), engine=engine, resume=stop_after > 8
-        )
-        take_steps = trainer.take_steps
-
-        def stepping(last, trainer=trainer, take_steps=take_steps, stop_after=stop_after):
-            if trainer.step >= stop_after:
-                raise KeyboardInterrupt
-            return take_steps(last)
-
-        monkeypatch.setattr(trainer, "take_steps", stepping)
-        with pytest.raises(KeyboardInterrupt):
-            trainer.run()
-    config = tiny_config(tmp_path / "parts", **settings)
-    TrainingRun(config, tiny_capture(), engine=engine, resume=True).run()
-    ours, theirs = (ckpt.load_checkpoint(ckpt.checkpoint_path(tmp_path / name, 29)) for name in ("parts", "whole"))
-    for key, value in theirs["splats"].items():
-        assert torch.equal(ours["splats"][key], value), key
-        for name, moment in theirs["optimizers"][key].items():
-            assert torch.equal(ours["optimizers"][key][name], moment), (key, name)
+    for name, stops in (("whole", (None,)), ("parts", (8, 16, 23, None))):
+        for place, stop in enumerate(stops):
+            config = tiny_config(tmp_path / name, **settings)
+            run_until(TrainingRun(config, tiny_capture(), engine=engine, resume=place > 0), stop)
+    ours, theirs = (last_checkpoint(tmp_path / name) for name in ("parts", "whole"))
+    arrays = [name for name in theirs if name.startswith((".splats", ".optimizers"))]
+    assert len(arrays) > 12
+    assert all(torch.equal(ours[name], theirs[name]) for name in arrays)
 
 
 def test_buffers_that_overflow_between_views_of_several_sizes_lose_nothing(engine, tmp_path, monkeypatch):
-    from cuda_ext.render import lists
-
     capture = mixed_sizes(tiny_capture())
     whole = TrainingRun(tiny_config(tmp_path / "whole"), capture, engine=engine)
     whole.run()
     monkeypatch.setattr(lists, "FIRST_GUESS", (0, 1))
     cramped = TrainingRun(tiny_config(tmp_path / "cramped"), capture, engine=engine)
     assert cramped.run()["instance_buffers_grown"] > 0
-    for key, value in whole.params.items():
-        assert torch.equal(cramped.params[key], value), key
+    assert_same_bits(cramped.params, whole.params)
 
 
 @pytest.mark.parametrize("batch_size", [1, 3])
 def test_photographs_without_room_pass_through_to_the_same_bits(engine, tmp_path, monkeypatch, batch_size):
-    from pop_fast.cuda import training
-
     capture = masked(mixed_sizes(tiny_capture()))
     runs = []
     monkeypatch.setattr(training, "MOMENTS_SHARE", 0.0)
@@ -169,8 +142,7 @@ def test_photographs_without_room_pass_through_to_the_same_bits(engine, tmp_path
     assert facts[0]["photograph_bytes"] > facts[1]["photograph_bytes"] > facts[2]["photograph_bytes"] > 0
     assert [run.stepper.fused.views.copied > 0 for run in runs] == [False, True, True]
     for run in runs[1:]:
-        for key, value in runs[0].params.items():
-            assert torch.equal(run.params[key], value), key
+        assert_same_bits(run.params, runs[0].params)
 
 
 def test_a_number_that_is_not_finite_is_found_on_the_device(engine, tmp_path):
@@ -188,25 +160,56 @@ def test_a_number_that_is_not_finite_is_found_on_the_device(engine, tmp_path):
         trainer.run()
 
 
-# The golden ladder, and steps of a real run each judged by the oracle's from the same state; see `tests.train`.
+# The golden ladder, and the laws of whole steps of the kit: every step is the oracle's from the same Gaussians.
 
 
-@pytest.mark.parametrize(
-    ("recipe", "steps"),
-    [(SHORT, 10), pytest.param(RECIPE, STEPS, marks=pytest.mark.slow)],
-    ids=["ten", "three-hundred"],
-)
-def test_every_step_is_the_oracles(engine, recipe, steps, tmp_path):
-    found = judged(run_of(recipe, tmp_path, engine), recipe, steps)
-    agree(found)
-    happened = {kind for step in found for kind in step.happened}
-    assert happened == EVERYTHING if recipe is RECIPE else happened
+class WholeSteps(Trainee):
+    """Takes steps of a `ShortTraining` on the GPU, as an adapter that offers nothing else."""
+
+    name, dtype = "the fused step", np.float32
+
+    def stage(self, name):
+        return getattr(self, name)
 
 
-def test_the_rules_of_updates_move_whom_they_move_and_nobody_else(engine, tmp_path):
-    rules.test_each_engine_moves_whom_the_rules_move_and_nobody_else(engine, tmp_path / "moves")
-    rules.test_gradients_that_wait_are_summed_alike_by_every_engine(engine, tmp_path / "waits")
+@pytest.fixture
+def whole_steps(engine, monkeypatch):
+    step = get_backend("cuda").whole_step()
+
+    def engine_of(config, own_strategy):
+        setting = step.unknown_setting(config)
+        if setting is not None:
+            pytest.skip(f"the fused step has no {setting}; `pop train` refuses it")
+        return engine
+
+    monkeypatch.setattr(training_run, "engine_of", engine_of)
+    return WholeSteps("pop_fast", "fast", "float32")
+
+
+OFFERED = {"taken_steps", "batched_steps", "whole_run"}
+RULES = "test_whole_steps:every_step_is_the_oracles_under_every_rule_of_updates"
+# where opacities have stopped for good, the fused step lets their moments go on: of rules it is asked who moves
+LAWS = [path for path, law in every_law().items() if set(law.needs) <= OFFERED and law.needs and path != RULES]
+
+
+@pytest.mark.parametrize("path", LAWS)
+def test_whole_steps_are_as_the_laws_say(whole_steps, path):
+    law_named(path).sentence(whole_steps)
+
+
+def test_the_rules_of_updates_move_whom_they_move_and_nobody_else(whole_steps):
+    options = {"max_steps": 8, "sh_interval": 1, "lr": laws.SLOW}
+    short = ShortTraining("pop", {**laws.STILL, **laws.WAITING}, options, (*laws.ORDER, 1), seed=126)
+    recipe, before, idle = Trained(short).recipe, short.params, 0
+    for step, record in enumerate(whole_steps.taken_steps(short)):
+        after = record["params"]
+        for key, value in before.items():
+            moved = not np.array_equal(after[key], value.astype(np.float32))
+            assert moved == is_updated(key, step, recipe), f"{key} at step {step}"
+            idle += not moved
+        before = after
+    assert idle > 5
 
 
 def test_ten_losses_are_the_oracles(engine, tmp_path):
-    climbed(climb(engine, tmp_path), torch.float32)
+    ladder_agree(climb(engine, tmp_path), torch.float32)

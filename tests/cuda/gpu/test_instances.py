@@ -7,8 +7,27 @@ from dataclasses import replace
 import pytest
 import torch
 
+from cuda_ext import load
+from cuda_ext.arrays import N_INSTANCES, OVERFLOW, CudaMemoryError, fill, kernel_profile, new_state, stream_of
+from cuda_ext.render.lists import TileBuffers, count_instances, splat_struct
+from pop_fast.cuda import rasterization
+from pop_fast.train.steps import Phase
 from pop_ref.constants import PAPER
-from tests.cuda.gpu.scene import HEIGHT, STEPS, THETA, WIDTH, N, apart, fused, fused_trainer, on_the_cpu, training_scene
+from tests.cuda.gpu.scene import (
+    HEIGHT,
+    STEPS,
+    THETA,
+    WIDTH,
+    N,
+    apart,
+    assert_gradients_close,
+    assert_same_bits,
+    fused,
+    fused_trainer,
+    leaves_of,
+    on_the_cpu,
+    training_scene,
+)
 
 # 30,000 x 30,000 tiles of 16 x 8 px; a splat that covers them all has as many instances
 ACROSS, PER_SPLAT = 30_000, 900_000_000
@@ -17,10 +36,6 @@ INT_MAX = 2**31 - 1
 
 def wide_splats(gpu, n, lists):
     """Return splats that cover every tile of a huge grid, and the lists' struct made ready to count them."""
-    from cuda_ext import load
-    from cuda_ext.arrays import fill
-    from cuda_ext.render.lists import splat_struct
-
     kernels = load()
     lists.n, lists.exact = n, False
     lists.set_grid(16 * ACROSS, 8 * ACROSS, 16, 8)
@@ -43,10 +58,6 @@ def wide_splats(gpu, n, lists):
 
 @pytest.mark.parametrize("n", [2, 3, 4, 5, 6, 9, 10])
 def test_instances_beyond_an_int_are_the_largest_int_and_not_few(gpu, n):
-    from cuda_ext import load
-    from cuda_ext.arrays import N_INSTANCES, kernel_profile, new_state
-    from cuda_ext.render.lists import count_instances
-
     kernels, state = load(), new_state(gpu)
     lists = kernels.TileLists()
     splats = wide_splats(gpu, n, lists)
@@ -56,9 +67,6 @@ def test_instances_beyond_an_int_are_the_largest_int_and_not_few(gpu, n):
 
 @pytest.mark.parametrize("before", [2**31 - 40, 2**31 - 1, 2**31, 2**32 - 1])
 def test_a_count_that_passes_an_int_halts_the_device_and_lists_nothing(gpu, before):
-    from cuda_ext import load
-    from cuda_ext.arrays import N_INSTANCES, OVERFLOW, kernel_profile, stream_of
-
     state, buffers, splats = counted(gpu)
     buffers.reserve(1024)
     # the last splat's slots as they are behind a multitude of others
@@ -72,39 +80,56 @@ def test_a_count_that_passes_an_int_halts_the_device_and_lists_nothing(gpu, befo
         assert not buffers.tensor(name).any(), name
 
 
-def counted(gpu):
-    """Return the state, the lists and the splats of the training scene, which has been counted."""
-    from cuda_ext.arrays import kernel_profile, new_state
-    from cuda_ext.render.lists import TileBuffers, count_instances, splat_struct
+def counted_lists(gpu, rows, width, height):
+    """Count the tiles that splats reach; return the state, the lists' buffers and the splats."""
+    rows = {name: value.to(gpu).contiguous() for name, value in rows.items()}
+    splats, n = splat_struct(**rows, colors=None), len(rows["depths"])
+    state, buffers = new_state(gpu), TileBuffers(n, width, height, (16, 8), True, gpu, buckets=False)
+    count_instances(buffers.struct, splats, kernel_profile(PAPER, 16), state.data_ptr(), gpu)
+    return state, buffers, splats
 
+
+def made_lists(gpu, rows, width, height):
+    """Make the lists of splats; return what is listed, where the lists of the tiles begin, and where they end."""
+    state, buffers, splats = counted_lists(gpu, rows, width, height)
+    total = int(state[N_INSTANCES])
+    buffers.reserve(total)
+    load().make_tile_lists(buffers.struct, splats, kernel_profile(PAPER, 16), 0, state.data_ptr(), stream_of(gpu))
+    listed, begin, end = (buffers.tensor(name).long().cpu() for name in ("listed", "tile_begin", "tile_end"))
+    assert int((end - begin).sum()) == total
+    return listed, begin, end
+
+
+def turned(sizes, g):
+    """Return conics and covariances of ellipses of so many px along their axes, turned in every direction."""
+    turn = 3.2 * torch.rand(len(sizes), generator=g)
+    axes = torch.stack((torch.cos(turn), torch.sin(turn), -torch.sin(turn), torch.cos(turn)), 1).view(-1, 2, 2)
+    covariance = axes @ torch.diag_embed(sizes.square()) @ axes.mT
+    inverse = torch.linalg.inv(covariance)
+    return torch.stack((inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]), 1), covariance
+
+
+def counted(gpu):
+    """Return the state, the lists and the splats of a scene of discs, which has been counted."""
     g = torch.Generator().manual_seed(0)
-    made = {
+    rows = {
         "means2d": torch.rand((N, 2), generator=g) * 40.0,
         "depths": torch.rand(N, generator=g) + 1.0,
         "conics": torch.tensor([0.1, 0.0, 0.1]).repeat(N, 1),
         "opacities": torch.full((N,), 0.5),
         "radii": torch.full((N, 2), 9, dtype=torch.int32),
     }
-    splats = splat_struct(**{name: value.to(gpu) for name, value in made.items()}, colors=None)
-    state, buffers = new_state(gpu), TileBuffers(N, 48, 36, (16, 8), True, gpu, buckets=False)
-    profile = kernel_profile(PAPER, 16)
-    count_instances(buffers.struct, splats, profile, state.data_ptr(), gpu)
-    return state, buffers, splats
+    return counted_lists(gpu, rows, 48, 36)
 
 
 def test_more_entries_than_the_kernels_can_number_are_refused_in_one_line(gpu):
-    from cuda_ext.arrays import CudaMemoryError
-
     _, buffers, _ = counted(gpu)
     with pytest.raises(CudaMemoryError, match=r"would have 2,147,483,647 entries or more; .* lower the number"):
         buffers.reserve(INT_MAX)
 
 
 def test_room_shrinks_after_a_phase_of_fat_splats_and_the_steps_stay_the_same(gpu, monkeypatch):
-    from cuda_ext.render import lists
-    from pop_fast.train.steps import Phase
-
-    monkeypatch.setattr(lists, "FIRST_GUESS", (0, 64))
+    monkeypatch.setattr(capacity, "FIRST_GUESS", (0, 64))
     phase, scene = Phase(3, True, True, True), training_scene()
     fat = {**scene.params, "scales": scene.params["scales"] + 1.5}
     (params, m, v), trainer = fused_trainer(replace(scene, params=fat), gpu)
@@ -160,8 +185,6 @@ def test_ten_fused_steps_under_another_reading_are_the_cpus(gpu, reading, backwa
 
 
 def test_the_share_that_blurs_is_of_the_pixels_that_a_view_keeps(gpu):
-    from pop_fast.train.steps import Phase
-
     scene = training_scene()
     masks = [None if k % 2 else torch.arange(WIDTH) < WIDTH // 4 for k in range(len(scene.photographs))]
     masks = [None if mask is None else mask.expand(HEIGHT, WIDTH) for mask in masks]
@@ -178,35 +201,18 @@ def test_the_share_that_blurs_is_of_the_pixels_that_a_view_keeps(gpu):
 
 
 def test_exact_lists_hold_the_tiles_that_a_splat_reaches_and_no_others(gpu):
-    from cuda_ext import load
-    from cuda_ext.arrays import N_INSTANCES, kernel_profile, new_state, stream_of
-    from cuda_ext.render.lists import TileBuffers, count_instances, splat_struct
-
     # rectangles of no tile, of one and of the whole image, and needles, in one warp and over the end of another
     g = torch.Generator().manual_seed(4)
     n, width, height = 75, 260, 130
-    sizes = torch.exp(4.5 * torch.rand((n, 2), generator=g)) * torch.tensor([1.0, 0.4])
-    turn = 3.2 * torch.rand(n, generator=g)
-    axes = torch.stack((torch.cos(turn), torch.sin(turn), -torch.sin(turn), torch.cos(turn)), 1).view(n, 2, 2)
-    covariance = axes @ torch.diag_embed(sizes.square()) @ axes.mT
-    inverse = torch.linalg.inv(covariance)
-    conics = torch.stack((inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]), 1)
+    conics, covariance = turned(torch.exp(4.5 * torch.rand((n, 2), generator=g)) * torch.tensor([1.0, 0.4]), g)
     opacities = 0.02 + 0.97 * torch.rand(n, generator=g)
     widths = torch.sqrt(2.0 * torch.log(255.0 * opacities))[:, None] * covariance.diagonal(dim1=1, dim2=2).sqrt()
     radii = torch.ceil(widths).int()
     radii[::7] = 0
     means2d = torch.rand((n, 2), generator=g) * torch.tensor([width + 80.0, height + 80.0]) - 40.0
     depths = torch.rand(n, generator=g)
-    rows = [t.to(gpu).contiguous() for t in (means2d, depths, conics, opacities, radii)]
-    state, buffers = new_state(gpu), TileBuffers(n, width, height, (16, 8), True, gpu, buckets=False)
-    kernels, profile, stream = load(), kernel_profile(PAPER, 16), stream_of(gpu)
-    splats = splat_struct(*rows, None)
-    count_instances(buffers.struct, splats, profile, state.data_ptr(), gpu)
-    total = int(state[N_INSTANCES])
-    buffers.reserve(total)
-    kernels.make_tile_lists(buffers.struct, splats, profile, 0, state.data_ptr(), stream)
-    listed, begin, end = (buffers.tensor(name).long().cpu() for name in ("listed", "tile_begin", "tile_end"))
-    assert int((end - begin).sum()) == total
+    rows = {"means2d": means2d, "depths": depths, "conics": conics, "opacities": opacities, "radii": radii}
+    listed, begin, end = made_lists(gpu, rows, width, height)
 
     reach = torch.log(255.0 * opacities.double())
     offsets = torch.arange(0.5, 16.0, 0.1, dtype=torch.float64)
@@ -234,63 +240,33 @@ def test_exact_lists_hold_the_tiles_that_a_splat_reaches_and_no_others(gpu):
 
 
 def test_rows_of_a_rectangle_are_exact_where_a_float_cannot_number_its_tiles(gpu):
-    from cuda_ext import load
-    from cuda_ext.arrays import kernel_profile, new_state, stream_of
-    from cuda_ext.render.lists import TileBuffers, count_instances, splat_struct
-
     # a band of 3 px over 12 million tiles, of which it reaches those of its rows alone
     across, down = 6_001, 2_000
     rows = {
-        "means2d": torch.tensor([[8.0 * across, 8.0 * down - 4.0]], device=gpu),
-        "depths": torch.ones(1, device=gpu),
-        "conics": torch.tensor([[1e-12, 0.0, 1.0]], device=gpu),
-        "opacities": torch.tensor([0.05], device=gpu),
-        "radii": torch.full((1, 2), 16 * across, dtype=torch.int32, device=gpu),
+        "means2d": torch.tensor([[8.0 * across, 8.0 * down - 4.0]]),
+        "depths": torch.ones(1),
+        "conics": torch.tensor([[1e-12, 0.0, 1.0]]),
+        "opacities": torch.tensor([0.05]),
+        "radii": torch.full((1, 2), 16 * across, dtype=torch.int32),
     }
-    buffers = TileBuffers(1, 16 * across, 8 * down, (16, 8), True, gpu, buckets=False)
-    state, profile, splats = new_state(gpu), kernel_profile(PAPER, 16), splat_struct(**rows, colors=None)
-    count_instances(buffers.struct, splats, profile, state.data_ptr(), gpu)
-    buffers.reserve(2 * across)
-    load().make_tile_lists(buffers.struct, splats, profile, 0, state.data_ptr(), stream_of(gpu))
-    begin, end = buffers.tensor("tile_begin"), buffers.tensor("tile_end")
-    reached = (end > begin).nonzero()[:, 0]
-    assert torch.equal(reached.cpu(), torch.arange(across) + (down - 1) * across)
-
-
-def long_scene(gpu, n, sizes):
-    """Return splats over an image of 65 x 65 tiles: their rows, some of them reaching across most of it."""
-    g = torch.Generator().manual_seed(11)
-    turn = 3.2 * torch.rand(n, generator=g)
-    axes = torch.stack((torch.cos(turn), torch.sin(turn), -torch.sin(turn), torch.cos(turn)), 1).view(n, 2, 2)
-    covariance = axes @ torch.diag_embed(sizes.square()) @ axes.mT
-    inverse = torch.linalg.inv(covariance)
-    rows = {
-        "means2d": torch.rand((n, 2), generator=g) * torch.tensor([1040.0, 520.0]),
-        "depths": torch.rand(n, generator=g),
-        "conics": torch.stack((inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]), 1),
-        "opacities": torch.full((n,), 0.9),
-        "radii": torch.ceil(3.3 * covariance.diagonal(dim1=1, dim2=2).sqrt()).int(),
-    }
-    return {name: value.to(gpu).contiguous() for name, value in rows.items()}
+    _, begin, end = made_lists(gpu, rows, 16 * across, 8 * down)
+    assert torch.equal((end > begin).nonzero()[:, 0], torch.arange(across) + (down - 1) * across)
 
 
 def test_tiles_of_a_block_beyond_its_words_are_those_of_each_splat_alone(gpu):
-    from cuda_ext import load
-    from cuda_ext.arrays import N_INSTANCES, kernel_profile, new_state, stream_of
-    from cuda_ext.render.lists import TileBuffers, count_instances, splat_struct
-
-    n, profile = 20, kernel_profile(PAPER, 16)
-    rows = long_scene(gpu, n, torch.tensor([[400.0, 30.0]]).repeat(n, 1))
+    n, g = 20, torch.Generator().manual_seed(11)
+    conics, covariance = turned(torch.tensor([[400.0, 30.0]]).repeat(n, 1), g)
+    rows = {
+        "means2d": torch.rand((n, 2), generator=g) * torch.tensor([1040.0, 520.0]),
+        "depths": torch.rand(n, generator=g),
+        "conics": conics,
+        "opacities": torch.full((n,), 0.9),
+        "radii": torch.ceil(3.3 * covariance.diagonal(dim1=1, dim2=2).sqrt()).int(),
+    }
     rows["radii"][::5] = 0
 
     def listed(chosen):
-        own = {name: value[chosen].contiguous() for name, value in rows.items()}
-        state, buffers = new_state(gpu), TileBuffers(len(chosen), 1040, 520, (16, 8), True, gpu, buckets=False)
-        splats = splat_struct(**own, colors=None)
-        count_instances(buffers.struct, splats, profile, state.data_ptr(), gpu)
-        buffers.reserve(int(state[N_INSTANCES]))
-        load().make_tile_lists(buffers.struct, splats, profile, 0, state.data_ptr(), stream_of(gpu))
-        begin, end, ids = (buffers.tensor(name).tolist() for name in ("tile_begin", "tile_end", "listed"))
+        ids, begin, end = made_lists(gpu, {name: value[chosen] for name, value in rows.items()}, 1040, 520)
         return {(chosen[ids[k]], tile) for tile in range(65 * 65) for k in range(begin[tile], end[tile])}
 
     # more tiles are tried than a block has words for, so that splats begin and end in the middle of a round
@@ -299,8 +275,6 @@ def test_tiles_of_a_block_beyond_its_words_are_those_of_each_splat_alone(gpu):
 
 
 def test_splats_of_many_slots_have_the_gradients_of_atomic_additions(gpu):
-    from pop_fast.cuda import rasterization
-
     g, n, width, height = torch.Generator().manual_seed(3), 70, 272, 136
     means = torch.rand((n, 3), generator=g) * torch.tensor([4.0, 2.0, 1.0]) + torch.tensor([-2.0, -1.0, 4.0])
     scales = torch.full((n, 3), 0.03)
@@ -312,18 +286,14 @@ def test_splats_of_many_slots_have_the_gradients_of_atomic_additions(gpu):
     v = torch.rand((1, height, width, 3), generator=g).to(gpu)
 
     def gradients(**options):
-        own = {name: value.to(gpu).detach().clone().requires_grad_() for name, value in leaves.items()}
+        own = leaves_of(leaves, gpu)
         image, _, meta = rasterization(*own.values(), torch.eye(4, device=gpu)[None], K, width, height, **options)
         (image * v).sum().backward()
         return {name: value.grad.cpu() for name, value in own.items()}, meta
 
     by_slots, meta = gradients(packed=False)
-    again, _ = gradients(packed=False)
-    assert (
-        sorted(meta["tiles_per_gauss"].flatten().tolist())[-4] >= 80
-    )  # of 16 x 16 px: twice as many of the lists' own
+    assert_same_bits(gradients(packed=False)[0], by_slots)
+    # of 16 x 16 px: twice as many of the lists' own
+    assert sorted(meta["tiles_per_gauss"].flatten().tolist())[-4] >= 80
     for backward in ("pixel_parallel", "gaussian_parallel"):
-        added, _ = gradients(packed=False, deterministic=False, backward=backward)
-        for name, value in by_slots.items():
-            assert torch.equal(value, again[name]), name
-            torch.testing.assert_close(added[name], value, rtol=1e-3, atol=1e-4 * float(value.abs().max()))
+        assert_gradients_close(gradients(packed=False, deterministic=False, backward=backward)[0], by_slots)

@@ -5,14 +5,32 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tests.cuda.gpu.scene import HEIGHT, LR, STEPS, WIDTH, apart, fused, fused_trainer, on_the_cpu, training_scene
+from cuda_ext.render import lists
+from pop_fast.api.rasterize import rasterization as on_cpu
+from pop_fast.cuda import rasterization as on_gpu
+from pop_fast.train.steps import Phase
+from pop_ref.settings import Objective
+from tests.cuda.gpu.scene import (
+    HEIGHT,
+    LR,
+    STEPS,
+    WIDTH,
+    apart,
+    assert_gradients_close,
+    assert_same_bits,
+    drawn,
+    fused,
+    fused_trainer,
+    leaves_of,
+    on_the_cpu,
+    training_scene,
+)
 
 
 @pytest.mark.graph
 def test_steps_launched_anew_are_the_replayed_steps(gpu):
     replayed, launched = (fused(training_scene(), gpu, replay=replay)[1] for replay in (True, False))
-    for name, value in replayed.items():
-        assert torch.equal(value, launched[name]), name
+    assert_same_bits(launched, replayed)
 
 
 @pytest.mark.graph
@@ -20,9 +38,6 @@ def test_steps_launched_anew_are_the_replayed_steps(gpu):
     "options", [{"backward": "gaussian_parallel"}, {"deterministic": False}, {"antialiased": True}]
 )
 def test_graphs_of_several_sizes_and_phases_are_replayed_in_turn(gpu, options):
-    from pop_fast.train.steps import Phase
-    from pop_ref.settings import Objective
-
     phases = (
         Phase(3, True, True, True),
         Phase(1, False, False, False, objective=Objective(pixelwise="l1")),
@@ -41,25 +56,19 @@ def test_graphs_of_several_sizes_and_phases_are_replayed_in_turn(gpu, options):
                 rows = tuple({name: value.clone() for name, value in group.items()} for group in rows)
                 trainer.rebind(*rows)
         found.append(rows[0])
-    for name, value in found[0].items():
-        if options.get("deterministic", True):
-            assert torch.equal(value, found[1][name]), name
-        else:
-            # sums in another order; where a gradient is rounding, Adam turns its sign into a whole step
-            apart = (value - found[1][name]).abs() > 0.1 * LR[name] * STEPS
-            assert apart.float().mean() < 0.01, name
+    if options.get("deterministic", True):
+        assert_same_bits(*found)
+    # sums in another order
+    assert all(apart(value, found[1][name], name) < 0.01 for name, value in found[0].items())
 
 
 @pytest.mark.graph
 def test_buffers_that_overflow_grow_and_nothing_is_lost(gpu, monkeypatch):
-    from cuda_ext.render import lists
-
     expected = fused(training_scene(), gpu)[1]
     monkeypatch.setattr(lists, "FIRST_GUESS", (0, 1))
     _, small, cramped = fused(training_scene(), gpu)
     assert cramped.grown > 0
-    for name, value in expected.items():
-        assert torch.equal(value, small[name]), name
+    assert_same_bits(small, expected)
 
 
 @pytest.mark.parametrize("backward", ["pixel_parallel", "gaussian_parallel"])
@@ -75,25 +84,17 @@ def test_ten_fused_steps_are_the_cpus_ten_steps(gpu, backward):
 
 @pytest.mark.graph
 def test_two_runs_give_the_same_bits(gpu):
-    first, second = (fused(training_scene(), gpu)[1] for _ in range(2))
-    for name, value in first.items():
-        assert torch.equal(value, second[name]), name
+    assert_same_bits(*(fused(training_scene(), gpu)[1] for _ in range(2)))
 
 
 def test_a_trainer_of_ones_own_learns_through_the_autograd_functions(gpu):
-    from pop_fast.api.rasterize import rasterization
-
     scene = training_scene()
-    leaves = {name: value.to(gpu).clone().requires_grad_() for name, value in scene.params.items()}
+    leaves = leaves_of(scene.params, gpu)
     optimizer = torch.optim.Adam([{"params": [leaves[name]], "lr": 5 * LR[name]} for name in leaves])
     photographs = torch.stack(scene.photographs).to(gpu).float() / 255.0
     losses = []
     for _ in range(STEPS):
-        image, alphas, meta = rasterization(
-            leaves["means"], leaves["quats"], leaves["scales"].exp(), torch.sigmoid(leaves["opacities"]),
-            torch.cat((leaves["sh0"], leaves["shN"]), 1), scene.viewmats.to(gpu), scene.Ks.to(gpu), WIDTH, HEIGHT,
-            sh_degree=3, packed=False, backend="cuda",
-        )  # fmt: skip
+        image, alphas, meta = drawn(on_cpu, leaves, scene, packed=False, backend="cuda")
         meta["means2d"].retain_grad()
         loss = (image - photographs).square().mean()
         loss.backward()
@@ -106,30 +107,20 @@ def test_a_trainer_of_ones_own_learns_through_the_autograd_functions(gpu):
 
 
 def test_rasterization_and_its_gradients_give_the_same_bits_twice(gpu):
-    from pop_fast.cuda import rasterization
-
     scene = training_scene()
     grads = []
     for _ in range(2):
-        leaves = {name: value.to(gpu).requires_grad_() for name, value in scene.params.items()}
-        image, _, _ = rasterization(
-            leaves["means"], leaves["quats"], leaves["scales"].exp(), torch.sigmoid(leaves["opacities"]),
-            torch.cat((leaves["sh0"], leaves["shN"]), 1), scene.viewmats.to(gpu), scene.Ks.to(gpu),
-            WIDTH, HEIGHT, sh_degree=3,
-        )  # fmt: skip
+        leaves = leaves_of(scene.params, gpu)
+        image, _, _ = drawn(on_gpu, leaves, scene)
         (image * torch.linspace(-1, 1, image.numel(), device=gpu).reshape(image.shape)).sum().backward()
         grads.append({name: leaf.grad for name, leaf in leaves.items()})
-    for name, value in grads[0].items():
-        assert bool(value.any()), f"{name} has no gradient"
-        assert torch.equal(value, grads[1][name]), name
+    assert all(bool(value.any()) for value in grads[0].values())
+    assert_same_bits(*grads)
 
 
 @pytest.mark.parametrize("backward", ["pixel_parallel", "gaussian_parallel"])
 @pytest.mark.parametrize("faint", [1, 44], ids=["one-bucket", "three-buckets"])
 def test_gradients_around_an_opaque_splat_keep_their_digits(gpu, backward, faint):
-    from pop_fast.api.rasterize import rasterization as on_cpu
-    from pop_fast.cuda import rasterization as on_gpu
-
     n = 2 * faint + 1
 
     def gradient(function, device, dtype, **options):
@@ -155,9 +146,6 @@ def test_gradients_around_an_opaque_splat_keep_their_digits(gpu, backward, faint
 
 @pytest.mark.parametrize("options", [{"counts": True}, {"profile": "inria"}])
 def test_lists_of_the_callers_tiles_go_back_as_the_warps_own_do(gpu, options):
-    from pop_fast.api.rasterize import rasterization as on_cpu
-    from pop_fast.cuda import rasterization as on_gpu
-
     scene, grads = training_scene(), []
     # 36 px: the last row of 16 px tiles is less than half full, so that a warp's part of it lies outside
     for function, device, backward in (
@@ -165,37 +153,22 @@ def test_lists_of_the_callers_tiles_go_back_as_the_warps_own_do(gpu, options):
         (on_gpu, gpu, {}),
         (on_gpu, gpu, {"backward": "gaussian_parallel"}),
     ):
-        # detached there: a copy of what asks for gradients is no leaf on another device
-        leaves = {name: value.detach().to(device).requires_grad_() for name, value in scene.params.items()}
-        image, _, _ = function(
-            leaves["means"], leaves["quats"], leaves["scales"].exp(), torch.sigmoid(leaves["opacities"]),
-            leaves["sh0"], scene.viewmats.to(device), scene.Ks.to(device), WIDTH, HEIGHT, sh_degree=0, **options,
-            **backward,
-        )  # fmt: skip
-        image.square().sum().backward()
+        leaves = leaves_of(scene.params, device)
+        drawn(function, leaves, scene, 0, **options, **backward)[0].square().sum().backward()
         grads.append({name: leaf.grad.cpu() for name, leaf in leaves.items() if leaf.grad is not None})
     assert len(grads[0]) == 5
     for found in grads[1:]:
-        for name, value in grads[0].items():
-            torch.testing.assert_close(found[name], value, rtol=1e-3, atol=1e-4 * float(value.abs().max()))
+        assert_gradients_close(found, grads[0])
 
 
 @pytest.mark.parametrize("mode", ["D", "ED", "RGB+D", "RGB+ED"])
 @pytest.mark.parametrize("packed", [False, True])
 def test_every_render_mode_is_the_cpus(gpu, mode, packed):
-    from pop_fast.api.rasterize import rasterization as on_cpu
-    from pop_fast.cuda import rasterization as on_gpu
-
     scene = training_scene()
-
-    def draw(function, device):
-        p = {name: value.to(device) for name, value in scene.params.items()}
-        return function(
-            p["means"], p["quats"], p["scales"].exp(), torch.sigmoid(p["opacities"]), p["sh0"],
-            scene.viewmats.to(device), scene.Ks.to(device), WIDTH, HEIGHT, sh_degree=0, render_mode=mode, packed=packed,
-        )  # fmt: skip
-
-    found, expected = draw(on_gpu, gpu), draw(on_cpu, "cpu")
+    found, expected = (
+        drawn(function, {k: v.to(device) for k, v in scene.params.items()}, scene, 0, render_mode=mode, packed=packed)
+        for function, device in ((on_gpu, gpu), (on_cpu, "cpu"))
+    )
     for k in (0, 1):
         torch.testing.assert_close(found[k].cpu(), expected[k], rtol=1e-4, atol=1e-5)
     for key in ("flatten_ids", "isect_offsets", "tiles_per_gauss"):
@@ -216,8 +189,6 @@ def test_every_render_mode_is_the_cpus(gpu, mode, packed):
     ],
 )
 def test_a_bad_value_is_named_with_its_index(gpu, name, index, value, words):
-    from pop_fast.cuda import rasterization
-
     scene = training_scene()
     p = {key: tensor.to(gpu).clone() for key, tensor in scene.params.items()}
     p |= {"scales": p["scales"].exp(), "opacities": torch.sigmoid(p["opacities"]), "colors": p.pop("sh0")}
@@ -225,4 +196,4 @@ def test_a_bad_value_is_named_with_its_index(gpu, name, index, value, words):
     del p["shN"]
     p[name][index] = value
     with pytest.raises(ValueError, match=words):
-        rasterization(**p, width=WIDTH, height=HEIGHT, sh_degree=0)
+        on_gpu(**p, width=WIDTH, height=HEIGHT, sh_degree=0)

@@ -1,4 +1,4 @@
-"""Exposures, random backgrounds and corrections of cameras in a training run: gradients are the oracle's."""
+"""What a run makes of its photographs: exposures, corrected cameras, random backgrounds, and fewer pixels at first."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import torch
 
 import pop_ref.appearance
 import pop_ref.refinement
+from benchmarks.faults.runs import same
 from pop_fast.api.backend import get_backend
 from pop_fast.api.backends import CUDA
 from pop_fast.data.capture import Capture
@@ -27,58 +28,21 @@ from pop_fast.train.engines import engine_of, torch_engine
 from pop_fast.train.evaluate import psnr, psnr_after_correction
 from pop_fast.train.schedule import phase_at
 from pop_fast.train.steps import why_not_trained
-from pop_fast.train.views import ViewTensors, render_view
+from pop_fast.train.views import SMALLEST_SIDE, ViewTensors, render_view, shrunk, with_shrunk
 from pop_ref.losses import photometric_pop, photometric_pop_vjp
 from pop_ref.records import Camera
 from pop_ref.render import render, render_vjp
 from pop_ref.training import gaussians_from_params
-from tests.app.tiny import last_checkpoint, tiny_capture, tiny_config
+from tests.app.tiny import last_checkpoint, run_until, tiny_capture, tiny_config
 
 ALL = {"exposure": True, "random_background": True, "refine_cameras": True}
 RNG = np.random.default_rng(21)
-IMAGE, TARGET = RNG.uniform(0.0, 1.0, (2, 12, 3))
 EXPOSURES = np.eye(3, 4) + RNG.normal(0.0, 0.2, (5, 3, 4))
 CORRECTIONS = RNG.normal(0.0, 0.02, (5, 6))
 
 
 def tensor(array: np.ndarray, requires_grad: bool = False) -> torch.Tensor:
     return torch.tensor(array, dtype=torch.float64, requires_grad=requires_grad)
-
-
-def test_stages_have_the_values_of_the_oracle() -> None:
-    picture = IMAGE.reshape(3, 4, 3)
-    pairs = [
-        (stages.expose(tensor(picture), tensor(EXPOSURES[0])), pop_ref.appearance.expose(picture, EXPOSURES[0])),
-        (stages.color_correct(tensor(IMAGE), tensor(TARGET)), pop_ref.appearance.color_correct(IMAGE, TARGET)),
-        (stages.centred_exposures(tensor(EXPOSURES)), pop_ref.appearance.centred_exposures(EXPOSURES)),
-    ]
-    for found, expected in pairs:
-        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-13)
-    for step, seed in ((0, 0), (3, 7), (29_999, 2**31 - 1)):
-        np.testing.assert_array_equal(stages.background_at(step, seed), pop_ref.appearance.background_at(step, seed))
-
-
-def test_the_common_motion_that_is_taken_out_is_the_oracles() -> None:
-    viewmats = np.stack([view.viewmat for view in tiny_capture().views])
-    found = stages.without_common_motion(tensor(CORRECTIONS), tensor(viewmats))
-    expected = pop_ref.refinement.without_common_motion(CORRECTIONS, viewmats)
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-15)
-    assert np.abs(expected - CORRECTIONS).max() > 1e-3
-
-
-@pytest.mark.parametrize("size", [0.0, 1e-3, 1.0])
-def test_corrections_of_cameras_and_their_gradients_are_the_oracles(size: float) -> None:
-    viewmat, v_refined = tiny_capture().views[1].viewmat, np.vstack([RNG.normal(size=(3, 4)), np.zeros(4)])
-    correction = size * RNG.normal(size=6)
-    leaves = tensor(viewmat, requires_grad=True), tensor(correction, requires_grad=True)
-    refined = stages.refined_viewmat(*leaves)
-    np.testing.assert_allclose(
-        refined.detach(), pop_ref.refinement.refined_viewmat(viewmat, correction), rtol=0.0, atol=1e-14
-    )
-    refined.backward(tensor(v_refined))
-    expected = pop_ref.refinement.refined_viewmat_vjp(viewmat, correction, v_refined)
-    for leaf, gradient in zip(leaves, expected, strict=True):
-        np.testing.assert_allclose(leaf.grad, gradient, rtol=0.0, atol=1e-12)
 
 
 def learned(run: TrainingRun) -> dict[str, torch.Tensor]:
@@ -143,36 +107,42 @@ def test_the_gradients_of_a_step_are_the_oracles(tmp_path: Path, backend: str, t
         assert torch.all(found[name][others] == 0.0)
 
 
-def test_a_run_that_was_stopped_goes_on_to_the_same_bits(tmp_path: Path) -> None:
-    def run_to(folder: Path, stop_after: int | None, resume: bool = False) -> None:
-        run = TrainingRun(tiny_config(folder, **ALL), tiny_capture(), resume=resume)
-        take_steps = run.take_steps
+COARSE = {"coarse_stop_iters": (9,)}
+STOPPED = {
+    "all": ALL,
+    "coarse": COARSE,
+    "coarse, exposures": {**COARSE, "exposure": True},
+    "coarse, compiled": {**COARSE, "backend": "compiled"},
+    "coarse, exposures, compiled": {**COARSE, "exposure": True, "backend": "compiled"},
+}
 
-        def stepping(last: int) -> Any:
-            if run.step == stop_after:
-                raise KeyboardInterrupt
-            return take_steps(last)
 
-        run.take_steps = stepping
-        if stop_after is None:
-            run.run()
-        else:
-            with pytest.raises(KeyboardInterrupt):
-                run.run()
+@pytest.fixture
+def tiny_may_shrink(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Views of 32 x 24 px may be halved."""
+    monkeypatch.setattr(coarse, "SMALLEST_SIDE", 12)
 
-    run_to(tmp_path / "whole", None)
-    for place, stop_after in enumerate((7, 17, None)):
-        run_to(tmp_path / "parts", stop_after, resume=place > 0)
+
+@pytest.mark.usefixtures("tiny_may_shrink")
+@pytest.mark.parametrize("what", STOPPED)
+def test_a_run_that_was_stopped_goes_on_to_the_same_bits(what: str, tmp_path: Path) -> None:
+    settings = STOPPED[what]
+    reason = get_backend(settings.get("backend", "fast")).why_not()
+    if reason is not None:
+        pytest.skip(reason)
+    # on either side of where photographs become whole
+    for name, stops in (("whole", (None,)), ("parts", (7, 17 if what == "all" else 12, None))):
+        for place, stop in enumerate(stops):
+            run_until(TrainingRun(tiny_config(tmp_path / name, **settings), tiny_capture(), resume=place > 0), stop)
     ours, theirs = (last_checkpoint(tmp_path / name, "seconds", "metrics_bytes") for name in ("parts", "whole"))
     assert list(ours) == list(theirs)
-    assert ".appearance.cameras.exp_avg" in ours
-    for name, value in ours.items():
-        same = torch.equal(value, theirs[name]) if isinstance(value, torch.Tensor) else value == theirs[name]
-        assert same, name
-    stats = (tmp_path / "parts" / "stats" / "appearance_step0029.json").read_text()
-    assert stats == (tmp_path / "whole" / "stats" / "appearance_step0029.json").read_text()
-    assert '"exposure"' in stats
-    assert '"viewmat"' in stats
+    assert [name for name, value in ours.items() if not same(value, theirs[name])] == []
+    if what == "all":
+        assert ".appearance.cameras.exp_avg" in ours
+        stats = (tmp_path / "parts" / "stats" / "appearance_step0029.json").read_text()
+        assert stats == (tmp_path / "whole" / "stats" / "appearance_step0029.json").read_text()
+        assert '"exposure"' in stats
+        assert '"viewmat"' in stats
 
 
 def test_settings_that_are_off_leave_views_and_images_as_they_are(tmp_path: Path) -> None:
@@ -259,25 +229,6 @@ def test_passes_see_the_cameras_as_they_are_corrected(tmp_path: Path) -> None:
     assert not torch.equal(seen[2].viewmat, views[2].viewmat)
 
 
-@pytest.mark.parametrize("exposure", [False, True])
-def test_what_shows_nothing_costs_nothing_before_any_background(tmp_path: Path, exposure: bool) -> None:
-    """Photographs that are transparent throughout ask for an empty scene, whatever lies behind it and however dark."""
-    capture = tiny_capture()
-    blank = np.zeros_like(capture.views[0].image)
-    clear = [replace(view, image=blank, alpha=blank[..., 0]) for view in capture.views]
-    initial = initialize_params(capture, 7, 0.5, 0.5, torch.float64)
-    initial["opacities"].fill_(-30.0)
-    config = tiny_config(tmp_path / "run", random_background=True, exposure=exposure)
-    run = TrainingRun(config, replace(capture, views=tuple(clear)), initial=initial, engine=torch_engine("fast"))
-    if exposure:
-        with torch.no_grad():
-            run.appearance.params["exposures"].copy_(tensor(EXPOSURES[:4]))
-    (stats,) = run.stepper.steps(0, 1, phase_at(config, config.strategy, 0))
-    assert stats.objective < 1e-9
-    nothing = tensor(np.zeros((24, 32, 3)))
-    assert run.stepper._photo_loss(nothing, 0, config.objective_at(0), torch.ones(3)) > 0.1
-
-
 def test_transparency_matters_to_a_random_background_alone(tmp_path: Path) -> None:
     def losses(name: str, alpha: np.ndarray | None, **settings: Any) -> list[float]:
         capture = tiny_capture()
@@ -351,3 +302,41 @@ def test_the_line_about_the_backend_says_that_autograd_takes_the_steps(tmp_path:
     assert said == "backend compiled, as asked for; its fused step has no refine_cameras, so autograd takes the steps"
     assert choose_backend(replace(asked, backend="fast", refine_cameras=True))[1] == "backend fast, as asked for"
     assert choose_backend(replace(asked, exposure=True))[1] == "backend compiled, as asked for"
+
+
+# Coarse to fine: the laws judge what is seen at which step.
+
+
+def made_view(height: int, width: int, **more: torch.Tensor) -> ViewTensors:
+    K = torch.tensor([[[200.0, 0.0, 131.5], [0.0, 190.0, 77.25], [0.0, 0.0, 1.0]]])
+    photo = torch.zeros(height, width, 3, dtype=torch.uint8)
+    return ViewTensors("a.png", photo, more.pop("mask", None), torch.eye(4)[None], K, **more)
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+def test_the_transparency_of_a_shrunk_view_is_the_mean_over_its_areas(factor: int) -> None:
+    generator = torch.Generator().manual_seed(5)
+    alpha = torch.randint(0, 256, (160, 256), generator=generator).to(torch.uint8)
+    view = made_view(160, 256, alpha=alpha)
+    small = shrunk(view, factor)
+    assert small.alpha is not None
+    opacity = alpha.numpy().reshape(160 // factor, factor, 256 // factor, factor).mean((1, 3))
+    assert np.abs(small.alpha.numpy() - opacity).max() <= 0.5 + 1e-4
+    assert (small.name, small.viewmat.tolist()) == (view.name, view.viewmat.tolist())
+    assert with_shrunk([view], ()) == [view]
+
+
+def test_a_view_is_not_shrunk_to_less_than_a_few_windows_nor_its_mask_to_nothing() -> None:
+    assert shrunk(made_view(70, 300), 4).height == 35
+    small = made_view(40, 300)
+    assert shrunk(small, 4) is small
+    assert min(shrunk(made_view(129, 300), 4).photo.shape[:2]) >= SMALLEST_SIDE
+    keep = torch.zeros(160, 256, dtype=torch.bool)
+    keep[3, 3] = True
+    assert shrunk(made_view(160, 256, mask=keep), 4).kept_pixels == 1
+
+
+@pytest.mark.parametrize("stops", [(5, 3), (-1,), (1, 2, 3, 4, 5)])
+def test_stops_that_cannot_be_are_refused(stops: tuple[int, ...]) -> None:
+    with pytest.raises(PopError, match="coarse_stop_iters"):
+        TrainConfig(coarse_stop_iters=stops)
