@@ -1,4 +1,6 @@
-"""The adapters that come with the kit: what is not here is skipped with the reason, what is stands up to the laws."""
+"""The adapters that come with the kit: what is not here is skipped with the reason, what is stands up to the laws.
+
+Sound implementations that lack a piece, or add in another order, are not refused; and what fails is told about."""
 
 from __future__ import annotations
 
@@ -6,25 +8,43 @@ import importlib.util
 import re
 import sys
 from collections.abc import Callable
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
+from pop_fast.api.rasterize import rasterization as fast
 from pop_ref.compositing import composite, composite_vjp
 from pop_ref.conformance import Adapter, Scene
-from pop_ref.conformance.adapter import under
+from pop_ref.conformance.adapter import OracleAdapter, View, stage_function, under
 from pop_ref.conformance.backends import ELSEWHERE, Absent, Unavailable, made_by, shipped, shipped_or_absent
-from pop_ref.conformance.capabilities import DERIVATIVES, EXTENTS, GRADIENTS, INRIAS, LOWER_CEILING, PROFILES, RENDER
+from pop_ref.conformance.capabilities import (
+    DERIVATIVES,
+    DETERMINISTIC,
+    DOMINANCE,
+    DOMINANT_WEIGHTS,
+    EXTENTS,
+    GRADIENTS,
+    HOMOGENEOUS,
+    INRIAS,
+    LOWER_CEILING,
+    PACKED,
+    PROFILES,
+    RENDER,
+)
 from pop_ref.conformance.failure_report import failure_report
 from pop_ref.conformance.inria_adapter import inria
 from pop_ref.conformance.law import missing
+from pop_ref.conformance.laws.test_whole import test_an_empty_scene_is_the_background as empty_scene_law
 from pop_ref.conformance.mutants import MUTANTS, living
 from pop_ref.conformance.mutants.trial import every_law, law_named, obeys
 from pop_ref.conformance.scenes import golden_scene, scene_as_code
 from pop_ref.conformance.torch_adapter import TorchAdapter
-from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER
+from pop_ref.conformance.views import ASKED
+from pop_ref.constants import GSPLAT_1_5, GSPLAT_1_6, INRIA, PAPER, Profile
 from pop_ref.constants import PROFILES as ALL_PROFILES
 from pop_ref.projection import project_means
 from tests.meta import inria_stub
@@ -244,6 +264,7 @@ def test_a_wrong_gradient_of_a_right_image_is_told() -> None:
     with living(by_name["conic_off_diagonal_twice"]) as backend:
         text = failure_report("test_some_law", backend, {"scene": golden_scene()})
     assert "first pixel" not in text
+    assert "first stage" not in text
     assert re.search(r"first gradient that differs: v_scales, Gaussian \d, entry \[\d\]: oracle \S+, backend \S+", text)
     assert "nearest decision: D" in text
 
@@ -291,3 +312,296 @@ def test_an_engines_own_adam_moves_what_strategies_edit(name: str, monkeypatch: 
 
     monkeypatch.setattr(module, "_step_by", halved)
     assert "training.rows" in (obeys(law, backend) or "")
+
+
+sound = partial(fast, backend="fast")
+TWICE = "test_gradients:twice_the_cotangent_is_exactly_twice_the_gradient"
+SCALED = "test_whole:scaling_the_world_by_a_power_of_two_changes_no_bit"
+
+
+def only_drawing(*args: Any, **options: Any) -> Any:
+    with torch.no_grad():
+        return sound(*args, **options)
+
+
+def leaving_torch(means: Any, *args: Any, **options: Any) -> Any:
+    return sound(torch.as_tensor(means.numpy()), *args, **options)
+
+
+@pytest.mark.parametrize("rasterization", [only_drawing, leaving_torch])
+def test_a_rasterizer_that_only_draws_is_judged_by_its_images(rasterization: Callable[..., Any]) -> None:
+    backend = TorchAdapter("drawing", rasterization, dtype="float32")
+    assert backend.has(RENDER)
+    assert not backend.has(GRADIENTS)
+    of_gradients = [stated for stated in LAWS.values() if GRADIENTS in stated.needs]
+    assert len(of_gradients) > 15
+    assert all(GRADIENTS in missing(backend, stated.needs) for stated in of_gradients)
+    # the laws of the signature compare its images all the same
+    cameras = law_named("test_signature_cameras:several_cameras_in_one_call_see_what_each_sees_alone")
+    assert not missing(backend, cameras.needs)
+    assert obeys(cameras, backend) is None
+
+
+def test_a_gradient_that_fails_is_a_failure_and_not_a_missing_piece() -> None:
+    def broken(*args: Any, **options: Any) -> Any:
+        raise RuntimeError("illegal memory access")
+
+    with pytest.raises(RuntimeError, match="illegal memory access"):
+        TorchAdapter("broken", broken).has(GRADIENTS)
+
+
+def ids_alone(*args: Any, **options: Any) -> Any:
+    image, alphas, meta = sound(*args, dominance=True, **options)
+    return image, alphas, {"dominant_ids": meta["dominant_ids"]}
+
+
+def test_dominant_ids_are_judged_without_weights_and_counts() -> None:
+    backend = TorchAdapter("ids", ids_alone, dtype="float32")
+    assert backend.has(DOMINANCE)
+    assert not backend.has(DOMINANT_WEIGHTS)
+    judged = [path for path, s in LAWS.items() if DOMINANCE in s.needs and not missing(backend, s.needs)]
+    assert len(judged) >= 6
+    assert {path: broken for path in judged if (broken := obeys(LAWS[path], backend, 10))} == {}
+
+
+def _refuses_packed(error: Callable[[], Any]) -> Callable[..., Any]:
+    def rasterization(*args: Any, packed: bool = True, **options: Any) -> Any:
+        return error() if packed else sound(*args, packed=False, **options)
+
+    return rasterization
+
+
+def _raises(error: Exception) -> Any:
+    raise error
+
+
+def _asserts() -> None:
+    allowed = False
+    assert allowed, "packed rows come later"
+
+
+def _refuses_packed_by(alone: Callable[[], Any], with_backgrounds: Callable[[], Any]) -> Callable[..., Any]:
+    def rasterization(*args: Any, packed: bool = True, backgrounds: Any = None, **options: Any) -> Any:
+        if packed:
+            return alone() if backgrounds is None else with_backgrounds()
+        return sound(*args, packed=False, backgrounds=backgrounds, **options)
+
+    return rasterization
+
+
+def _states() -> Any:
+    return _raises(NotImplementedError("packed"))
+
+
+def without_packed(means: Any, quats: Any, scales: Any, opacities: Any, colors: Any, viewmats: Any, Ks: Any,
+                   width: int, height: int, sh_degree: int | None = None, backgrounds: Any = None) -> Any:  # fmt: skip
+    return sound(means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree=sh_degree,
+                 backgrounds=backgrounds, packed=False)  # fmt: skip
+
+
+REFUSALS: dict[str, Callable[..., Any]] = {
+    "not implemented": _refuses_packed(lambda: _raises(NotImplementedError("packed"))),
+    "a ValueError by a statement": _refuses_packed(lambda: _raises(ValueError("packed=True is not for me"))),
+    "words of compiled code": _refuses_packed(lambda: _raises(RuntimeError("packed mode is not supported"))),
+    "no such argument": without_packed,
+    "a statement, and an assertion with backgrounds": _refuses_packed_by(_states, _asserts),
+}
+DEFECTS: dict[str, Callable[..., Any]] = {
+    "an assertion": _refuses_packed(_asserts),
+    "an operation on types that have none": _refuses_packed(lambda: {} | ()),  # type: ignore[operator]
+    "arrays that do not fit": _refuses_packed(lambda: np.zeros(2) + np.zeros(3)),
+    "a key that is not there": _refuses_packed(lambda: {}["packed"]),
+    "an argument of something inside": _refuses_packed(lambda: dict.fromkeys(values=())),  # type: ignore[call-arg]
+    "an assertion, and a statement with backgrounds": _refuses_packed_by(_asserts, _states),
+    "a kernel that fails": _refuses_packed(lambda: _raises(RuntimeError("illegal memory access"))),
+}
+PACKED_LAW = "test_signature_cameras:packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same"
+
+
+@pytest.mark.parametrize("words", REFUSALS)
+def test_what_is_refused_on_purpose_is_skipped_in_the_words_of_the_refusal(words: str) -> None:
+    backend = TorchAdapter("refusing", REFUSALS[words], dtype="float32")
+    assert missing(backend, law_named(PACKED_LAW).needs) == [PACKED]
+    assert "packed" in str(backend.why_not(PACKED))
+
+
+def test_a_rasterizer_with_fewer_arguments_than_gsplats_is_judged_by_those_it_has() -> None:
+    backend = TorchAdapter("short", without_packed, dtype="float32")
+    for path in (
+        "test_agreement:the_image_is_one_of_the_oracles_outcomes",
+        "test_signature_cameras:several_cameras_in_one_call_see_what_each_sees_alone",
+    ):
+        assert not missing(backend, law_named(path).needs)
+        assert obeys(law_named(path), backend, 5) is None
+
+
+@pytest.mark.parametrize("defect", DEFECTS)
+def test_an_error_that_nobody_raised_on_purpose_is_a_defect_that_a_law_reports(defect: str) -> None:
+    backend = TorchAdapter("crashing", DEFECTS[defect], dtype="float32")
+    assert not missing(backend, law_named(PACKED_LAW).needs)
+    assert obeys(law_named(PACKED_LAW), backend, 5) is not None
+
+
+class _Unordered(torch.autograd.Function):
+    """A sum whose gradient is taken in an order that another run does not repeat: its last bit varies."""
+
+    run = 0
+
+    @staticmethod
+    def forward(ctx: Any, value: Any) -> Any:
+        return value.clone()
+
+    @staticmethod
+    def backward(ctx: Any, v: Any) -> Any:
+        _Unordered.run += 1
+        return v * (1.0 + (_Unordered.run % 3) * torch.finfo(v.dtype).eps)
+
+
+def unordered(means: Any, *args: Any, **options: Any) -> Any:
+    return sound(_Unordered.apply(means), *args, **options)
+
+
+def test_sums_without_an_order_are_not_held_to_equal_bits() -> None:
+    assert obeys(law_named(TWICE), TorchAdapter("careless", unordered, dtype="float32"), 10) is not None
+    backend = TorchAdapter("atomic", unordered, dtype="float32", deterministic=False)
+    skipped = {path for path, stated in LAWS.items() if DETERMINISTIC in missing(backend, stated.needs)}
+    assert {TWICE, "test_gradients:gradients_ignore_the_coefficients_of_other_bands"} <= skipped
+    assert "test_agreement:gradients_are_the_oracles" not in skipped
+    assert obeys(law_named("test_agreement:gradients_are_the_oracles"), backend, 10) is None
+
+
+class OneProfile(Adapter):
+    """An author's adapter: the oracle's stages as methods, and an error for constants that it does not have."""
+
+    name, dtype, profile = "one profile", np.float64, GSPLAT_1_5
+
+    def __getattr__(self, name: str) -> Any:
+        function = stage_function("pop_ref", name)
+        if function is None:
+            raise AttributeError(name)
+
+        def checked(*args: Any, **options: Any) -> Any:
+            for value in (*args, *options.values()):
+                if isinstance(value, Profile):
+                    assert {**vars(value), "name": ""} == {**vars(GSPLAT_1_5), "name": ""}, f"handed {value.name}"
+            return function(*args, **options)
+
+        return checked
+
+
+@pytest.mark.parametrize("stage", ["projection", "camera", "alpha", "footprint", "tiles"])
+def test_an_adapter_of_one_profile_is_handed_no_other(stage: str) -> None:
+    backend = OneProfile()
+    judged = {path: s for path, s in LAWS.items() if s.stage == stage and not missing(backend, s.needs)}
+    assert len(judged) >= 4
+    assert {path: broken for path, s in judged.items() if (broken := obeys(s, backend, 20))} == {}
+
+
+class InriasDivision(OracleAdapter):
+    """The oracle with Inria's divisor w + 1e-7, which a world of another size meets elsewhere."""
+
+    def render(self, scene: Scene) -> View:
+        R, t = scene.camera.viewmat[:3, :3], scene.camera.viewmat[:3, 3]
+        p = scene.gaussians.means @ R.T + t
+        aside = p * np.array([1.0, 1.0, 0.0]) * (p[:, 2:] / (p[:, 2:] + 1e-7) - 1.0)
+        return super().render(scene.with_overrides(means=scene.gaussians.means + aside @ R))
+
+
+def test_inrias_divisor_breaks_no_law_of_its_profile() -> None:
+    backend = InriasDivision()
+    assert obeys(law_named(SCALED), backend) is not None
+    backend.profile = INRIA
+    assert Adapter.has(backend, HOMOGENEOUS) is False
+    assert HOMOGENEOUS in law_named(SCALED).needs
+
+
+class Greyish(OracleAdapter):
+    """The oracle with a background that is a little too bright."""
+
+    def render(self, scene: Scene) -> View:
+        return super().render(scene.with_overrides(background=scene.background + 2.0**-10))
+
+
+def test_an_empty_scene_has_a_report() -> None:
+    with pytest.raises(AssertionError) as caught:
+        empty_scene_law(Greyish())
+    report = "\n".join(caught.value.__notes__)
+    assert "no report" not in report
+    assert "first pixel that differs: image, pixel (0, 0)" in report
+    no_gaussians = golden_scene().rows([])
+    assert "no report" not in failure_report("test_some_law", OracleAdapter(), {"scene": no_gaussians})
+
+
+class WrongGradients(OracleAdapter):
+    """The oracle with a wrong gradient of the background."""
+
+    def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
+        found = super().gradients(scene, v_image, v_T_final)
+        return found | {"background": found["background"] + 1.0}
+
+
+def test_a_law_that_asked_for_no_gradient_is_not_explained_by_one() -> None:
+    backend = WrongGradients()
+    assert "first gradient that differs: v_background" in failure_report(
+        "test_some_law", backend, {"scene": golden_scene()}
+    )
+    backend.asked_for_gradients = False  # type: ignore[attr-defined]
+    report = failure_report("test_some_law", backend, {"scene": golden_scene()})
+    assert "gradient" not in report
+    assert "the law breaks in what it compares" in report
+
+
+def refusing(*args: Any, render_mode: str = "RGB", radius_clip: float = 0.0, **options: Any) -> Any:
+    if render_mode != "RGB":
+        raise NotImplementedError("no depth")
+    if radius_clip:
+        raise ValueError("radius_clip must be 0")
+    return sound(*args, **options)
+
+
+def bare(means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane=0.01, eps2d=0.3,
+         sh_degree=None, packed=True, tile_size=16, backgrounds=None):  # fmt: skip
+    named = {"sh_degree": sh_degree, "packed": packed, "tile_size": tile_size, "backgrounds": backgrounds}
+    planes = {"near_plane": near_plane, "eps2d": eps2d}
+    return sound(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **planes, **named)
+
+
+def test_an_argument_that_is_refused_or_not_there_is_a_skip_by_name() -> None:
+    lacks = {
+        refusing: {"depth modes", "radius_clip"},
+        bare: {
+            "depth modes",
+            "radius_clip",
+            "covariances in place of quaternions and scales",
+            "planes and low-pass other than its defaults",
+        },
+    }
+    for rasterization, expected in lacks.items():
+        backend = TorchAdapter("partial", rasterization, dtype="float32")
+        assert {name for name in ASKED if not backend.has(name)} == expected | {"sparse_grad"}
+        assert backend.has(GRADIENTS), "an argument absgrad is no condition of gradients"
+
+
+def of_one_profile(profile: Profile) -> Any:
+    """Give a rasterizer that has the constants of one profile, and no argument to choose another."""
+
+    def rasterization(means: Any, quats: Any, scales: Any, opacities: Any, colors: Any, viewmats: Any, Ks: Any,
+                      width: int, height: int, packed: bool = True, render_mode: str = "RGB", absgrad: bool = False,
+                      covars: Any = None, **options: Any) -> Any:  # fmt: skip
+        given = {"packed": packed, "render_mode": render_mode, "absgrad": absgrad, "covars": covars, **options}
+        return sound(
+            means, quats, scales, opacities, colors, viewmats, Ks, width, height, profile=profile.name, **given
+        )
+
+    return TorchAdapter(profile.name, rasterization, dtype="float32", profile=profile)
+
+
+@pytest.mark.slow  # all laws of the signature
+@pytest.mark.parametrize("profile", [GSPLAT_1_6, INRIA], ids=lambda profile: profile.name)
+def test_the_laws_of_the_signature_and_of_scale_judge_constants_of_any_profile(profile: Profile) -> None:
+    backend, judged = of_one_profile(profile), 0
+    for path, stated in LAWS.items():
+        if path.startswith(("test_signature", "test_scale")) and not missing(backend, stated.needs):
+            assert obeys(stated, backend) is None, path
+            judged += 1
+    assert judged >= (24 if profile is INRIA else 36)
