@@ -1,6 +1,7 @@
-"""The adapters that come with the kit: what is not here is skipped with the reason, what is stands up to the laws.
+"""The adapters of the kit: what is not here is skipped with the reason, what is stands up to the laws.
 
-Sound implementations that lack a piece, or add in another order, are not refused; and what fails is told about."""
+Sound implementations that lack a piece, or add in another order, are not refused; and what fails is told about.
+"""
 
 from __future__ import annotations
 
@@ -281,15 +282,16 @@ def test_an_adapter_is_found_by_its_path_and_must_be_one() -> None:
         made_by("no_such.module:Mine")
 
 
-def test_a_scene_of_the_kit_is_a_public_name() -> None:
-    assert isinstance(golden_scene(), Scene)
+def _here(name: str) -> Any:
+    backend = shipped_or_absent(name)
+    if isinstance(backend, Absent):
+        pytest.skip(backend.reason)
+    return backend
 
 
 @pytest.mark.parametrize("name", ["compiled64", "compiled32"])
 def test_what_the_compiled_backend_has_of_its_own_is_judged(name: str) -> None:
-    backend = shipped_or_absent(name)
-    if isinstance(backend, Absent):
-        pytest.skip(backend.reason)
+    backend = _here(name)
     own = ("tile_lists", "contributions", "sensitivities", "fisher_blocks", "dominant_points", "adam_step")
     assert [stage for stage in own if not backend.has(stage)] == []
     assert all("compiled" in backend._stage(stage).__module__ for stage in own[:-1])
@@ -297,9 +299,7 @@ def test_what_the_compiled_backend_has_of_its_own_is_judged(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["compiled32", "mirror32"])
 def test_an_engines_own_adam_moves_what_strategies_edit(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    backend = shipped_or_absent(name)
-    if isinstance(backend, Absent):
-        pytest.skip(backend.reason)
+    backend = _here(name)
     law = law_named("test_strategies:a_training_by_gsplat_is_the_oracles_at_every_step")
     assert obeys(law, backend) is None
     # an engine that takes steps of half the length is no longer the oracle's, whatever torch's own Adam does

@@ -128,26 +128,20 @@ def test_rounding_a_scene_twice_is_rounding_it_once() -> None:
 @pytest.mark.parametrize(
     ("actual", "expected", "scale", "dtype", "said"),
     [
-        (
-            [1.0, 2.5],
-            [1.0, 2.0],
-            1.0,
-            np.float64,
-            [r"first at \[1\].*differs by .* units, allowed", "got 2.5, expected 2.0"],
-        ),
+        ([1.0, 2.5], [1.0, 2.0], 1.0, np.float64, r"first at \[1\].*differs by .* units, allowed"),
+        ([1.0, 2.5], [1.0, 2.0], 1.0, np.float64, "got 2.5, expected 2.0"),
         # one wrong entry among a million
-        (np.eye(1, 10**6, 123_456)[0] * 1e-6, np.zeros(10**6), 1.0, np.float32, [r"first at \[123456\]"]),
-        *(([bad], [1.0], 1e300, np.float64, ["not finite"]) for bad in (np.nan, np.inf, -np.inf)),
-        (np.zeros(2), np.zeros((2, 1)), 1.0, np.float64, ["shape"]),
+        (np.where(np.arange(10**6) == 123_456, 1e-6, 0.0), np.zeros(10**6), 1.0, np.float32, r"first at \[123456\]"),
+        *(([bad], [1.0], 1e300, np.float64, "not finite") for bad in (np.nan, np.inf, -np.inf)),
+        (np.zeros(2), np.zeros((2, 1)), 1.0, np.float64, "shape"),
     ],
-    ids=["index", "million", "nan", "inf", "-inf", "shape"],
+    ids=["index", "values", "million", "nan", "inf", "-inf", "shape"],
 )
 def test_what_differs_is_told_with_index_values_and_units(
-    actual: Any, expected: Any, scale: float, dtype: Any, said: list[str]
+    actual: Any, expected: Any, scale: float, dtype: Any, said: str
 ) -> None:
-    with pytest.raises(AssertionError) as caught:
+    with pytest.raises(AssertionError, match=said):
         assert_close("alpha.sigma", np.array(actual), np.array(expected), scale, dtype)
-    assert all(re.search(words, str(caught.value)) for words in said), caught.value
 
 
 def test_bits_of_other_shapes_are_not_the_same() -> None:

@@ -1,6 +1,7 @@
-"""Portable vectors: the oracle passes its own, a float32 port passes, and a broken port is told where.
+"""Portable vectors and the corpus: the oracle and a float32 port pass the vectors, and a broken port is told where.
 
-What is kept of the corpus, and what the oracle is remembered to have answered, is what the oracle says today."""
+What is kept of the corpus, and what the oracle is remembered to have answered, is what the oracle says today.
+"""
 
 from __future__ import annotations
 
@@ -48,6 +49,11 @@ def folder(made_once: Callable[..., Path]) -> Path:
     return made_once("vectors", lambda folder: export(folder / "vectors")) / "vectors"
 
 
+@pytest.fixture
+def index(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "index.json").read_text())
+
+
 @pytest.mark.parametrize(
     "name", [name if name == "fast64" else pytest.param(name, marks=pytest.mark.slow) for name in SHIPPED]
 )
@@ -93,8 +99,7 @@ def test_a_broken_port_is_told_which_vector_and_array(folder: Path, tmp_path: Pa
     assert not any(array in ("image", "images") for _, array in failed)
 
 
-def test_the_index_explains_every_array_of_every_vector(folder: Path) -> None:
-    index = json.loads((folder / "index.json").read_text())
+def test_the_index_explains_every_array_of_every_vector(folder: Path, index: dict[str, Any]) -> None:
     assert {key: value for key, value in index.items() if key != "vectors"} == schema(kinds())
     axes = {name for names in index["axes"] for name in names.split(", ")}
     for name, vector in index["vectors"].items():
@@ -123,12 +128,9 @@ def test_the_index_explains_every_array_of_every_vector(folder: Path) -> None:
             assert (sizes["W"], sizes["H"]) == (vector["options"]["width"], vector["options"]["height"])
 
 
-def test_every_rule_names_arrays_that_are_there() -> None:
-    for arrays in (kind["arrays"] for kind in kinds().values()):
-        _assert_rules_name_arrays(arrays)
-
-
-def _assert_rules_name_arrays(arrays: dict[str, dict[str, Any]]) -> None:
+@pytest.mark.parametrize("kind", kinds())
+def test_every_rule_names_arrays_that_are_there(kind: str) -> None:
+    arrays = kinds()[kind]["arrays"]
     for name, entry in arrays.items():
         assert ("compare" in entry) == (entry["role"] == "output"), name
         for rule in entry.get("compare", []):
@@ -166,8 +168,7 @@ def test_masks_leave_most_of_every_vector_to_be_compared(folder: Path) -> None:
                 assert cotangent not in stored.files or np.any(stored[cotangent] != 0.0)
 
 
-def test_inputs_are_exact_in_float32(folder: Path) -> None:
-    index = json.loads((folder / "index.json").read_text())
+def test_inputs_are_exact_in_float32(folder: Path, index: dict[str, Any]) -> None:
     for vector in index["vectors"].values():
         arrays = index["kinds"][vector["kind"]]["arrays"]
         with np.load(folder / vector["file"]) as stored:
@@ -175,9 +176,8 @@ def test_inputs_are_exact_in_float32(folder: Path) -> None:
                 assert np.array_equal(stored[name], stored[name].astype(np.float32)), f"{vector['file']}: {name}"
 
 
-def test_vectors_of_an_older_version_are_refused(folder: Path, tmp_path: Path) -> None:
-    index = json.loads((folder / "index.json").read_text()) | {"version": 3}
-    (tmp_path / "index.json").write_text(json.dumps(index))
+def test_vectors_of_an_older_version_are_refused(index: dict[str, Any], tmp_path: Path) -> None:
+    (tmp_path / "index.json").write_text(json.dumps(index | {"version": 3}))
     with pytest.raises(ValueError, match="version is 3, this program reads 4; write the vectors again"):
         check(tmp_path, tmp_path)
 

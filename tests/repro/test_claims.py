@@ -1,6 +1,8 @@
 """Claims, readings and experiments on results whose answer is known by hand.
 
-The noise floor and its intervals are held to numbers made by hand, to scipy, and to how often they decide what is noise."""
+The noise floor and its intervals are held to numbers made by hand, to scipy, and to how often they decide what is
+noise.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""The reproduction's words: paper.toml is what the paper prints; protocol.md, README.md and claims.md are whole.
+"""The reproduction's words and tables: paper.toml is what the paper prints, and the pages are whole.
 
-Tables from results: means and spreads, what is compared with the paper and what must not be, and no blank cell."""
+Tables from results have means and spreads, what is compared with the paper and what must not be, and no blank cell.
+"""
 
 from __future__ import annotations
 
@@ -122,12 +123,11 @@ def printed(cell: str) -> tuple[float, int]:
 def test_every_value_and_every_colour_is_that_of_the_source() -> None:
     found = dict(printed_tables())
     assert set(found) == {table.label for table in paper().tables}
-    for table in paper().tables:
+    for each in paper().tables:
         told = [
-            [(line.values[d][m], line.marks[d][m]) for d in table.datasets for m in table.metrics]
-            for line in table.rows
+            [(line.values[d][m], line.marks[d][m]) for d in each.datasets for m in each.metrics] for line in each.rows
         ]
-        assert found[table.label] == told, table.label
+        assert found[each.label] == told, each.label
 
 
 def test_there_are_five_tables_of_288_cells() -> None:
@@ -144,10 +144,9 @@ def test_scenes_rows_and_encodings_are_known_to_each_other() -> None:
     sized = {line.row for number in (1, 2) for line in told.table(number).rows}
     assert set(told.bytes_per_gaussian) == sized
     assert set(told.bytes_per_gaussian.values()) == {236, 248}
-    for table in told.tables:
-        assert set(table.datasets) <= set(told.datasets)
-        for line in table.rows:
-            assert all((dataset, line.row) in told.lpips for dataset in table.datasets)
+    for each in told.tables:
+        assert set(each.datasets) <= set(told.datasets)
+        assert all((dataset, line.row) in told.lpips for line in each.rows for dataset in each.datasets)
 
 
 def test_the_defaults_of_the_method_are_the_stated_numbers() -> None:

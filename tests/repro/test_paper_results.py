@@ -1,6 +1,7 @@
 """A result survives its file, and one that is damaged or does not agree with itself is told by file, line and field.
 
-`pop-repro verify`: a result comes out again at its commit, and one that was altered does not."""
+By `pop-repro verify` it comes out again at its commit, and one that was altered does not.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""The rows' files: whole, in agreement with the recipes and with paper.toml, and refused where they are wrong.
+"""Rows, scenes and methods: whole, in agreement with the recipes and with paper.toml, and refused where they are wrong.
 
-Scenes under a data root: found in their published layouts, checked, and refused where the protocol has others.
-
-Every method is what its table says: what a run resolves, on which schedule, and what happens in a step."""
+Scenes under a data root are found in their published layouts and checked. Every method is what its table says: what a
+run resolves, on which schedule, and what happens in a step.
+"""
 
 from __future__ import annotations
 
@@ -95,9 +95,9 @@ def test_a_file_opens_with_claim_hardware_and_hours_and_describes_its_row(name):
 
 def test_rows_have_the_names_and_bytes_that_the_paper_has_for_them():
     printed = {}
-    for table in paper().tables:
-        for line in table.rows:
-            printed.setdefault(line.row, {})[str(table.number)] = line.name
+    for each in paper().tables:
+        for line in each.rows:
+            printed.setdefault(line.row, {})[str(each.number)] = line.name
     for row in load_rows():
         assert dict(row.paper) == printed.get(row.name, {}), row.name
         assert [str(number) for number in row.tables] == list(row.paper), row.name
@@ -398,47 +398,48 @@ def test_a_scene_that_is_absent_is_missing_and_its_source_is_named(root: Path):
     assert any(line.startswith("  fox          missing  expected: 50 photographs, 7 held out") for line in lines)
 
 
-def test_a_missing_photograph_is_refused_as_it_moves_the_split(root: Path):
-    (root / "360_v2" / "bonsai" / "images_2" / "view_003.png").unlink()
+REFUSED: dict[str, tuple[Callable[[Path], object], dict[str, Any], str]] = {
+    "a photograph is missing, which moves the split": (
+        lambda folder: (folder / "images_2" / "view_003.png").unlink(),
+        {},
+        "1 of 10 photographs are absent, images_2/view_003.png the first, which moves the every-8th split",
+    ),
+    "another number of photographs": (
+        lambda folder: None,
+        {"n_images": VIEWS + 1},
+        "has 10 photographs with a camera where 11 are published (as is recalled;",
+    ),
+    "no folder of shrunk photographs": (
+        lambda folder: shutil.rmtree(folder / "images_2"),
+        {},
+        "images_2: is absent; the protocol takes the photographs of this folder",
+    ),
+    "photographs that are not shrunk": (
+        lambda folder: shutil.copytree(folder / "images", folder / "images_2", dirs_exist_ok=True),
+        {},
+        "a photograph is 48 x 32 and its camera 48 x 32, and the protocol takes 1/2 of that",
+    ),
+    "one photograph of another size": (
+        lambda folder: write_png(odd := folder / "images_2" / "view_007.png", read_image(odd)[:10].copy()),
+        {},
+        "24 x 10",
+    ),
+    "another size than published": (
+        lambda folder: None,
+        {"size": (30, 20), "verified": True},
+        "has photographs of 24 x 16 where the protocol has 30 x 20: get it again from",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_a_scene_other_than_published_is_refused(root: Path, monkeypatch, what: str):
+    damage, published, says = REFUSED[what]
+    damage(root / "360_v2" / "bonsai")
+    monkeypatch.setitem(scenes.SCENES, "bonsai", replace(bonsai(), **published))
     found = check_scene(bonsai(), root)
     assert found.status == "refused"
-    assert (
-        "1 of 10 photographs are absent, images_2/view_003.png the first, which moves the every-8th split"
-        in found.reason
-    )
-
-
-def test_another_number_of_photographs_is_refused(root: Path, monkeypatch):
-    monkeypatch.setitem(scenes.SCENES, "bonsai", replace(bonsai(), n_images=VIEWS + 1))
-    found = check_scene(bonsai(), root)
-    assert found.status == "refused"
-    assert "has 10 photographs with a camera where 11 are published (as is recalled;" in found.reason
-
-
-def test_photographs_that_are_not_shrunk_as_published_are_refused(root: Path):
-    folder = root / "360_v2" / "bonsai"
-    shutil.rmtree(folder / "images_2")
-    assert (
-        "images_2: is absent; the protocol takes the photographs of this folder" in check_scene(bonsai(), root).reason
-    )
-    shutil.copytree(folder / "images", folder / "images_2")
-    found = check_scene(bonsai(), root)
-    assert found.status == "refused"
-    assert "a photograph is 48 x 32 and its camera 48 x 32, and the protocol takes 1/2 of that" in found.reason
-
-
-def test_one_photograph_of_another_size_is_refused(root: Path):
-    odd = root / "360_v2" / "bonsai" / "images_2" / "view_007.png"
-    write_png(odd, read_image(odd)[:10].copy())
-    found = check_scene(bonsai(), root)
-    assert found.status == "refused"
-    assert "24 x 10" in found.reason
-
-
-def test_photographs_of_another_size_than_published_are_refused(root: Path, monkeypatch):
-    monkeypatch.setitem(scenes.SCENES, "bonsai", replace(bonsai(), size=(30, 20), verified=True))
-    reason = check_scene(bonsai(), root).reason
-    assert "has photographs of 24 x 16 where the protocol has 30 x 20: get it again from" in reason
+    assert says in found.reason
 
 
 def test_a_capture_with_a_split_of_its_own_is_refused(root: Path, monkeypatch):

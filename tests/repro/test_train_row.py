@@ -1,6 +1,7 @@
 """Training a row: its result is whole, the same whether it was interrupted or not, and made once.
 
-Captures that were prepared for a node: the same bytes as those that are loaded, and nothing else is taken."""
+A row that begins from another's checkpoint, or from a capture that was prepared for a node, is the same row.
+"""
 
 from __future__ import annotations
 

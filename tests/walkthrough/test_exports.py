@@ -24,10 +24,8 @@ from pop_ref.walkthrough.builder.notebooks import notebook
 from pop_ref.walkthrough.builder.slides import FILE, chapters_of, deck, read_slides
 from pop_ref.walkthrough.pages import Outcome, run_chapter
 from pop_ref.walkthrough.widgets import html
-from tests.walkthrough.chromium import SCREENSHOTS, WHY_NOT, Page, keep
+from tests.walkthrough.chromium import SCREENSHOTS, Page, keep
 from tests.walkthrough.ran import CHAPTERS, MISSING, executed, ran, run_of
-
-in_browser = pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT)
 
 TEXT = """# minutes: 5
 
@@ -250,7 +248,7 @@ def test_a_training_in_a_book_is_drawn_before_the_page_is_loaded(page: Page, tmp
     assert page.ask("early.filter(each => / dB$/.test(each))") == ["10.3 dB", "10.3 dB"]
 
 
-@in_browser
+@pytest.mark.skipif(command.chromium() is None, reason="there is no Chromium here (apt install chromium)")
 def test_the_command_prints_a_book(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--pdf", str(tmp_path / "new" / "book.pdf"), "--only", "1"]) == 0
     assert [path.name for path in tmp_path.rglob("*.*")] == ["book.pdf"]

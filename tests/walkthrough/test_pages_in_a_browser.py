@@ -1,14 +1,11 @@
-"""Every chapter's page in a browser: on a desktop and a phone, light and dark, nothing sticks out or complains.
+"""Pages in a browser: on a desktop and a phone, light and dark, nothing sticks out or complains; widgets answer.
 
-The widgets in a browser: they appear, answer to sliders, fingers and keys, fit a phone, and say no error.
-
-`splat.py` in the page: asked for by a click, handed on as it is, and a sentence where there is no network.
-
-Pyodide itself, and NumPy for it, lie on a content network and on no package index, so a stand-in is served from this
-machine: it has Pyodide's names, runs no Python, and says what it was asked. What is real here is the page, its worker,
-and the file that the stand-in is handed; `test_splat.py` runs that file.
-
-What drives a Chromium through pipes closes them, also when the browser never answers."""
+Chapters and the contents fit their windows. Widgets appear, answer to sliders, fingers and keys. `splat.py` in the
+page is asked for by a click, handed on as it is, and a sentence says where there is no network. Pyodide itself, and
+NumPy for it, lie on a content network and on no package index, so a stand-in is served from this machine: it has
+Pyodide's names, runs no Python, and says what it was asked. What is real here is the page, its worker, and the file
+that the stand-in is handed; `test_splat.py` runs that file.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +30,7 @@ from pop_ref.walkthrough.builder.chapter import read_chapter
 from pop_ref.walkthrough.builder.layout import asset, chapter_page, index_page
 from pop_ref.walkthrough.widgets import FOLDER as WIDGET_FOLDER
 from pop_ref.walkthrough.widgets import PYODIDE, WIDGETS, html
-from tests.app import browser as of_the_app
-from tests.walkthrough import chromium
+from tests.app import browser
 from tests.walkthrough.chromium import SCREENSHOTS, Page, keep
 from tests.walkthrough.ran import CHAPTERS, ran
 
@@ -59,7 +55,7 @@ def _looked_at(page: Page, file: Path) -> None:
 
 
 def _is_sound(page: Page, name: str, width: int, dark: bool) -> None:
-    page.ask("new Promise(done => setTimeout(() => done(1), 100))")
+    _wait_ms(page, 100)
     assert page.complaints == []
     assert page.ask("document.documentElement.scrollWidth") <= width, page.ask(STICKS_OUT)
     assert page.ask(STICKS_OUT) == []
@@ -122,12 +118,9 @@ SPLAT = (Path(__file__).resolve().parents[2] / "pop_ref" / "learn" / "splat.py")
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("widgets")
-    style = asset("page.css")
     texts = {name: html(name) for name in NAMES} | {"all": "".join(html(name) for name in NAMES)}
     for name, text in texts.items():
-        head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><style>{style}</style>'
-        whole = f"<!doctype html><html><head>{head}</head><body><main>{text}</main></body></html>"
-        (folder / f"{name}.html").write_text(whole, encoding="utf-8")
+        _write_page(folder / f"{name}.html", text)
     return {name: folder / f"{name}.html" for name in texts}
 
 
@@ -149,6 +142,16 @@ CUT = """[...document.querySelectorAll('.pop-widget svg text')].filter(each => {
 
 def _image(png: bytes) -> np.ndarray:
     return matplotlib.image.imread(io.BytesIO(png), format="png")[..., :3]
+
+
+def _write_page(file: Path, text: str) -> None:
+    style = f"<style>{asset('page.css')}</style>"
+    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width">{style}'
+    file.write_text(f"<!doctype html><html><head>{head}</head><body><main>{text}</main></body></html>", "utf-8")
+
+
+def _wait_ms(page: Page, ms: int) -> None:
+    page.ask(f"new Promise(done => setTimeout(() => done(1), {ms}))")
 
 
 def _settle(page: Page) -> None:
@@ -263,33 +266,6 @@ def test_a_splat_is_dragged_by_mouse_finger_and_arrow_keys(page: Page, files: di
     assert page.complaints == []
 
 
-def test_what_a_splat_shows_is_what_the_oracle_computes(page: Page, files: dict[str, Path]) -> None:
-    from pop_ref.alpha import alpha_from_sigma, sigma_at_pixel
-    from pop_ref.footprint import conics_from_covars2d, low_pass, radii_from_covars2d
-
-    page.open(files["splat2d"])
-    turn = np.radians(23)
-    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    covars2d = low_pass((R @ np.diag([3.4**2, 1.5**2]) @ R.T)[None], 0.3)
-    conic = conics_from_covars2d(covars2d)[0].tolist()
-    sigma = sigma_at_pixel([12.1, 7.4], conic, 17.5, 10.5)
-    assert _reading(page, "its exponent \u03c3") == f"{sigma:.3f}"
-    assert _reading(page, "its alpha") == f"{alpha_from_sigma(sigma, 0.8)[0]:.4f}"
-    radii = radii_from_covars2d(covars2d, np.array([0.8]))[0]
-    assert _reading(page, "extent") == f"{2 * radii[0]} \u00d7 {2 * radii[1]} px"
-    n = sum(
-        not alpha_from_sigma(sigma_at_pixel([12.1, 7.4], conic, x + 0.5, y + 0.5), 0.8)[1]
-        for x in range(24)
-        for y in range(16)
-    )
-    assert _reading(page, "pixels drawn") == f"{n} of 384"
-    # the canvas leaves the rest of them clear
-    clear = (
-        "(c => [...c.getContext('2d').getImageData(0, 0, 24, 16).data].filter((x, i) => i % 4 === 3 && x > 0).length)"
-    )
-    assert page.ask(f"{clear}(document.querySelector('canvas'))") == n
-
-
 def test_splats_of_a_stack_change_places_and_a_wall_ends_the_pixel(page: Page, files: dict[str, Path]) -> None:
     page.open(files["stack"])
     order = """[...document.querySelectorAll('.pw-row')].sort((a, b) => a.style.order - b.style.order)
@@ -375,10 +351,10 @@ def test_a_page_trains_without_and_with_the_prior(page: Page, files: dict[str, P
     page.ask("document.querySelector('[aria-label=\"look from\"]').focus()")
     page.press("ArrowRight")
     _settle(page)
-    page.ask("new Promise(done => setTimeout(() => done(1), 600))")
+    _wait_ms(page, 600)
     assert page.ask(drawn)[2] != photo
     _click(page, "start again")
-    page.ask("new Promise(done => setTimeout(() => done(1), 600))")
+    _wait_ms(page, 600)
     assert _trained(page, 0) == before
     assert page.complaints == []
 
@@ -470,11 +446,7 @@ def served(tmp_path: Path) -> Iterator[tuple[str, Path, list[str]]]:
 def _opened(page: Page, place: Path, address: str, width: int = 900) -> None:
     markup = html("python")
     assert markup.count(json.dumps(PYODIDE)) == 1
-    text = markup.replace(json.dumps(PYODIDE), json.dumps(address))
-    head = (
-        f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><style>{asset("page.css")}</style>'
-    )
-    place.write_text(f"<!doctype html><html><head>{head}</head><body><main>{text}</main></body></html>")
+    _write_page(place, markup.replace(json.dumps(PYODIDE), json.dumps(address)))
     page.open(place, width=width)
 
 
@@ -496,7 +468,7 @@ def test_a_click_hands_python_the_file_as_it_is_and_shows_its_lines_and_its_pict
     (folder / "pyodide.js").write_text(f"const FAILS = false;{STAND_IN}", encoding="utf-8")
     splat.write_png(folder / "splat.png", np.full((8, 16, 3), [0.9, 0.2, 0.1]))
     _opened(page, tmp_path / "page.html", address, width=400)
-    page.ask("new Promise(done => setTimeout(() => done(1), 300))")
+    _wait_ms(page, 300)
     assert asked == [], "nothing is loaded before the click"
     page.ask("document.querySelector('button').click()")
     _wait(lambda: _status(page) == "splat.py has ended.")
@@ -542,17 +514,13 @@ def test_the_file_that_is_handed_on_runs_as_a_program_by_runpy(tmp_path: Path, m
     assert (tmp_path / "splat.png").read_bytes().startswith(b"\x89PNG")
 
 
-# ends at once
-SILENT = shutil.which("true")
-
-
-@pytest.mark.parametrize("driver", ["app", "walkthrough"])
-def test_a_browser_that_does_not_answer_leaves_no_pipe_open(
-    driver: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(of_the_app, "find_chromium", lambda: SILENT)
-    monkeypatch.setattr(chromium, "chromium", lambda: SILENT)
+def test_a_browser_that_does_not_answer_leaves_no_pipe_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # it ends at once
+    monkeypatch.setattr(browser, "find_chromium", lambda: shutil.which("true"))
     before = set(os.listdir("/proc/self/fd"))
-    with pytest.raises((AssertionError, RuntimeError, BrokenPipeError), match=r"ended|gone away|Broken pipe"):
-        (of_the_app.browser(tmp_path) if driver == "app" else chromium.Page()).__enter__()
+    with (
+        pytest.raises((AssertionError, BrokenPipeError), match=r"ended|Broken pipe"),
+        browser.browser(tmp_path),
+    ):
+        pass
     assert set(os.listdir("/proc/self/fd")) == before

@@ -1,6 +1,7 @@
-"""Splatting in one file is the oracle's: images, gradients, a densification step, Adam's steps.
+"""Splatting in one file, and the formulas that the course states in its own words, give what the oracle does.
 
-The formulas that the course states in its own words give what the oracle's functions return."""
+Of `splat.py`: images, gradients, a densification step, Adam's steps.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +37,7 @@ from pop_ref.training import gaussians_from_params, params_vjp
 SIZE = 24
 
 
-def _scene(seed: int, n: int = 60) -> dict[str, np.ndarray]:
+def _scene(seed: int, n: int) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(seed)
     return {
         "means": rng.uniform(-1.6, 1.6, (n, 3)),
@@ -50,17 +51,17 @@ def _scene(seed: int, n: int = 60) -> dict[str, np.ndarray]:
     }
 
 
-def _drawn(seed: int):
-    params, camera, background = _scene(seed), splat.orbit(0.7 * seed, SIZE), np.array([0.25, 0.5, 1.0])
-    # from nearby, so that the near plane and the frustum's clamp take part
-    camera[0][:3, 3] *= 0.45
-    return params, camera, background
+def toy(seed: int, n: int, size: int) -> tuple[dict[str, np.ndarray], Camera]:
+    """Draw a scene, and a camera so near that the near plane and the frustum's clamp take part."""
+    viewmat, *intrinsics = splat.orbit(0.7 * seed, size)
+    viewmat[:3, 3] *= 0.45
+    return _scene(seed, n), Camera(viewmat, *intrinsics)
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_images_gradients_and_dominant_counts_are_the_oracles(seed: int) -> None:
-    params, camera, background = _drawn(seed)
-    gaussians, view = gaussians_from_params(params), Camera(*camera)
+    (params, view), background = toy(seed, 60, SIZE), np.array([0.25, 0.5, 1.0])
+    camera, gaussians = (view.viewmat, view.K, SIZE, SIZE), gaussians_from_params(params)
     expected = render(gaussians, view, background)
     image, tape = splat.render(params, camera, background)
     assert np.max(np.abs(image - expected.image)) < 1e-12

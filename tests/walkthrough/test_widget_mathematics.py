@@ -1,8 +1,8 @@
-"""What the widgets compute is what the oracle computes: their pure functions, run by node, on vectors of the oracle.
+"""What the widgets compute and say is what the oracle computes; node runs their code.
 
-What a widget says with its picture is what the oracle computes, at the values that its prompt suggests.
-
-The widgets' own scripts run in node, on as much of a page as they need."""
+Their pure functions run on vectors of the oracle, and their own scripts on as much of a page as they need, at the
+values that their prompts suggest.
+"""
 
 from __future__ import annotations
 
@@ -41,6 +41,7 @@ from pop_ref.records import Camera
 from pop_ref.render import render, render_vjp
 from pop_ref.training import gaussians_from_params, params_vjp
 from pop_ref.walkthrough.widgets import FOLDER, WIDGETS, html, mathematics
+from tests.walkthrough.test_splat import toy
 
 NODE = shutil.which("node")
 pytestmark = pytest.mark.skipif(NODE is None, reason="there is no node here to run JavaScript")
@@ -255,21 +256,6 @@ def test_harmonics_and_their_colours() -> None:
     )
 
 
-def _toy(seed: int, n: int, size: int) -> tuple[dict[str, np.ndarray], Camera]:
-    """Draw a scene with needles and discs, splats past the picture, behind the camera, under the floor, too opaque."""
-    rng = np.random.default_rng(seed)
-    params = {
-        "means": rng.uniform(-1.6, 1.6, (n, 3)),
-        "quats": rng.standard_normal((n, 4)),
-        "scales": rng.uniform(-4.0, 0.3, (n, 3)),
-        "opacities": rng.uniform(-7.0, 9.0, n),
-        "sh0": rng.uniform(-2.5, 2.5, (n, 1, 3)),
-    }
-    camera = splat.orbit(0.7 * seed, size)
-    camera[0][:3, 3] *= 0.45
-    return params, Camera(*camera)
-
-
 def _told(camera: Camera) -> dict[str, Any]:
     R, t = camera.viewmat[:3, :3].ravel().tolist(), camera.viewmat[:3, 3].tolist()
     f, c = camera.K[[0, 1], [0, 1]].tolist(), camera.K[:2, 2].tolist()
@@ -301,7 +287,7 @@ def _close(found: Any, value: np.ndarray, relative: float, name: str = "") -> No
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_page_that_trains_draws_and_differentiates_as_the_oracle_does(seed: int) -> None:
-    (params, camera), background = _toy(seed, 60, 24), np.array([0.25, 0.5, 1.0])
+    (params, camera), background = toy(seed, 60, 24), np.array([0.25, 0.5, 1.0])
     gaussians = gaussians_from_params(params)
     v_image = np.random.default_rng(seed).standard_normal((24, 24, 3))
     expected = render(gaussians, camera, background)
@@ -364,7 +350,7 @@ def _oracles_training(
 
 def test_a_training_in_the_page_takes_the_oracles_steps() -> None:
     """Twelve steps, two of them densification steps, with every Gaussian's parameters and both moments compared."""
-    params, _ = _toy(1, 40, 20)
+    params, _ = toy(1, 40, 20)
     rng = np.random.default_rng(8)
     params["scales"] = rng.uniform(-4.2, -1.5, params["scales"].shape)
     params["opacities"] = rng.uniform(-5.6, 2.0, 40)
@@ -425,17 +411,19 @@ def _covar2d(long: float, short: float, degrees: float) -> np.ndarray:
     return (R @ np.diag([long**2, short**2]) @ R.T)[None]
 
 
-@pytest.mark.parametrize(("opacity", "long", "short", "eps2d"), [(0.02, 3.4, 1.5, 0.3), (0.8, 0.1, 0.1, 0.3)])
+AS_IT_OPENS = (0.8, 3.4, 1.5)
+
+
+@pytest.mark.parametrize(("opacity", "long", "short"), [AS_IT_OPENS, (0.02, 3.4, 1.5), (0.8, 0.1, 0.1)])
 def test_a_splat_tells_its_edge_its_extent_and_what_blur_does_to_its_paint(
-    opacity: float, long: float, short: float, eps2d: float
+    opacity: float, long: float, short: float
 ) -> None:
     assert "opacity down to 0.02" in WIDGETS["splat2d"].prompt
-    shown = _shown(
-        "splat2d",
-        ("slide", "opacity", opacity),
-        ("slide", "first standard deviation", long),
-        ("slide", "second standard deviation", short),
-    )["readings"]
+    sliders = ("opacity", "first standard deviation", "second standard deviation")
+    wanted = (opacity, long, short)
+    doings = [] if wanted == AS_IT_OPENS else [("slide", *each) for each in zip(sliders, wanted, strict=True)]
+    page, eps2d = _shown("splat2d", *doings), 0.3
+    shown = page["readings"]
     covar2d = _covar2d(long, short, 23)
     blurred = low_pass(covar2d, eps2d)
     k = np.sqrt(2.0 * np.log(255.0 * opacity))
@@ -448,10 +436,15 @@ def test_a_splat_tells_its_edge_its_extent_and_what_blur_does_to_its_paint(
     assert shown["ρ, antialiased mode only"] == f"{compensations(covar2d, eps2d)[0]:.3f}"
     assert (paint > 30.0) == (long == 0.1)
     conic = conics_from_covars2d(blurred)[0].tolist()
-    assert f"{0.5 * np.array([-5.4, -3.1]) @ np.linalg.inv(blurred[0]) @ [-5.4, -3.1]:.3f}" == shown["its exponent σ"]
+    sigma = 0.5 * np.array([-5.4, -3.1]) @ np.linalg.inv(blurred[0]) @ [-5.4, -3.1]
+    assert shown["its exponent σ"] == f"{sigma:.3f}"
+    assert shown["its alpha"] == f"{alpha.alpha_from_sigma(sigma, opacity)[0]:.4f}"
     rows = SplatRows([[12.1, 7.4]], [conic], [opacity], [[1.0]])
-    lit = [composite_pixel([0], rows, x + 0.5, y + 0.5, [0.0]).ids for x in range(24) for y in range(16)]
-    assert shown["pixels drawn"] == f"{sum(map(len, lit))} of 384"
+    lit = sum(len(composite_pixel([0], rows, x + 0.5, y + 0.5, [0.0]).ids) for x in range(24) for y in range(16))
+    assert shown["pixels drawn"] == f"{lit} of 384"
+    # the canvas leaves the rest of them clear
+    canvas = page["canvases"][0]
+    assert np.count_nonzero(canvas["data"][3::4]) == lit
 
 
 def _orbit_truth(distance: float, sideways: float) -> tuple[np.ndarray, np.ndarray]:
