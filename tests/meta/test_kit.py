@@ -684,9 +684,7 @@ def test_the_scenes_hold_what_they_are_for() -> None:
     assert all(not np.allclose(scene.camera.viewmat[:3, :3], np.eye(3)) for scene in scenes)
     assert any(scene.camera.width % scene.tile_size for scene in scenes)
     assert any(np.any(view.T_final < 1e-3) for view in views)
-
-
-def test_depth_is_not_distance_in_the_third_of_them() -> None:
+    # depth is not distance in the third of them
     scene = corners()[2]["scene"]
     p = scene.gaussians.means @ scene.camera.viewmat[:3, :3].T + scene.camera.viewmat[:3, 3]
     assert np.argsort(p[:, 2]).tolist() != np.argsort(np.linalg.norm(p, axis=1)).tolist()

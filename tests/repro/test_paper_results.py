@@ -20,7 +20,7 @@ import pytest
 from paper_repro.cli import main
 from paper_repro.jobs import job_named
 from paper_repro.record import to_line
-from paper_repro.results import RESULTS, SCALES, Result, existing_folder, find, kept, read, read_all, write
+from paper_repro.results import RESULTS, SCALES, Result, find, kept, read, read_all, write
 from paper_repro.train_row import commit
 from paper_repro.verify import history, other_kind
 from pop_fast.errors import PopError
@@ -192,12 +192,6 @@ def test_what_cannot_be_read_is_not_written(tmp_path: Path) -> None:
         with pytest.raises(PopError, match=r"psnr|run"):
             write(strange, tmp_path)
     assert not list(tmp_path.rglob("*.jsonl"))
-
-
-def test_a_folder_of_results_that_is_not_there_is_refused_where_it_is_read(tmp_path: Path) -> None:
-    assert existing_folder(tmp_path) == tmp_path
-    with pytest.raises(PopError, match="typo: no such folder; name the one that holds the results with --results"):
-        existing_folder(tmp_path / "typo")
 
 
 def test_a_curve_is_read_between_its_points() -> None:

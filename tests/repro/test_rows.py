@@ -138,22 +138,7 @@ def test_step_numbers_of_options_are_shortened_with_the_schedule():
     assert job_named("l2", "demo", "toy").config().strategy.blur_stop_iter == -1
     reset, pop = (job_named(row, "demo", "toy").config().strategy for row in ("reset", "pop"))
     assert (reset.reset_every, reset.prune_too_big_after, reset.prune_too_big) == (30, 30, True)
-    assert (pop.reset_every, pop.prune_too_big) == (0, False)
-
-
-@pytest.mark.parametrize("scale", ["small", "no_floor", "full", "paper"])
-def test_the_scales_that_judge_have_the_whole_schedule(scale):
-    scene = next(iter(SCALES[scale].factors))
-    reset, whole = job_named("reset", scene, scale).config(), job_named("reset", "garden", "paper").config()
-    assert SCALES[scale].steps_scaler == 1.0
-    assert replace(reset.strategy, blur_min_pixels=0.0) == whole.strategy
-    assert (reset.max_steps, reset.sh_interval) == (whole.max_steps, whole.sh_interval)
-
-
-def test_a_small_scale_keeps_theta_blur_at_ten_pixels_and_the_papers_does_not():
-    for scale, floor in (("toy", 10.0), ("small", 10.0), ("full", 10.0), ("no_floor", 0.0), ("paper", 0.0)):
-        scene = next(iter(SCALES[scale].factors))
-        assert job_named("pop", scene, scale).config().strategy.blur_min_pixels == floor
+    assert (pop.reset_every, pop.prune_too_big, pop.blur_min_pixels) == (0, False, 10.0)
 
 
 @pytest.mark.parametrize("scale", ["toy", "small", "full"])

@@ -24,26 +24,23 @@ from pop_ref.conformance.mutants.trial import every_law
 from pop_ref.learn import stubs
 from pop_ref.learn.course import BY_NAME, COURSE, NOT_TAUGHT, Stage
 from pop_ref.learn.diagnosis import diagnose
-from pop_ref.learn.drawing import HEAD, ORACLES, SIDE, YOURS, drawn_counterexample
+from pop_ref.learn.drawing import HEAD, ORACLES, SIDE, YOURS, drawn_counterexample, lettered
 from pop_ref.learn.grading import read_grade
-from pop_ref.learn.judge import Verdict, judge
-from pop_ref.learn.lettering import lettered
+from pop_ref.learn.judge import Verdict, judge, told
 from pop_ref.learn.mistakes import MISTAKES
 from pop_ref.learn.mistakes_geometry import Mistake
 from pop_ref.learn.probes import oracle, probes
 from pop_ref.learn.progress import PASSED, WRITTEN, course_map, note_passed, picture, state
 from pop_ref.learn.splat import orbit, photograph, write_png
 from pop_ref.learn.student import Call, borrowing, read_work, tried_on
-from pop_ref.learn.telling import told
 from pop_ref.learn.training import a_capture, a_picture, the_toy, train
 from pop_ref.walkthrough.builder.chapter import chapter_files, chapter_number
 
 ROOT = Path(__file__).resolve().parents[2]
 ORACLE = ROOT / "pop_ref"
-HERE = Path(__file__).parent
 # of each function, pieces of the right solution and what stands there instead
-WRONG = tomllib.loads((HERE / "wrong_solutions.toml").read_text(encoding="utf-8"))
-RIGHT = tomllib.loads((HERE / "right_solutions.toml").read_text(encoding="utf-8"))
+SOLUTIONS = tomllib.loads((Path(__file__).parent / "solutions.toml").read_text(encoding="utf-8"))
+WRONG, RIGHT = SOLUTIONS["wrong"], SOLUTIONS["right"]
 
 
 def oracles_text(name: str) -> str:
