@@ -20,6 +20,9 @@ from pop_ref.learn.judge import Verdict
 from pop_ref.learn.student import Call, numbers
 from pop_ref.render import render
 
+# of a letter, which is three by five of them, and a line of text
+SQUARE: Final = 2
+LINE: Final = 7 * SQUARE
 SIDE: Final = 240
 # over each panel, for two lines
 HEAD: Final = 2 * LINE
@@ -220,8 +223,6 @@ def write_film(path: Path, frames: Sequence[np.ndarray], seconds: float = 0.4) -
     beside.replace(path)
 
 
-SQUARE: Final = 2
-LINE: Final = 7 * SQUARE
 _CHARACTERS: Final = "0123456789abcdefghijklmnopqrstuvwxyz[]-+.,: "
 # of each five rows from the top, an octal digit a row, whose three bits are the squares from the left
 _ROWS: Final = (
