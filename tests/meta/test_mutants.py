@@ -134,14 +134,11 @@ def test_what_is_published_of_kills_is_of_todays_mutants_in_every_precision_that
         assert tried == {mutant.name: set(mutant.precisions) for mutant in mutants}, "run 'make kit'"
 
 
-def test_there_are_at_least_twenty_mutants_and_no_two_alike() -> None:
+def test_mutants_are_many_no_two_alike_and_each_changes_one_place_of_one_file() -> None:
     assert len(MUTANTS) >= 20
     assert len({mutant.name for mutant in (*EVERYONE, *BLACK_BOXES)}) == len(EVERYONE) + len(BLACK_BOXES)
     assert len({mutant.law for mutant in BLACK_BOXES}) >= 8
     assert len({(mutant.package, mutant.file, mutant.new) for mutant in EVERYONE}) == len(EVERYONE)
-
-
-def test_each_change_is_one_place_of_one_file() -> None:
     for mutant in EVERYONE:
         assert mutant.broken_source()
         assert law_named(mutant.law).name == mutant.law.partition(":")[2]

@@ -117,17 +117,14 @@ def test_every_stage_has_functions_and_laws(stage) -> None:
     assert all(path.is_file() for path in stages.files("pop_fast", stage))
 
 
-def test_the_rooms_share_most_of_their_functions() -> None:
-    assert len(BOTH_ROOMS) >= 40
-
-
 @pytest.mark.parametrize(("name", "reference", "fast"), BOTH_ROOMS, ids=lambda value: value if value else "")
 def test_twins_take_the_same_parameters(name: str, reference: list[str], fast: list[str]) -> None:
     """The fast twin may add parameters of its own, after the oracle's."""
     assert (fast[: len(reference)] == reference) == (name not in OTHER_PARAMETERS), (reference, fast)
 
 
-def test_documented_differences_are_still_there() -> None:
+def test_the_rooms_share_most_of_their_functions_and_documented_differences_are_still_there() -> None:
+    assert len(BOTH_ROOMS) >= 40
     assert set(OTHER_PARAMETERS) <= {name for name, _, _ in BOTH_ROOMS}
 
 
@@ -232,12 +229,9 @@ def test_the_pictures_are_small_and_made_of_our_own_scene() -> None:
 # docs/FORMATS.md says what the program's table of formats says.
 
 
-def test_the_page_is_the_one_that_is_made() -> None:
+def test_the_page_of_formats_is_the_one_that_is_made_and_tells_every_loss() -> None:
     made = runpy.run_path(str(DOCS / "formats.py"))["page"]()
     assert (DOCS / "FORMATS.md").read_text(encoding="utf-8") == made, "run 'python docs/formats.py --write'"
-
-
-def test_every_format_says_what_it_loses_of_every_field() -> None:
     fields = ["centre", "scale", "rotation", "opacity", "colour", "view dependence"]
     assert all(list(format.losses) == fields for format in FORMATS.values())
 
@@ -248,17 +242,11 @@ SCRIPT = runpy.run_path(str(DOCS / "commands.py"), run_name="commands")
 PAGE = (DOCS / "commands.md").read_text(encoding="utf-8")
 
 
-def test_every_command_was_run_and_is_shown() -> None:
+def test_every_command_was_run_and_is_shown_and_none_failed() -> None:
     assert SCRIPT["lacking"](PAGE) == [], "run 'python docs/commands.py --write'"
     assert SCRIPT["lacking"](PAGE.replace("## pop eval", "## pop evaluate")) == ["pop eval"]
-
-
-def test_every_command_line_of_the_script_is_on_the_page() -> None:
     typed = [run.words for run in (*SCRIPT["RUNS"], *SCRIPT["REPRO"])]
     assert re.findall(r"^\$ (.*)$", PAGE, flags=re.MULTILINE) == typed
-
-
-def test_no_command_failed_and_no_path_of_the_machine_is_shown() -> None:
     assert "Traceback" not in PAGE
     assert "error:" not in PAGE
     assert not re.search(r"(^|[\s\"'(])/(tmp|home|root|work|Users)\b", PAGE)

@@ -497,7 +497,8 @@ def test_the_spread_is_pooled_over_rows_and_scenes_about_each_mean() -> None:
     # 2 and 6, over one and two degrees of freedom
     assert (spread.s, spread.df, spread.groups) == (pytest.approx(sqrt(8.0 / 3.0)), 3, 2)
     assert (spread.least, spread.largest) == (pytest.approx(sqrt(2.0)), pytest.approx(sqrt(3.0)))
-    assert noise_of(runs("pop", 1.0)).of(PSNR) is None
+    # no noise is no floor of zero
+    assert noise_of(runs("pop", 1.0)).of(PSNR) is Noise([]).of(PSNR) is None
 
 
 def test_counts_vary_by_their_ratios_and_times_on_each_machine_alone() -> None:
@@ -605,7 +606,3 @@ def test_a_difference_far_beyond_the_noise_is_decided_by_its_sign_in_results_of_
     verdicts = {e.scene: e.verdict for e in told.told.evidence}
     assert verdicts == {scene: "holds" if effect > 0.0 else "does not hold" for scene, effect in effects.items()}
     assert told.verdict == ("holds" if min(effects.values()) > 0.0 else "does not hold")
-
-
-def test_no_noise_is_no_floor_of_zero() -> None:
-    assert Noise([]).of(PSNR) is None

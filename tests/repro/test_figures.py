@@ -471,9 +471,7 @@ def test_names_of_close_markers_cover_nothing_and_are_nearest_to_their_own_or_jo
         if not place.is_joined:
             assert distance(place.box, marker) <= min(distance(place.box, other) for other in others)
     assert sum(place.is_joined for place in found) <= 2
-
-
-def test_the_order_of_markers_changes_no_place_of_markers_far_apart():
+    # their order changes no place of markers far apart
     apart = [CLUSTERS[2], CLUSTERS[3], CLUSTERS[1]]
     assert places(apart, FRAME) == places(apart[::-1], FRAME)[::-1]
 
@@ -527,10 +525,12 @@ def test_the_grid_in_the_repository_is_of_the_still_life_and_worth_showing():
     assert all(float(line["psnr"]) > 25.0 for line in found)
 
 
-def test_without_renders_the_grid_says_where_it_looked(tmp_path):
+def test_without_renders_or_a_scene_figures_say_where_they_looked(tmp_path):
     runs = [result("pop"), result("3dgs")]
     with pytest.raises(NoDataError, match=f"whose renders are in {tmp_path}; give the folder"):
         qualitative.renders_and_photographs(asked("5", runs, tmp_path))
+    with pytest.raises(PopError, match=f"{tmp_path} has none of kitchen; name another --data"):
+        opacity_one.pushed(asked("3", [], tmp_path, scale="paper"))
 
 
 def test_the_most_different_square_is_that_of_a_search_over_all():
@@ -593,8 +593,3 @@ def test_a_constant_map_has_no_correlation():
     ramp = np.arange(12.0).reshape(3, 4)
     assert artifact.correlation(np.full((3, 4), 0.3), ramp) is None
     assert artifact.correlation(ramp, -2.0 * ramp + 1.0) == pytest.approx(-1.0, rel=1e-12)
-
-
-def test_the_artifacts_need_a_scene(tmp_path):
-    with pytest.raises(PopError, match=f"{tmp_path} has none of kitchen; name another --data"):
-        opacity_one.pushed(asked("3", [], tmp_path, scale="paper"))

@@ -238,14 +238,12 @@ def test_details_are_numbered_without_gaps(letter: str) -> None:
     assert len(numbers) == {"P": 26, "C": 9}[letter]
 
 
-def test_every_detail_says_what_it_rests_on() -> None:
+def test_every_detail_says_what_it_rests_on_and_refers_to_what_is_there() -> None:
     details = re.findall(r"^- \*\*P\d+\. .*$", PROTOCOL, flags=re.MULTILINE)
     evidence = re.compile(r"\*(paper|source|derived|here)\*")
     # the last is a rule of this project
     assert [d[:40] for d in details[:-1] if not evidence.search(d)] == []
-
-
-def test_every_label_that_is_referred_to_is_there() -> None:
+    # every label that is referred to is there
     there = set(re.findall(r"^- \*\*([PC]\d+)\. ", PROTOCOL, flags=re.MULTILINE)) | {a.id for a in AMBIGUITIES}
     named = set(re.findall(r"\b([PCA]\d{1,2})\b", PROTOCOL))
     assert named <= there
@@ -480,14 +478,11 @@ def test_ratios_stand_beside_the_papers_own() -> None:
     assert table(1, "paper", []).ratios is None
 
 
-def test_a_ratio_without_its_base_says_so() -> None:
+def test_a_ratio_without_its_base_says_so_and_every_base_is_in_its_table() -> None:
     ratios = table(1, "small", DEV[:1]).ratios
     assert ratios is not None
     assert ratios.relative is not None
     assert ratios.relative["pop"][0] == "gsplat not run"
-
-
-def test_the_base_of_every_ratio_is_in_its_table() -> None:
     assert {number: base for number, base in REFERENCES.items() if paper().table(number).row(base)} == REFERENCES
     assert set(REFERENCES) == {1, 2, 3, 4, 5}
 

@@ -81,6 +81,8 @@ READINGS = {
 def test_every_file_is_a_row_and_every_row_has_a_file():
     assert sorted(path.stem for path in CONFIGS.glob("*.toml")) == sorted(ROWS)
     assert len(set(ROWS)) == len(ROWS)
+    # and no two train the same
+    assert len({tuple(job_named(name, "train", "paper").words()) for name in ROWS}) == len(ROWS)
 
 
 @pytest.mark.parametrize("name", ROWS)
@@ -121,11 +123,6 @@ def test_a_row_trains_what_the_recipe_of_its_name_says(name):
 def test_a_reading_differs_from_pop_in_one_value(name):
     pop = job_named("pop", "garden", "paper").config().strategy
     assert replace(pop, **dict([READINGS[name]])) == job_named(name, "garden", "paper").config().strategy != pop
-
-
-def test_no_two_rows_train_the_same():
-    words = [tuple(job_named(name, "train", "paper").words()) for name in ROWS]
-    assert len(set(words)) == len(ROWS)
 
 
 def test_step_numbers_of_options_are_shortened_with_the_schedule():
@@ -256,11 +253,6 @@ def test_a_missing_field_a_strange_scene_and_what_is_no_toml_are_named(tmp_path:
         header_of("pop", tmp_path)
 
 
-def test_the_scenes_of_the_papers_scale_are_the_papers():
-    of_paper = {scene.name for scene in scenes.SCENES.values() if scene.in_paper}
-    assert {scene for names in paper().datasets.values() for scene in names} == of_paper == set(SCALES["paper"].factors)
-
-
 LAYOUTS = {
     "garden": ("mipnerf360/garden", "360_v2/garden", "garden"),
     "flowers": ("360_extra_scenes/flowers", "mipnerf360/flowers"),
@@ -300,11 +292,8 @@ def test_a_scene_is_found_in_each_published_layout(tmp_path: Path, name, place):
         find_folder(SCENES[name], tmp_path)
     (tmp_path / place).mkdir(parents=True)
     assert find_folder(SCENES[name], tmp_path) == tmp_path / place
-
-
-def test_a_root_that_is_not_there_is_named(tmp_path: Path):
     with pytest.raises(PopError, match=r"nowhere: no such folder; name the one that holds the scenes with --data"):
-        find_folder(SCENES["fox"], tmp_path / "nowhere")
+        find_folder(SCENES[name], tmp_path / "nowhere")
 
 
 def test_every_scene_says_what_it_is_and_where_it_comes_from():
@@ -317,6 +306,8 @@ def test_every_scene_says_what_it_is_and_where_it_comes_from():
         *("bicycle", "flowers", "garden", "stump", "treehill")
     ]
     assert {scene for scale in SCALES.values() for scene in scale.factors} == set(SCENES)
+    of_paper = {scene.name for scene in SCENES.values() if scene.in_paper}
+    assert {scene for names in paper().datasets.values() for scene in names} == of_paper == set(SCALES["paper"].factors)
     # what was compared with the photographs, and nothing else
     assert {scene.name for scene in SCENES.values() if scene.verified} == {
         *("garden_512", "bonsai_800", "bear_512", "fox", *MADE)
@@ -439,17 +430,11 @@ def test_a_capture_with_a_split_of_its_own_is_refused(root: Path, monkeypatch):
         check_capture(job, replace(config, test_every=5, given=None), capture)
     with pytest.raises(PopError, match="bonsai has 9 photographs with a camera where 10 are published"):
         check_capture(job, config, replace(capture, views=capture.views[:-1]))
-
-
-def test_a_capture_that_was_read_at_another_size_is_refused(root: Path):
-    job = job_named("pop", "bonsai", "paper")
+    # and one that was read at another size
     whole = load_capture(root / "360_v2" / "bonsai", images="images")
     with pytest.raises(PopError, match="bonsai has photographs of 48 x 32 where the protocol has 24 x 16"):
-        check_capture(job, job.config(), whole)
-
-
-def test_the_held_out_views_are_every_eighth_from_the_first(root: Path):
-    capture = load_capture(root / "360_v2" / "bonsai", images="images_2")
+        check_capture(job, config, whole)
+    # the held-out views are every eighth from the first
     assert [view.name for view in capture.test_views(HOLD_OUT)] == ["view_000.png", "view_008.png"]
 
 

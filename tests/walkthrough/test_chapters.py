@@ -249,6 +249,8 @@ def test_a_small_chapter_shows_what_it_prints_draws_and_folds() -> None:
     outcomes = run_chapter(chapter)
     assert [outcome.printed for outcome in outcomes] == ["", "1.0\n", "", ""]
     page = chapter_page(chapter, outcomes, [chapter])
+    # the same chapter makes the same bytes
+    assert _whole(GOOD) == page
     assert "A caption &lt; with" in page
     assert page.index("<summary>Answer</summary>") > page.index("What is two?")
     assert "<msup><mi>x</mi><mn>2</mn></msup>" in page
@@ -373,10 +375,6 @@ def _whole(text: str) -> str:
     return chapter_page(chapter, run_chapter(chapter), [chapter])
 
 
-def test_the_same_chapter_makes_the_same_bytes() -> None:
-    assert _whole(GOOD) == _whole(GOOD)
-
-
 def _fails(old: str, new: str) -> str:
     assert GOOD.count(old) == 1
     with pytest.raises(ChapterError) as caught:
@@ -384,12 +382,10 @@ def _fails(old: str, new: str) -> str:
     return str(caught.value)
 
 
-def test_a_false_claim_is_named_with_its_file_and_line() -> None:
+def test_a_false_claim_and_an_error_inside_the_oracle_are_named_with_file_and_line() -> None:
     told = _fails("assert two == 2", "assert two == 3")
     assert told == "chapter_01_small.py:29: AssertionError\n    assert two == 3"
-
-
-def test_an_error_inside_the_oracle_is_named_where_the_chapter_calls() -> None:
+    # where the chapter calls
     told = _fails("two = 2", "from pop_ref.constants import profile_named\ntwo = profile_named('none')")
     assert told.startswith("chapter_01_small.py:29: ValueError: profile 'none' is unknown")
     assert told.endswith("\n    two = profile_named('none')")

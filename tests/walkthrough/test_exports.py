@@ -258,16 +258,13 @@ def test_the_command_prints_a_book(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "book.pdf" in capsys.readouterr().out
 
 
-def test_without_a_browser_the_command_says_what_a_book_needs(
+def test_without_a_browser_or_by_one_that_prints_nothing_a_book_is_an_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CHROMIUM", "no-such-browser")
     assert main(["--pdf", str(tmp_path / "book.pdf"), "--only", "1"]) == 2
     assert capsys.readouterr().err.startswith("a PDF needs Chromium or Chrome: install it")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_browser_that_prints_nothing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CHROMIUM", "false")
     with pytest.raises(command.BrowserError, match="false printed nothing"):
         command._printed("<p>")
