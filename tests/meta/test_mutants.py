@@ -210,8 +210,7 @@ def test_a_law_notices_twice_the_tooth_and_not_half_of_it(quantity: str, what: s
         assert (obeys(law_named(f"test_agreement:{law}"), off, examples=0) is not None) == noticed
 
 
-ROOT = Path(__file__).parents[2]
-COVERAGE = json.loads((ROOT / "benchmarks" / "results" / "law_coverage.json").read_text(encoding="utf-8"))
+COVERAGE = json.loads((RESULTS / "law_coverage.json").read_text(encoding="utf-8"))
 
 
 def test_lines_that_run_are_logged_and_no_others() -> None:

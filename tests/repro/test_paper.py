@@ -545,13 +545,11 @@ def test_no_cell_is_blank_and_every_line_has_all_columns(results: list[Result], 
     assert tex.count(r"\begin") == tex.count(r"\end")
 
 
+@needs_the_source
 def test_the_colours_are_those_of_the_paper() -> None:
-    source = Path(__file__).resolve().parents[3] / "shared" / "paper" / "pop_paper.tex"
-    if not source.is_file():
-        pytest.skip("../shared/paper with the LaTeX source is absent")
     colours = re.findall(r"\\definecolor.*", PREAMBLE)
     assert len(colours) == 3
-    assert all(colour in source.read_text(encoding="utf-8") for colour in colours)
+    assert all(colour in SOURCE.read_text(encoding="utf-8") for colour in colours)
 
 
 def test_what_goes_beyond_the_paper_has_a_table_of_its_own() -> None:

@@ -320,13 +320,9 @@ def test_a_scene_is_one_file_and_nothing_else_is_edited_to_add_one(tmp_path: Pat
     fox = (package / "scenes" / "fox.toml").read_text(encoding="utf-8")
     (tmp_path / "paper_repro" / "scenes" / "porch.toml").write_text(fox.replace('folder = "fox"', 'folder = "porch"'))
     asked = ["queue", "--scale", "small", "--rows", "pop", "--results", str(tmp_path), "--list"]
-    done = subprocess.run(
-        [sys.executable, "-P", "-m", "paper_repro", *asked],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(package.parent)])},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    command = [sys.executable, "-P", "-m", "paper_repro", *asked]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(package.parent)])}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     assert "pop porch --scale small --seed 42" in done.stdout.splitlines()
 
 
