@@ -26,12 +26,14 @@ from pop_ref.records import Camera
 from pop_ref.render import RenderGradients
 from pop_ref.training import Training, start
 
+# functions by name
+Oracle = dict[str, Callable[..., Any]]
 # what is special, empty for a plain input; the arguments
 Probe = tuple[str, tuple[Any, ...]]
 
 
 @functools.cache
-def oracle() -> dict[str, Callable[..., Any]]:
+def oracle() -> Oracle:
     """Return the oracle's functions of the course by name."""
     return {
         name: getattr(importlib.import_module(f"pop_ref.{home}"), name)

@@ -27,8 +27,7 @@ from pop_ref.learn.diagnosis import diagnose
 from pop_ref.learn.drawing import HEAD, ORACLES, SIDE, YOURS, drawn_counterexample, lettered
 from pop_ref.learn.grading import read_grade
 from pop_ref.learn.judge import Verdict, judge, told
-from pop_ref.learn.mistakes import MISTAKES
-from pop_ref.learn.mistakes_geometry import Mistake
+from pop_ref.learn.mistakes import MISTAKES, Mistake
 from pop_ref.learn.probes import oracle, probes
 from pop_ref.learn.progress import PASSED, WRITTEN, course_map, note_passed, picture, state
 from pop_ref.learn.splat import orbit, photograph, write_png
