@@ -20,23 +20,9 @@ from torch import Tensor
 
 from pop_fast.api.rasterize import rasterization as fast
 from pop_ref.compositing import composite, composite_vjp
-from pop_ref.conformance import Adapter, Scene
+from pop_ref.conformance import Adapter, Scene, capabilities
 from pop_ref.conformance.adapter import OracleAdapter, View, stage_function, under
 from pop_ref.conformance.backends import ELSEWHERE, Absent, Unavailable, made_by, shipped, shipped_or_absent
-from pop_ref.conformance.capabilities import (
-    DERIVATIVES,
-    DETERMINISTIC,
-    DOMINANCE,
-    DOMINANT_WEIGHTS,
-    EXTENTS,
-    GRADIENTS,
-    HOMOGENEOUS,
-    INRIAS,
-    LOWER_CEILING,
-    PACKED,
-    PROFILES,
-    RENDER,
-)
 from pop_ref.conformance.failure_report import failure_report
 from pop_ref.conformance.inria_adapter import inria
 from pop_ref.conformance.law import missing
@@ -46,8 +32,7 @@ from pop_ref.conformance.mutants.trial import every_law, law_named, obeys
 from pop_ref.conformance.scenes import golden_scene, scene_as_code
 from pop_ref.conformance.torch_adapter import TorchAdapter
 from pop_ref.conformance.views import ASKED
-from pop_ref.constants import GSPLAT_1_5, GSPLAT_1_6, INRIA, PAPER, Profile
-from pop_ref.constants import PROFILES as ALL_PROFILES
+from pop_ref.constants import GSPLAT_1_5, GSPLAT_1_6, INRIA, PAPER, PROFILES, Profile
 from pop_ref.projection import project_means
 
 LAWS = every_law()
@@ -234,8 +219,10 @@ def test_a_rasterizer_that_needs_a_gpu_says_so(monkeypatch: pytest.MonkeyPatch) 
 def test_inrias_interface_is_judged_through_its_adapter(dtype: str) -> None:
     adapter = inria("stub", STUB, dtype, "cpu")
     assert not broken(adapter)
-    assert not missing(adapter, (RENDER, GRADIENTS, INRIAS))
-    assert missing(adapter, (PROFILES, EXTENTS, DERIVATIVES, LOWER_CEILING))
+    assert not missing(adapter, (capabilities.RENDER, capabilities.GRADIENTS, capabilities.INRIAS))
+    assert missing(
+        adapter, (capabilities.PROFILES, capabilities.EXTENTS, capabilities.DERIVATIVES, capabilities.LOWER_CEILING)
+    )
     g = adapter.gradients(adapter.sees(golden_scene()), np.ones((16, 16, 3)), np.zeros((16, 16)))
     assert set(g) == {"means", "quats", "scales", "opacities", "sh", "means2d"}
 
@@ -273,19 +260,19 @@ def fixed(profile: str) -> TorchAdapter:
     from pop_fast.api.rasterize import rasterization as sound
 
     def rasterization(*args: Any, rasterize_mode: str = "classic", **options: Any) -> Any:
-        options["near_plane"] = ALL_PROFILES[profile].near_plane
+        options["near_plane"] = PROFILES[profile].near_plane
         options["rasterize_mode"] = rasterize_mode
         image, alphas, meta = sound(*args, profile=profile, **options)
         return image, alphas, {"means2d": meta["means2d"], "radii": meta["radii"]}
 
-    return TorchAdapter(f"fixed {profile}", rasterization, profile=ALL_PROFILES[profile])
+    return TorchAdapter(f"fixed {profile}", rasterization, profile=PROFILES[profile])
 
 
 @pytest.mark.parametrize("profile", ["gsplat_1_6", "inria"])
 def test_a_rasterizer_with_one_profile_is_judged_under_it(profile: str) -> None:
     adapter = fixed(profile)
     assert not broken(adapter)
-    assert adapter.sees(golden_scene()).profile == ALL_PROFILES[profile]
+    assert adapter.sees(golden_scene()).profile == PROFILES[profile]
 
 
 def test_a_rasterizer_of_another_profile_than_it_claims_is_noticed() -> None:
@@ -340,15 +327,15 @@ def test_a_stage_is_judged_through_an_adapter_of_a_few_lines() -> None:
     judged = [path for path, law in LAWS.items() if not missing(adapter, law.needs)]
     assert judged == ["test_alpha:the_falloff_is_one_at_the_centre_and_multiplies_over_sums"]
     assert not broken(adapter, *judged)
-    assert not adapter.has(RENDER)
+    assert not adapter.has(capabilities.RENDER)
     with pytest.raises(LookupError, match="one stage has no stage function sigma_at_pixel"):
         adapter.stage("sigma_at_pixel")
 
 
 def test_blending_alone_is_judged_by_the_laws_of_images_and_gradients() -> None:
     adapter = Blending()
-    assert adapter.has(RENDER)
-    assert adapter.has(GRADIENTS)
+    assert adapter.has(capabilities.RENDER)
+    assert adapter.has(capabilities.GRADIENTS)
     assert not broken(adapter, IMAGE, GRADIENT, BACKGROUND)
     assert broken(ForgetsBackground(), GRADIENT, BACKGROUND) == [BACKGROUND]
 
@@ -448,11 +435,11 @@ def leaving_torch(means: Any, *args: Any, **options: Any) -> Any:
 @pytest.mark.parametrize("rasterization", [only_drawing, leaving_torch])
 def test_a_rasterizer_that_only_draws_is_judged_by_its_images(rasterization: Callable[..., Any]) -> None:
     backend = TorchAdapter("drawing", rasterization, dtype="float32")
-    assert backend.has(RENDER)
-    assert not backend.has(GRADIENTS)
-    of_gradients = [stated for stated in LAWS.values() if GRADIENTS in stated.needs]
+    assert backend.has(capabilities.RENDER)
+    assert not backend.has(capabilities.GRADIENTS)
+    of_gradients = [stated for stated in LAWS.values() if capabilities.GRADIENTS in stated.needs]
     assert len(of_gradients) > 15
-    assert all(GRADIENTS in missing(backend, stated.needs) for stated in of_gradients)
+    assert all(capabilities.GRADIENTS in missing(backend, stated.needs) for stated in of_gradients)
     # the laws of the signature compare its images all the same
     cameras = law_named("test_signature_cameras:several_cameras_in_one_call_see_what_each_sees_alone")
     assert not missing(backend, cameras.needs)
@@ -464,7 +451,7 @@ def test_a_gradient_that_fails_is_a_failure_and_not_a_missing_piece() -> None:
         raise RuntimeError("illegal memory access")
 
     with pytest.raises(RuntimeError, match="illegal memory access"):
-        TorchAdapter("broken", broken).has(GRADIENTS)
+        TorchAdapter("broken", broken).has(capabilities.GRADIENTS)
 
 
 def ids_alone(*args: Any, **options: Any) -> Any:
@@ -474,9 +461,9 @@ def ids_alone(*args: Any, **options: Any) -> Any:
 
 def test_dominant_ids_are_judged_without_weights_and_counts() -> None:
     backend = TorchAdapter("ids", ids_alone, dtype="float32")
-    assert backend.has(DOMINANCE)
-    assert not backend.has(DOMINANT_WEIGHTS)
-    judged = [path for path, s in LAWS.items() if DOMINANCE in s.needs and not missing(backend, s.needs)]
+    assert backend.has(capabilities.DOMINANCE)
+    assert not backend.has(capabilities.DOMINANT_WEIGHTS)
+    judged = [path for path, s in LAWS.items() if capabilities.DOMINANCE in s.needs and not missing(backend, s.needs)]
     assert len(judged) >= 6
     assert {path: broken for path in judged if (broken := obeys(LAWS[path], backend, 10))} == {}
 
@@ -538,8 +525,8 @@ PACKED_LAW = "test_signature_cameras:packed_rows_are_those_of_the_visible_gaussi
 @pytest.mark.parametrize("words", REFUSALS)
 def test_what_is_refused_on_purpose_is_skipped_in_the_words_of_the_refusal(words: str) -> None:
     backend = TorchAdapter("refusing", REFUSALS[words], dtype="float32")
-    assert missing(backend, law_named(PACKED_LAW).needs) == [PACKED]
-    assert "packed" in str(backend.why_not(PACKED))
+    assert missing(backend, law_named(PACKED_LAW).needs) == [capabilities.PACKED]
+    assert "packed" in str(backend.why_not(capabilities.PACKED))
 
 
 def test_a_rasterizer_with_fewer_arguments_than_gsplats_is_judged_by_those_it_has() -> None:
@@ -581,7 +568,7 @@ def unordered(means: Any, *args: Any, **options: Any) -> Any:
 def test_sums_without_an_order_are_not_held_to_equal_bits() -> None:
     assert obeys(law_named(TWICE), TorchAdapter("careless", unordered, dtype="float32"), 10) is not None
     backend = TorchAdapter("atomic", unordered, dtype="float32", deterministic=False)
-    skipped = {path for path, stated in LAWS.items() if DETERMINISTIC in missing(backend, stated.needs)}
+    skipped = {path for path, stated in LAWS.items() if capabilities.DETERMINISTIC in missing(backend, stated.needs)}
     assert {TWICE, "test_gradients:gradients_ignore_the_coefficients_of_other_bands"} <= skipped
     assert "test_agreement:gradients_are_the_oracles" not in skipped
     assert obeys(law_named("test_agreement:gradients_are_the_oracles"), backend, 10) is None
@@ -628,8 +615,8 @@ def test_inrias_divisor_breaks_no_law_of_its_profile() -> None:
     backend = InriasDivision()
     assert obeys(law_named(SCALED), backend) is not None
     backend.profile = INRIA
-    assert Adapter.has(backend, HOMOGENEOUS) is False
-    assert HOMOGENEOUS in law_named(SCALED).needs
+    assert Adapter.has(backend, capabilities.HOMOGENEOUS) is False
+    assert capabilities.HOMOGENEOUS in law_named(SCALED).needs
 
 
 class Greyish(OracleAdapter):
@@ -696,7 +683,7 @@ def test_an_argument_that_is_refused_or_not_there_is_a_skip_by_name() -> None:
     for rasterization, expected in lacks.items():
         backend = TorchAdapter("partial", rasterization, dtype="float32")
         assert {name for name in ASKED if not backend.has(name)} == expected | {"sparse_grad"}
-        assert backend.has(GRADIENTS), "an argument absgrad is no condition of gradients"
+        assert backend.has(capabilities.GRADIENTS), "an argument absgrad is no condition of gradients"
 
 
 def of_one_profile(profile: Profile) -> Any:

@@ -1,6 +1,7 @@
-"""The other forms of the chapters: slides that turn and fit, a printed book, and the command that writes them.
+"""The other forms of the chapters: notebooks, slides that turn and fit, a printed book, and their command.
 
-The notebooks: they hold the chapter, run in Jupyter, and every picture appears; the first nine need no torch."""
+Notebooks hold the chapter, run in Jupyter, and every picture appears; the first nine need no torch.
+"""
 
 from __future__ import annotations
 
