@@ -1,8 +1,8 @@
 """Build your own Gaussian splatting, stage by stage, judged by the conformance kit.
 
 In reading order: `splat` (the whole of it in one file), `course` (the thirteen stages), `stubs` (the files to fill in),
-`student` (the oracle with a student's functions in it), `judge`, `mistakes` and `telling` (what a broken law says to a
-student), `progress` (the map and the picture), `training`.
+`student` (the oracle with a student's functions in it), `judge` and `mistakes` (what a broken law says to a student),
+`progress` (the map and the picture), `training`.
 """
 
 from __future__ import annotations

@@ -88,8 +88,7 @@ def check(name: str, folder: Path, wants_answer: bool) -> int:
     stage, work = stage_named(name), read_work(folder)
     needs_of_judging()
     from pop_ref.learn.drawing import drawn_counterexample
-    from pop_ref.learn.judge import judge
-    from pop_ref.learn.telling import told
+    from pop_ref.learn.judge import judge, told
 
     verdict = judge(work, stage)
     print(told(stage, verdict))

@@ -2,7 +2,7 @@
 
 Covariances are drawn as ellipses, rotations as the axes that they turn, the blue ones thinner and on top; pictures
 as pictures, and all other numbers as bars side by side, each pair to its own scale. Over each panel stands what it
-shows, and under a pair of bars which number of the result it is.
+shows, and under a pair of bars which number of the result it is, in capitals of three by five squares.
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ import numpy as np
 
 from pop_ref.conformance.scenes import Scene
 from pop_ref.learn.judge import Verdict
-from pop_ref.learn.lettering import LINE, SQUARE, write_text
 from pop_ref.learn.student import Call, numbers
 from pop_ref.render import render
 
+# of a letter, which is three by five of them, and a line of text
+SQUARE: Final = 2
+LINE: Final = 7 * SQUARE
 SIDE: Final = 240
 # over each panel, for two lines
 HEAD: Final = 2 * LINE
@@ -219,3 +221,43 @@ def write_film(path: Path, frames: Sequence[np.ndarray], seconds: float = 0.4) -
         for kind, data in [*parts, (b"IEND", b"")]:
             file.write(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)))
     beside.replace(path)
+
+
+_CHARACTERS: Final = "0123456789abcdefghijklmnopqrstuvwxyz[]-+.,: "
+# of each five rows from the top, an octal digit a row, whose three bits are the squares from the left
+_ROWS: Final = (
+    "7555726227717477171755711747177475771111757577571725755656563444365556746477464434553557557222711152"
+    "5565544447577556555525552656442556365655342167222255557555525577555255552227124764446311130070002720"
+    "00002000240202000000"
+)
+_GLYPHS: Final = {each: _ROWS[5 * k : 5 * k + 5] for k, each in enumerate(_CHARACTERS)}
+
+
+def lettered(text: str) -> np.ndarray:
+    """Return a text as squares.
+
+    Args:
+        text: of letters (large and small look alike), digits, spaces and `[]-+.,:`.
+
+    Returns:
+        Which pixels [5 SQUARE, 4 SQUARE len(text)] are inked, bool.
+
+    Raises:
+        KeyError: a character has no glyph.
+    """
+    glyphs = [[[int(row) >> bit & 1 for bit in (2, 1, 0)] + [0] for row in _GLYPHS[each]] for each in text.lower()]
+    squares = np.concatenate([np.zeros((5, 0)), *(np.array(glyph) for glyph in glyphs)], axis=1)
+    return squares.repeat(SQUARE, axis=0).repeat(SQUARE, axis=1).astype(bool)
+
+
+def write_text(picture: np.ndarray, text: str, x: int, y: int, color: np.ndarray) -> None:
+    """Write a text into a picture; what does not fit is cut off.
+
+    Args:
+        picture: [H, W, 3], written to.
+        text: as in `lettered`.
+        x, y: its left and upper edge, in pixels.
+        color: [3].
+    """
+    inked = lettered(text)[: max(0, len(picture) - y), : max(0, picture.shape[1] - x)]
+    picture[y : y + inked.shape[0], x : x + inked.shape[1]][inked] = color

@@ -1,21 +1,106 @@
-"""Mistakes that everyone makes once: what they compute, and the sentence that helps.
+"""Mistakes that everyone makes once: what they compute, and the sentence that helps; here those of splats and pixels.
 
 A mistake is recognised by its numbers: it explains a wrong function if it gives what the function gave on every input
-that was tried. The first that does is told.
+that was tried. The first that does is told. `mistakes_geometry` has those of what comes before, `mistakes_training` of
+what comes after.
 """
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
-from pop_ref.learn.mistakes_backward import BACKWARD
-from pop_ref.learn.mistakes_geometry import GEOMETRY, Mistake, Oracle
+from pop_ref.learn.mistakes_geometry import GEOMETRY, Known
 from pop_ref.learn.mistakes_training import TRAINING
+from pop_ref.learn.probes import Oracle
 from pop_ref.learn.student import Call, same
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """A mistake in one function.
+
+    Attributes:
+        function: which.
+        made: given the oracle's functions by name and the arguments, what the mistake computes.
+        sentence: what is wrong.
+        hint: where to look.
+    """
+
+    function: str
+    made: Callable[..., Any]
+    sentence: str
+    hint: str
+
+
+def _lists(order: Callable[..., Any], by_column: bool = False) -> Callable[..., Any]:
+    """Make `tile_lists` in another order of splats, or with the tiles of a column one after the other."""
+
+    def made(
+        o: Oracle, means2d: Any, radii: Any, depths: Any, width: int, height: int, size: int, *profile: Any
+    ) -> Any:
+        n_x, n_y = o["grid_size"](width, height, size)
+        lists: list[list[int]] = [[] for _ in range(n_x * n_y)]
+        rects = o["tile_rects"](means2d, radii, width, height, size, *profile).tolist()
+        for i in sorted(range(len(depths)), key=lambda i: order(float(depths[i]), i)):
+            for y in range(rects[i][1], rects[i][3]):
+                for x in range(rects[i][0], rects[i][2]):
+                    lists[x * n_y + y if by_column else y * n_x + x].append(i)
+        return lists
+
+    return made
+
+
+def _reach(squared: bool, k: float = 0.0) -> Callable[..., Any]:
+    """Make `radii_from_covars2d` without the 2 under its root, or with one reach for every opacity."""
+
+    def made(o: Oracle, covars2d: Any, opacities: Any, *profile: Any) -> Any:
+        taken = o["radii_from_covars2d"](covars2d, opacities, *profile) > 0
+        with np.errstate(all="ignore"):
+            reach = np.sqrt((2.0 if squared else 1.0) * np.log(255.0 * np.maximum(opacities, 1e-9)))
+            reach = np.minimum(np.nan_to_num(reach), 3.33) if k == 0.0 else np.full(len(opacities), k)
+            sides = reach[:, None] * np.sqrt(np.einsum("nii->ni", covars2d))
+        return np.where(taken, np.ceil(sides), 0).astype(np.int64)
+
+    return made
+
+
+def _on_one_side(o: Oracle, covars2d: Any, v: Any) -> Any:
+    """Make `conics_from_covars2d_vjp` with both Q on one side of V."""
+    A, B, C = o["conics_from_covars2d"](covars2d).T
+    Q = np.moveaxis(np.array([[A, B], [B, C]]), 2, 0)
+    V = np.moveaxis(np.array([[v[:, 0], v[:, 1] / 2.0], [v[:, 1] / 2.0, v[:, 2]]]), 2, 0)
+    return -V @ Q @ Q
+
+
+def _opacity_left_in(o: Oracle, sigma: float, opacity: float, v_alpha: float, *profile: Any) -> Any:
+    v_sigma, v_opacity = o["alpha_from_sigma_vjp"](sigma, opacity, v_alpha, *profile)
+    return v_sigma, opacity * v_opacity
+
+
+def _opacity_left_out(o: Oracle, sigma: float, opacity: float, v_alpha: float, *profile: Any) -> Any:
+    v_sigma, v_opacity = o["alpha_from_sigma_vjp"](sigma, opacity, v_alpha, *profile)
+    return v_sigma / opacity, v_opacity
+
+
+def _conics(by: Callable[..., Any], sign: float = -1.0) -> Callable[..., Any]:
+    """Make `conics_from_covars2d` that multiplies by something else than one over the determinant, or whose determinant
+    has another sign in it."""
+
+    def made(o: Oracle, covars2d: Any) -> Any:
+        a, b, c = covars2d[:, 0, 0], covars2d[:, 0, 1], covars2d[:, 1, 1]
+        det = a * c + sign * b * b
+        return np.where(det > 0.0, np.stack([c, -b, a]) * by(det), 0.0).T
+
+    return made
+
+
+def _exchanged_sides(o: Oracle, means2d: Any, radii: Any, width: int, height: int, *profile: Any) -> Any:
+    return o["on_screen"](means2d, radii, height, width, *profile)
 
 
 def _sigma(squares: float = 0.5, cross: float = 1.0, right: float = 0.0, down: float = 0.0) -> Callable[..., Any]:
@@ -28,9 +113,8 @@ def _sigma(squares: float = 0.5, cross: float = 1.0, right: float = 0.0, down: f
     return made
 
 
-def _shifted(right: float, down: float) -> Mistake:
-    return Mistake(
-        "sigma_at_pixel",
+def _shifted(right: float, down: float) -> Known:
+    return (
         _sigma(right=right, down=down),
         "Your pixel is half a pixel off: px and py are the pixel's centre already, its index + 0.5.",
         "Use d = mean2d - (px, py) as they are given; add or take away no half.",
@@ -134,194 +218,328 @@ def _dominant(better: Callable[[float, float], bool], by_place: bool = False) ->
     return made
 
 
-MISTAKES: Final = (
-    *GEOMETRY,
-    *BACKWARD,
-    *TRAINING,
-    Mistake(
-        "sigma_at_pixel",
-        _sigma(1.0, 1.0),
-        f"A half is missing before the two squares. {_HALF}",
-        "The cross term has no half, because B stands twice in the symmetric matrix Q and once in the conic.",
+_PIXELS: Final[dict[str, tuple[Known, ...]]] = {
+    "low_pass": (
+        (
+            lambda o, covars2d, eps2d: covars2d + eps2d,
+            "The blur is added to all four entries; a round blur has no entries off the diagonal.",
+            "covars2d + eps2d * np.eye(2).",
+        ),
+        (
+            lambda o, covars2d, eps2d, *given: covars2d - eps2d * np.eye(2),
+            "eps2d is taken away from the diagonal; it is added, as blur makes a splat wider.",
+            "covars2d + eps2d times the unit matrix.",
+        ),
     ),
-    Mistake(
-        "sigma_at_pixel",
-        _sigma(1.0, 2.0),
-        f"A half is missing: your exponent is twice what it should be. {_HALF}",
-        "Halve the whole of A dx dx + 2 B dx dy + C dy dy.",
+    "conics_from_covars2d": (
+        (
+            lambda o, covars2d: np.where(
+                np.linalg.det(covars2d)[:, None] > 0.0, covars2d.reshape(-1, 4)[:, [0, 1, 3]], 0.0
+            ),
+            "You return the covariance; a conic is its inverse.",
+            "[[a, b], [b, c]] has the inverse [[c, -b], [-b, a]] / (a c - b b).",
+        ),
+        (
+            lambda o, covars2d: o["conics_from_covars2d"](covars2d) * np.array([1.0, -1.0, 1.0]),
+            "The off-diagonal of the inverse has the wrong sign.",
+            "[[a, b], [b, c]] has the inverse [[c, -b], [-b, a]] / (a c - b b).",
+        ),
+        (
+            _conics(lambda det: 1.0 / det, sign=1.0),
+            "The determinant has the wrong sign in it: it is a c - b b.",
+            "[[a, b], [b, c]] has the inverse [[c, -b], [-b, a]] / (a c - b b).",
+        ),
+        *(
+            (
+                _conics(by),
+                "You do not divide by the determinant, as an inverse does.",
+                "[[a, b], [b, c]] has the inverse [[c, -b], [-b, a]] / (a c - b b).",
+            )
+            for by in (lambda det: det, lambda det: 1.0)
+        ),
     ),
-    Mistake(
-        "sigma_at_pixel",
-        _sigma(0.5, 0.5),
-        "The cross term is halved once too often: B stands twice in the symmetric matrix Q, once in the conic.",
-        "Write Q = [[A, B], [B, C]] and multiply d^T Q d out before you halve it.",
+    "conics_from_covars2d_vjp": (
+        (
+            lambda o, covars2d, v: o["conics_from_covars2d_vjp"](covars2d, v * np.array([1.0, 2.0, 1.0])),
+            "The off-diagonal counts twice: it stands once in the conic and twice in the matrix.",
+            "Give each of the matrix's two entries half of v_xy.",
+        ),
+        (
+            _on_one_side,
+            "The products stand in another order: Q stands on either side of V.",
+            "The inverse's small change is -Q dX Q, so the cotangent is -Q V Q.",
+        ),
     ),
-    Mistake(
-        "falloff",
-        lambda o, sigma: float(np.exp(sigma)),
-        "Your falloff grows with the distance: the exponent's sign is missing.",
-        "It is 1 at the centre and less everywhere else.",
+    "radii_from_covars2d": (
+        (
+            _reach(squared=False),
+            "A 2 is missing under the root: alpha is o exp(-d^2 / 2), so that it falls to 1/255 at d^2 = 2 ln(255 o).",
+            "The reach is min(3.33, sqrt(2 ln(255 o))) standard deviations.",
+        ),
+        (
+            _reach(squared=True, k=3.0),
+            "Your reach is three standard deviations whatever the opacity; it ends where alpha falls to 1/255.",
+            "The reach is min(3.33, sqrt(2 ln(255 o))) standard deviations: a faint splat ends sooner.",
+        ),
+        (
+            _reach(squared=True, k=3.33),
+            "Your reach is 3.33 standard deviations whatever the opacity; that is its upper bound only.",
+            "The reach is min(3.33, sqrt(2 ln(255 o))) standard deviations: a faint splat ends sooner.",
+        ),
+        (
+            lambda o, covars2d, *given: (
+                o["radii_from_covars2d"](covars2d * covars2d * np.eye(2), *given)
+                * (o["radii_from_covars2d"](covars2d, *given) > 0)
+            ),
+            "You take variances for standard deviations: the covariance's diagonal holds squares.",
+            "The reach is k times the root of the diagonal's entry.",
+        ),
+        (
+            lambda o, covars2d, opacities, *given: (
+                o["radii_from_covars2d"](covars2d, np.ones_like(opacities), *given)
+                * (o["radii_from_covars2d"](covars2d, opacities, *given) > 0)
+            ),
+            "Your reach is that of opacity 1 for every splat; a faint one ends sooner.",
+            "The reach is min(3.33, sqrt(2 ln(255 o))) standard deviations, with o the splat's own.",
+        ),
     ),
-    Mistake(
-        "alpha_from_sigma",
-        lambda o, sigma, opacity, *profile: (opacity * o["falloff"](sigma), False),
-        "Your alpha has neither ceiling nor floor.",
-        "Take min(profile.alpha_ceiling, ...), and skip the splat where sigma < 0 or alpha < profile.alpha_floor.",
+    "on_screen": (
+        (
+            _exchanged_sides,
+            "Width and height are exchanged: x is compared with the width, y with the height.",
+            "The columns of means2d are x and y.",
+        ),
     ),
-    Mistake(
-        "composite_pixel",
-        _pixel,
-        "The background is missing: what light is left behind the last splat shows it.",
-        "Add T_final times the background to the colour.",
+    "tile_rects": (
+        (
+            lambda o, *given: o["tile_rects"](*given)[:, [1, 0, 3, 2]],
+            "x and y are exchanged: columns stand for rows. A rectangle is (x0, y0, x1, y1).",
+            "tiles_x, tiles_y = grid_size(width, height, tile_size), x first.",
+        ),
+        (
+            lambda o, *given: o["tile_rects"](*given)[:, [0, 2, 1, 3]],
+            "Your rectangle has one axis after the other, (x0, x1, y0, y1); it is (x0, y0, x1, y1).",
+            "First the corner with the smaller numbers, then the other.",
+        ),
+        (
+            lambda o, *given: o["tile_rects"](*given) - np.pad(o["tile_rects"](*given)[:, :2], ((0, 0), (2, 0))),
+            "Your last two numbers are the number of tiles; what is asked for is one past the last tile.",
+            "(x0, y0, x1, y1), half open: x1 - x0 tiles lie between.",
+        ),
     ),
-    Mistake(
-        "composite_pixel_vjp",
-        _pixel_vjp(tail=False, background_seen=False),
-        "The tail is missing from dC/dalpha: more alpha shows more of a splat's own colour, and hides the colour of all"
-        " that is behind it. Yours has the first part only.",
-        "C = T (alpha c + (1 - alpha) behind), so dC/dalpha = T (c - behind). Walk from the back: start with behind ="
-        " background . v_color + v_T_final, and after each splat behind += alpha (color_dot_grad - behind).",
+    "tile_lists": (
+        (
+            _lists(lambda depth, i: (depth, i), by_column=True),
+            "Your tiles are numbered down the columns: columns stand for rows. Tile (x, y) is number y * tiles_x + x.",
+            "Row-major order: all tiles of the first row, then the second.",
+        ),
+        (
+            _lists(lambda depth, i: (-depth, i)),
+            "Your lists run from back to front; the nearest splat comes first.",
+            "Sort by (depth, index), the smaller depth first.",
+        ),
+        (
+            _lists(lambda depth, i: i),
+            "Your lists are not sorted by depth.",
+            "Go through the splats in the order of (depth, index).",
+        ),
+        (
+            _lists(lambda depth, i: (-depth, -i)),
+            "Your lists run from back to front; the nearest splat comes first.",
+            "Sort by (depth, index), the smaller depth first.",
+        ),
     ),
-    Mistake(
-        "composite_pixel_vjp",
-        _pixel_vjp(background_seen=False),
-        "The background is missing from the light behind the last splat.",
-        "Before the walk from back to front, behind is background . v_color + v_T_final.",
+    "sigma_at_pixel": (
+        (
+            _sigma(1.0, 1.0),
+            f"A half is missing before the two squares. {_HALF}",
+            "The cross term has no half, because B stands twice in the symmetric matrix Q and once in the conic.",
+        ),
+        (
+            _sigma(1.0, 2.0),
+            f"A half is missing: your exponent is twice what it should be. {_HALF}",
+            "Halve the whole of A dx dx + 2 B dx dy + C dy dy.",
+        ),
+        (
+            _sigma(0.5, 0.5),
+            "The cross term is halved once too often: B stands twice in the symmetric matrix Q, once in the conic.",
+            "Write Q = [[A, B], [B, C]] and multiply d^T Q d out before you halve it.",
+        ),
+        _shifted(0.5, 0.5),
+        _shifted(-0.5, -0.5),
+        _shifted(0.5, 0.0),
+        _shifted(0.0, 0.5),
+        _shifted(-0.5, 0.0),
+        _shifted(0.0, -0.5),
+        (
+            _sigma(0.5, 0.0),
+            "The cross term is missing: a splat that is turned has B, too.",
+            "sigma = (A dx dx + C dy dy) / 2 + B dx dy.",
+        ),
+        (
+            lambda o, mean2d, conic, px, py: o["sigma_at_pixel"](mean2d, conic, py, px),
+            "The pixel's x and y are exchanged: rows stand for columns.",
+            "px runs along the columns of an image, py along its rows: dx = mean2d[0] - px, dy = mean2d[1] - py.",
+        ),
+        (
+            lambda o, mean2d, conic, px, py: o["sigma_at_pixel"](mean2d, (conic[0], conic[2], conic[1]), px, py),
+            "The conic is read in another order: it is (A, B, C), the cross term in the middle.",
+            "A, B, C = conic; sigma = (A dx dx + C dy dy) / 2 + B dx dy.",
+        ),
     ),
-    Mistake(
-        "composite_pixel_vjp",
-        _pixel_vjp(forwards=True),
-        "You walk from front to back; the way back begins with the last splat, since what is behind a splat must be"
-        " known before the splat is reached.",
-        "Go through reversed(pixel.ids), with alphas and transmittances reversed alike.",
+    "falloff": (
+        (
+            lambda o, sigma: float(np.exp(sigma)),
+            "Your falloff grows with the distance: the exponent's sign is missing.",
+            "It is 1 at the centre and less everywhere else.",
+        ),
+        (
+            lambda o, sigma: 1.0 - sigma,
+            "You take the first two terms of the exponential for the whole of it.",
+            "exp(-sigma), which never falls below 0.",
+        ),
     ),
-    Mistake(
-        "composite_pixel_vjp",
-        _pixel_vjp(early=True),
-        "You add a splat to what is behind it before its own cotangent is taken.",
-        "First v_alpha = T (color_dot_grad - behind), then behind += alpha (color_dot_grad - behind).",
+    "alpha_from_sigma": (
+        (
+            lambda o, sigma, opacity, *profile: (opacity * o["falloff"](sigma), False),
+            "Your alpha has neither ceiling nor floor.",
+            "Take min(profile.alpha_ceiling, ...), and skip the splat where sigma < 0 or alpha < profile.alpha_floor.",
+        ),
+        (
+            lambda o, sigma, opacity, *profile: o["alpha_from_sigma"](sigma, 1.0, *profile),
+            "The opacity is missing: alpha is the opacity times the falloff.",
+            "alpha = min(ceiling, opacity * falloff(sigma)).",
+        ),
     ),
-    _shifted(0.5, 0.5),
-    _shifted(-0.5, -0.5),
-    _shifted(0.5, 0.0),
-    _shifted(0.0, 0.5),
-    _shifted(-0.5, 0.0),
-    _shifted(0.0, -0.5),
-    Mistake(
-        "sigma_at_pixel",
-        _sigma(0.5, 0.0),
-        "The cross term is missing: a splat that is turned has B, too.",
-        "sigma = (A dx dx + C dy dy) / 2 + B dx dy.",
+    "alpha_from_sigma_vjp": (
+        (
+            _opacity_left_in,
+            "The opacity is left in its own derivative: of o exp(-sigma) by o it is exp(-sigma).",
+            "v_o = exp(-sigma) v_alpha; only v_sigma has the opacity in it.",
+        ),
+        (
+            _opacity_left_out,
+            "The opacity is missing from the cotangent of sigma.",
+            "alpha = o exp(-sigma), so v_sigma = -alpha v_alpha.",
+        ),
     ),
-    Mistake(
-        "sigma_at_pixel",
-        lambda o, mean2d, conic, px, py: o["sigma_at_pixel"](mean2d, conic, py, px),
-        "The pixel's x and y are exchanged: rows stand for columns.",
-        "px runs along the columns of an image, py along its rows: dx = mean2d[0] - px, dy = mean2d[1] - py.",
+    "composite_pixel": (
+        (
+            _pixel,
+            "The background is missing: what light is left behind the last splat shows it.",
+            "Add T_final times the background to the colour.",
+        ),
+        (
+            _pixel_by_alpha,
+            "Your weight is alpha alone: a splat gives its colour times alpha, times the light that is left, T.",
+            "weight = T * alpha, with T before this splat.",
+        ),
+        (
+            lambda o, ids, *given: o["composite_pixel"](list(reversed(ids)), *given),
+            "You walk from back to front; the list is in order, front first.",
+            "Go through ids as they come: T starts at 1 at the eye.",
+        ),
+        (
+            _pixel_forward(dims="alpha"),
+            "You keep the share alpha of the light; a splat takes that share away, and 1 - alpha is left.",
+            "T starts at 1, and behind a splat it is T (1 - alpha).",
+        ),
+        (
+            _pixel_forward(dims="T - alpha"),
+            "You take alpha from the light that is left; a splat takes the share alpha of what reaches it.",
+            "Behind a splat T is T (1 - alpha), which is T - T alpha.",
+        ),
+        (
+            _pixel_forward(last=True),
+            "You blend the splat at which the pixel stops; the pixel ends before it.",
+            "Ask stops(T (1 - alpha)) before the splat's colour is added.",
+        ),
+        (
+            _pixel_forward(after=True),
+            "You keep the light that is left behind each splat; the light before it is asked for.",
+            "Append T to the transmittances before T becomes T (1 - alpha).",
+        ),
+        (
+            _pixel_painted,
+            "You paint each splat over those before it, as from back to front; the list is in order, front first.",
+            "color += T alpha c, with T the light that the splats before it have left.",
+        ),
     ),
-    Mistake(
-        "alpha_from_sigma",
-        lambda o, sigma, opacity, *profile: o["alpha_from_sigma"](sigma, 1.0, *profile),
-        "The opacity is missing: alpha is the opacity times the falloff.",
-        "alpha = min(ceiling, opacity * falloff(sigma)).",
+    "composite_pixel_vjp": (
+        (
+            _pixel_vjp(tail=False, background_seen=False),
+            "The tail is missing from dC/dalpha: more alpha shows more of a splat's own colour, and hides the colour of"
+            " all that is behind it. Yours has the first part only.",
+            "C = T (alpha c + (1 - alpha) behind), so dC/dalpha = T (c - behind). Walk from the back: start with behind"
+            " = background . v_color + v_T_final, and after each splat behind += alpha (color_dot_grad - behind).",
+        ),
+        (
+            _pixel_vjp(background_seen=False),
+            "The background is missing from the light behind the last splat.",
+            "Before the walk from back to front, behind is background . v_color + v_T_final.",
+        ),
+        (
+            _pixel_vjp(forwards=True),
+            "You walk from front to back; the way back begins with the last splat, since what is behind a splat must be"
+            " known before the splat is reached.",
+            "Go through reversed(pixel.ids), with alphas and transmittances reversed alike.",
+        ),
+        (
+            _pixel_vjp(early=True),
+            "You add a splat to what is behind it before its own cotangent is taken.",
+            "First v_alpha = T (color_dot_grad - behind), then behind += alpha (color_dot_grad - behind).",
+        ),
+        (
+            _pixel_vjp(dims=False),
+            "A splat hides what is behind it: the light behind must lose the share alpha before the splat's own is"
+            " added.",
+            "behind += alpha (color_dot_grad - behind), the same as alpha color_dot_grad + (1 - alpha) behind.",
+        ),
+        (
+            _pixel_vjp(share=False),
+            "A splat counts whole in what is behind the next one; it counts by the share alpha that it covers.",
+            "behind = alpha color_dot_grad + (1 - alpha) behind.",
+        ),
+        (
+            _pixel_vjp(color_lit=False),
+            "The light that reaches the splat is missing from the cotangent of its colour.",
+            "v_colors += T alpha v_color, as C has T alpha c.",
+        ),
+        (
+            _pixel_vjp(absolute=False),
+            "The absolute value is missing in v_means2d_abs: pixels on two sides of a splat cancel.",
+            "Add |v_mean2d| of every pixel, entry by entry.",
+        ),
+        (
+            _pixel_vjp(lit=False),
+            "The light that reaches the splat is missing from v_alpha: what hardly any light reaches changes the pixel"
+            " hardly.",
+            "v_alpha = T (color_dot_grad - behind), with T of pixel.transmittances.",
+        ),
     ),
-    Mistake(
-        "composite_pixel",
-        _pixel_by_alpha,
-        "Your weight is alpha alone: a splat gives its colour times alpha, times the light that is left, T.",
-        "weight = T * alpha, with T before this splat.",
+    "dominant_id": (
+        (
+            _dominant(lambda weight, best: weight < best),
+            "The comparison is the wrong way round: the largest weight wins.",
+            "A later splat wins where weight > best_weight.",
+        ),
+        (
+            _dominant(lambda weight, best: weight > best, by_place=True),
+            "You return the winner's place in the list; its id is asked for.",
+            "ids[place] is the id.",
+        ),
     ),
-    Mistake(
-        "composite_pixel",
-        lambda o, ids, *given: o["composite_pixel"](list(reversed(ids)), *given),
-        "You walk from back to front; the list is in order, front first.",
-        "Go through ids as they come: T starts at 1 at the eye.",
+    "dominant_counts": (
+        (
+            lambda o, ids, n: np.minimum(o["dominant_counts"](ids, n), 1),
+            "Each Gaussian is counted once, however many pixels it dominates.",
+            "Add 1 to a Gaussian's count at every pixel that is its own.",
+        ),
     ),
-    Mistake(
-        "composite_pixel",
-        _pixel_forward(dims="alpha"),
-        "You keep the share alpha of the light; a splat takes that share away, and 1 - alpha is left.",
-        "T starts at 1, and behind a splat it is T (1 - alpha).",
-    ),
-    Mistake(
-        "composite_pixel",
-        _pixel_forward(dims="T - alpha"),
-        "You take alpha from the light that is left; a splat takes the share alpha of what reaches it.",
-        "Behind a splat T is T (1 - alpha), which is T - T alpha.",
-    ),
-    Mistake(
-        "composite_pixel",
-        _pixel_forward(last=True),
-        "You blend the splat at which the pixel stops; the pixel ends before it.",
-        "Ask stops(T (1 - alpha)) before the splat's colour is added.",
-    ),
-    Mistake(
-        "composite_pixel",
-        _pixel_forward(after=True),
-        "You keep the light that is left behind each splat; the light before it is asked for.",
-        "Append T to the transmittances before T becomes T (1 - alpha).",
-    ),
-    Mistake(
-        "sigma_at_pixel",
-        lambda o, mean2d, conic, px, py: o["sigma_at_pixel"](mean2d, (conic[0], conic[2], conic[1]), px, py),
-        "The conic is read in another order: it is (A, B, C), the cross term in the middle.",
-        "A, B, C = conic; sigma = (A dx dx + C dy dy) / 2 + B dx dy.",
-    ),
-    Mistake(
-        "composite_pixel_vjp",
-        _pixel_vjp(dims=False),
-        "A splat hides what is behind it: the light behind must lose the share alpha before the splat's own is added.",
-        "behind += alpha (color_dot_grad - behind), the same as alpha color_dot_grad + (1 - alpha) behind.",
-    ),
-    Mistake(
-        "composite_pixel",
-        _pixel_painted,
-        "You paint each splat over those before it, as from back to front; the list is in order, front first.",
-        "color += T alpha c, with T the light that the splats before it have left.",
-    ),
-    Mistake(
-        "composite_pixel_vjp",
-        _pixel_vjp(share=False),
-        "A splat counts whole in what is behind the next one; it counts by the share alpha that it covers.",
-        "behind = alpha color_dot_grad + (1 - alpha) behind.",
-    ),
-    Mistake(
-        "falloff",
-        lambda o, sigma: 1.0 - sigma,
-        "You take the first two terms of the exponential for the whole of it.",
-        "exp(-sigma), which never falls below 0.",
-    ),
-    Mistake(
-        "dominant_id",
-        _dominant(lambda weight, best: weight < best),
-        "The comparison is the wrong way round: the largest weight wins.",
-        "A later splat wins where weight > best_weight.",
-    ),
-    Mistake(
-        "dominant_id",
-        _dominant(lambda weight, best: weight > best, by_place=True),
-        "You return the winner's place in the list; its id is asked for.",
-        "ids[place] is the id.",
-    ),
-    Mistake(
-        "composite_pixel_vjp",
-        _pixel_vjp(color_lit=False),
-        "The light that reaches the splat is missing from the cotangent of its colour.",
-        "v_colors += T alpha v_color, as C has T alpha c.",
-    ),
-    Mistake(
-        "composite_pixel_vjp",
-        _pixel_vjp(absolute=False),
-        "The absolute value is missing in v_means2d_abs: pixels on two sides of a splat cancel.",
-        "Add |v_mean2d| of every pixel, entry by entry.",
-    ),
-    Mistake(
-        "composite_pixel_vjp",
-        _pixel_vjp(lit=False),
-        "The light that reaches the splat is missing from v_alpha: what hardly any light reaches changes the pixel"
-        " hardly.",
-        "v_alpha = T (color_dot_grad - behind), with T of pixel.transmittances.",
-    ),
+}
+
+MISTAKES: Final = tuple(
+    Mistake(function, *known) for function, all_known in (GEOMETRY | _PIXELS | TRAINING).items() for known in all_known
 )
 
 

@@ -1,31 +1,16 @@
-"""Mistakes that everyone makes once, of the stages from raw parameters to tiles; see `mistakes`."""
+"""Mistakes that everyone makes once, from raw parameters to the screen; see `mistakes`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
-Oracle = dict[str, Callable[..., Any]]
+from pop_ref.learn.probes import Oracle
 
-
-@dataclass(frozen=True)
-class Mistake:
-    """A mistake in one function.
-
-    Attributes:
-        function: which.
-        made: given the oracle's functions by name and the arguments, what the mistake computes.
-        sentence: what is wrong.
-        hint: where to look.
-    """
-
-    function: str
-    made: Callable[..., Any]
-    sentence: str
-    hint: str
+# what a mistake computes, what is wrong, and where to look
+Known = tuple[Callable[..., Any], str, str]
 
 
 def _turned(name: str) -> Callable[..., Any]:
@@ -80,38 +65,6 @@ def _colors(half: float, unit: bool) -> Callable[..., Any]:
     return made
 
 
-def _lists(order: Callable[..., Any], by_column: bool = False) -> Callable[..., Any]:
-    """Make `tile_lists` in another order of splats, or with the tiles of a column one after the other."""
-
-    def made(
-        o: Oracle, means2d: Any, radii: Any, depths: Any, width: int, height: int, size: int, *profile: Any
-    ) -> Any:
-        n_x, n_y = o["grid_size"](width, height, size)
-        lists: list[list[int]] = [[] for _ in range(n_x * n_y)]
-        rects = o["tile_rects"](means2d, radii, width, height, size, *profile).tolist()
-        for i in sorted(range(len(depths)), key=lambda i: order(float(depths[i]), i)):
-            for y in range(rects[i][1], rects[i][3]):
-                for x in range(rects[i][0], rects[i][2]):
-                    lists[x * n_y + y if by_column else y * n_x + x].append(i)
-        return lists
-
-    return made
-
-
-def _reach(squared: bool, k: float = 0.0) -> Callable[..., Any]:
-    """Make `radii_from_covars2d` without the 2 under its root, or with one reach for every opacity."""
-
-    def made(o: Oracle, covars2d: Any, opacities: Any, *profile: Any) -> Any:
-        taken = o["radii_from_covars2d"](covars2d, opacities, *profile) > 0
-        with np.errstate(all="ignore"):
-            reach = np.sqrt((2.0 if squared else 1.0) * np.log(255.0 * np.maximum(opacities, 1e-9)))
-            reach = np.minimum(np.nan_to_num(reach), 3.33) if k == 0.0 else np.full(len(opacities), k)
-            sides = reach[:, None] * np.sqrt(np.einsum("nii->ni", covars2d))
-        return np.where(taken, np.ceil(sides), 0).astype(np.int64)
-
-    return made
-
-
 def _without_z_of_the_diagonal(
     o: Oracle, means_cam: Any, K: Any, width: int, height: int, v: Any, *profile: Any
 ) -> Any:
@@ -125,285 +78,474 @@ _TRANSPOSED: Final = (
     "It turns the world into the Gaussian's own frame, and what is wanted turns the Gaussian's axes into the world."
 )
 
-GEOMETRY: Final = (
-    Mistake(
-        "rotmats_from_quats",
-        _turned("rotmats_from_quats"),
-        f"Your rotation is transposed. {_TRANSPOSED}",
-        "Turn (1, 0, 0) by a quarter about z, q = (1, 0, 0, 1): it must land on (0, 1, 0), so the first column of R is"
-        " (0, 1, 0). Exchange the signs of the terms with w.",
-    ),
-    Mistake(
-        "rotmats_from_quats",
-        lambda o, quats: o["rotmats_from_quats"](quats[:, [3, 0, 1, 2]]),
-        "Your quaternion is read as (x, y, z, w); here the real part comes first, (w, x, y, z).",
-        "The identity is (1, 0, 0, 0).",
-    ),
-    Mistake(
-        "rotmats_from_quats",
-        _without_length,
-        "Your quaternion is used as it is given; it must be divided by its length first, since only then is it a"
-        " rotation.",
-        "Training moves its four numbers freely, so that its length is anything; unit_quats_from_quats divides.",
-    ),
-    Mistake(
-        "covars_from_quats_scales",
-        _transposed_covars,
-        f"Your rotation is transposed: the covariance is R^T S S R and not R S S R^T. {_TRANSPOSED}",
-        "With M = R diag(s) the covariance is M M^T. M^T M is another matrix.",
-    ),
-    Mistake(
-        "covars_from_quats_scales",
-        lambda o, quats, scales: o["covars_from_quats_scales"](quats, np.sqrt(scales)),
-        "Your scales enter once; a covariance holds squares, because scales are standard deviations.",
-        "With M = R diag(s) the covariance is M M^T, in which every scale stands twice.",
-    ),
-    Mistake(
-        "sh_basis",
-        _positive_first_harmonics,
-        "Two of your harmonics of degree 1 have the wrong sign: they are (-y, z, -x) times a constant.",
-        "The signs are a convention, and every file of splats follows it.",
-    ),
-    Mistake(
-        "colors_from_sh",
-        _colors(half=0.0, unit=True),
-        "The half is missing: a Gaussian whose coefficients are 0 is grey, not black.",
-        "c = max(sum_k Y_k h_k + 0.5, 0).",
-    ),
-    Mistake(
-        "colors_from_sh",
-        _colors(half=0.5, unit=False),
-        "Your direction is used as it is given; the harmonics ask for one of length 1.",
-        "Divide each direction by its length before sh_basis.",
-    ),
-    Mistake(
-        "means_cam_from_means",
-        _with_transposed_camera("means_cam_from_means"),
-        "Your camera's rotation is transposed.",
-        "viewmat takes the world into the camera: p = R mean + t, without a transpose.",
-    ),
-    Mistake(
-        "covars_cam_from_covars",
-        _with_transposed_camera("covars_cam_from_covars"),
-        "Your camera's rotation is transposed.",
-        "A linear map A turns a covariance S into A S A^T; here A is R = viewmat[:3, :3].",
-    ),
-    Mistake(
-        "camera_center",
-        lambda o, viewmat: -viewmat[:3, 3],
-        "Your centre is -t, which is in the camera's frame; it is asked for in the world's.",
-        "The centre is the point that viewmat takes to 0: solve R c + t = 0.",
-    ),
-    Mistake(
-        "project_means",
-        lambda o, means_cam, K, width, height, *profile: (
-            o["project_means"](means_cam, K, width, height, *profile) - K[:2, 2]
+
+def _along_q(o: Oracle, quats: Any, v: Any) -> Any:
+    """Make `unit_quats_from_quats_vjp` that takes the part along u out as a multiple of q."""
+    length = np.linalg.norm(quats, axis=1, keepdims=True)
+    return (v - quats * np.sum(quats / length * v, axis=1, keepdims=True)) / length
+
+
+def _covars_back(widths: bool = True, turned: bool = True) -> Callable[..., Any]:
+    """Make `covars_from_quats_scales_vjp` without the widths in the cotangent of R, or without R in that of s."""
+
+    def made(o: Oracle, quats: Any, scales: Any, v_covars: Any) -> Any:
+        R = o["rotmats_from_quats"](quats)
+        v_M = (v_covars + np.swapaxes(v_covars, 1, 2)) @ (R * scales[:, None, :])
+        v_R = v_M * scales[:, None, :] if widths else v_M
+        v_s = np.sum(R * v_M, axis=1) if turned else np.sum(v_M, axis=1)
+        return o["rotmats_from_quats_vjp"](quats, v_R), v_s
+
+    return made
+
+
+def _colors_back(divided: bool) -> Callable[..., Any]:
+    """Make `colors_from_sh_vjp` that keeps the part along the direction, divided by the length or not."""
+
+    def made(o: Oracle, sh: Any, dirs: Any, degree: int, v_colors: Any) -> Any:
+        length = np.linalg.norm(dirs, axis=1, keepdims=True)
+        n = (degree + 1) ** 2
+        lit = o["colors_from_sh"](sh, dirs, degree) > 0.0
+        v_basis = np.einsum("nkc,nc->nk", sh[:, :n], np.where(lit, v_colors, 0.0))
+        v_units = o["sh_basis_vjp"](dirs / length, degree, v_basis)
+        return o["colors_from_sh_vjp"](sh, dirs, degree, v_colors)[0], v_units / length if divided else v_units
+
+    return made
+
+
+def _first_degree(x: float, y: float, z: float) -> Callable[..., Any]:
+    """Make `sh_basis` whose harmonics of degree 1 stand in the order x, y, z, with these signs."""
+
+    def made(o: Oracle, dirs: Any, degree: int) -> Any:
+        basis = o["sh_basis"](dirs, degree)
+        if degree > 0:
+            basis[:, 1:4] = np.sqrt(3.0 / (4.0 * np.pi)) * np.array([x, y, z]) * dirs
+        return basis
+
+    return made
+
+
+def _point_over_z(o: Oracle, means_cam: Any, K: Any, *given: Any) -> Any:
+    """Make `project_means` that divides the principal point by z, too."""
+    focal = np.array([K[0, 0], K[1, 1]])
+    return (means_cam[:, :2] * focal + K[:2, 2]) / means_cam[:, 2:]
+
+
+def _once_by_z(o: Oracle, means_cam: Any, K: Any, width: int, height: int, v: Any, *profile: Any) -> Any:
+    """Make `projection_jacobians_vjp` that divides an offset by z once where it should by z^2."""
+    back = o["projection_jacobians_vjp"](means_cam, K, width, height, v, *profile).copy()
+    z = means_cam[:, 2]
+    entries = o["projection_jacobians"](means_cam, K, width, height, *profile)
+    for axis in (0, 1):
+        free = K[axis, axis] * means_cam[:, axis] / z**2
+        inside = np.isclose(entries[:, axis, 2], -free, rtol=1e-12, atol=0.0)
+        back[:, 2] -= np.where(inside, free / z, 0.0) * v[:, axis, 2]
+    return back
+
+
+def _turned_back(name: str) -> Callable[..., Any]:
+    """Make a camera's vjp whose first result has R where R^T is asked for, or the reverse."""
+
+    def made(o: Oracle, values: Any, viewmat: Any, v: Any) -> Any:
+        turned = viewmat.copy()
+        turned[:3, :3] = viewmat[:3, :3].T
+        right, wrong = (list(o[name](values, each, v)) for each in (viewmat, turned))
+        right[0] = wrong[0]
+        return tuple(right)
+
+    return made
+
+
+def _two_of_one(o: Oracle, quats: Any, v_rotmats: Any, *, half: int) -> Any:
+    """Make `rotmats_from_quats_vjp` with one number of the unit quaternion's cotangent halved."""
+    units = o["unit_quats_from_quats"](quats)
+    w, x, y, z = units.T
+    g = np.moveaxis(v_rotmats, 0, -1)
+    along = [
+        -z * g[0, 1] + y * g[0, 2] + z * g[1, 0] - x * g[1, 2] - y * g[2, 0] + x * g[2, 1],
+        y * (g[0, 1] + g[1, 0]) + z * (g[0, 2] + g[2, 0]) + w * (g[2, 1] - g[1, 2]) - 2 * x * (g[1, 1] + g[2, 2]),
+        x * (g[0, 1] + g[1, 0]) + z * (g[1, 2] + g[2, 1]) + w * (g[0, 2] - g[2, 0]) - 2 * y * (g[0, 0] + g[2, 2]),
+        x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1]) + w * (g[1, 0] - g[0, 1]) - 2 * z * (g[0, 0] + g[1, 1]),
+    ]
+    v_units = 2.0 * np.stack(along, axis=1)
+    v_units[:, half] *= 0.5
+    return o["unit_quats_from_quats_vjp"](quats, v_units)
+
+
+_UNIT_BACK: Final = "unit_quats_from_quats_vjp"
+
+
+def _rotation_left(name: str, formula: str) -> Known:
+    return (
+        _turned_back(f"{name}_vjp"),
+        "R stands where R^T is asked for: what the camera turned is turned back.",
+        f"The way forward turns by R, the way back by its transpose: {formula}.",
+    )
+
+
+GEOMETRY: Final[dict[str, tuple[Known, ...]]] = {
+    "scales_from_log_scales": (
+        (
+            lambda o, log_scales: log_scales,
+            "The exponential is missing: what is kept is the logarithm of the width.",
+            "exp(log_scales), entry by entry.",
         ),
-        "The principal point is missing: you measure from the optical axis, pixels are counted from the corner.",
-        "Add (cx, cy) = (K[0, 2], K[1, 2]).",
     ),
-    Mistake(
-        "conics_from_covars2d",
-        lambda o, covars2d: np.where(
-            np.linalg.det(covars2d)[:, None] > 0.0, covars2d.reshape(-1, 4)[:, [0, 1, 3]], 0.0
+    "scales_from_log_scales_vjp": (
+        (
+            lambda o, log_scales, v: log_scales * v,
+            "You multiply by the logarithm; the derivative of exp(x) is exp(x).",
+            "v_scales times the scales themselves.",
         ),
-        "You return the covariance; a conic is its inverse.",
-        "[[a, b], [b, c]] has the inverse [[c, -b], [-b, a]] / (a c - b b).",
-    ),
-    Mistake(
-        "conics_from_covars2d",
-        lambda o, covars2d: o["conics_from_covars2d"](covars2d) * np.array([1.0, -1.0, 1.0]),
-        "The off-diagonal of the inverse has the wrong sign.",
-        "[[a, b], [b, c]] has the inverse [[c, -b], [-b, a]] / (a c - b b).",
-    ),
-    Mistake(
-        "conics_from_covars2d_vjp",
-        lambda o, covars2d, v: o["conics_from_covars2d_vjp"](covars2d, v * np.array([1.0, 2.0, 1.0])),
-        "The off-diagonal counts twice: it stands once in the conic and twice in the matrix.",
-        "Give each of the matrix's two entries half of v_xy.",
-    ),
-    Mistake(
-        "opacities_from_logits_vjp",
-        lambda o, logits, v: v.copy(),
-        "The sigmoid's slope is missing.",
-        "o = 1 / (1 + exp(-x)) has the derivative o (1 - o).",
-    ),
-    Mistake(
-        "covars_from_quats_scales",
-        lambda o, quats, scales: np.stack([np.diag(s * s) for s in scales]),
-        "The rotation has gone from your covariance, diag(s)^2 is left: you multiply M^T M where M M^T is asked for, or"
-        " your M scales its rows, diag(s) R.",
-        "M = R diag(s) scales columns, R * s in NumPy; a column of R is an axis of the Gaussian. Then M @ M.T.",
-    ),
-    Mistake(
-        "covars_from_quats_scales",
-        lambda o, quats, scales: o["covars_from_quats_scales"](quats, scales**2),
-        "Your scales enter four times; a covariance holds squares of standard deviations, so each enters twice.",
-        "With M = R diag(s), without a square, the covariance is M M^T.",
-    ),
-    Mistake(
-        "sh_basis",
-        lambda o, dirs, degree: o["sh_basis"](-dirs, degree),
-        "Your direction runs from the Gaussian to the camera; it is asked for from the camera to the Gaussian.",
-        "Use (x, y, z) as they are given: the harmonics of degree 1 are (-y, z, -x) times a constant.",
-    ),
-    Mistake(
-        "camera_center",
-        lambda o, viewmat: -viewmat[:3, :3] @ viewmat[:3, 3],
-        "Your rotation is not transposed: the centre is -R^T t, and yours is -R t.",
-        "Solve R c + t = 0; the inverse of a rotation is its transpose.",
-    ),
-    Mistake(
-        "means_cam_from_means",
-        lambda o, means, viewmat: (means + viewmat[:3, 3]) @ viewmat[:3, :3].T,
-        "You add t before it turns; a point is turned first and moved then.",
-        "p = R mean + t.",
-    ),
-    Mistake(
-        "rotmats_from_quats_vjp",
-        _without_length_back,
-        "The division by the length is not walked back: yours is the cotangent of the unit quaternion, not of q.",
-        "End with unit_quats_from_quats_vjp(quats, v_units).",
-    ),
-    Mistake(
-        "tile_lists",
-        _lists(lambda depth, i: (depth, i), by_column=True),
-        "Your tiles are numbered down the columns: columns stand for rows. Tile (x, y) is number y * tiles_x + x.",
-        "Row-major order: all tiles of the first row, then the second.",
-    ),
-    Mistake(
-        "tile_lists",
-        _lists(lambda depth, i: (-depth, i)),
-        "Your lists run from back to front; the nearest splat comes first.",
-        "Sort by (depth, index), the smaller depth first.",
-    ),
-    Mistake(
-        "tile_lists",
-        _lists(lambda depth, i: i),
-        "Your lists are not sorted by depth.",
-        "Go through the splats in the order of (depth, index).",
-    ),
-    Mistake(
-        "tile_rects",
-        lambda o, *given: o["tile_rects"](*given)[:, [1, 0, 3, 2]],
-        "x and y are exchanged: columns stand for rows. A rectangle is (x0, y0, x1, y1).",
-        "tiles_x, tiles_y = grid_size(width, height, tile_size), x first.",
-    ),
-    Mistake(
-        "tile_rects",
-        lambda o, *given: o["tile_rects"](*given)[:, [0, 2, 1, 3]],
-        "Your rectangle has one axis after the other, (x0, x1, y0, y1); it is (x0, y0, x1, y1).",
-        "First the corner with the smaller numbers, then the other.",
-    ),
-    Mistake(
-        "tile_rects",
-        lambda o, *given: o["tile_rects"](*given) - np.pad(o["tile_rects"](*given)[:, :2], ((0, 0), (2, 0))),
-        "Your last two numbers are the number of tiles; what is asked for is one past the last tile.",
-        "(x0, y0, x1, y1), half open: x1 - x0 tiles lie between.",
-    ),
-    Mistake(
-        "scales_from_log_scales_vjp",
-        lambda o, log_scales, v: log_scales * v,
-        "You multiply by the logarithm; the derivative of exp(x) is exp(x).",
-        "v_scales times the scales themselves.",
-    ),
-    Mistake(
-        "scales_from_log_scales_vjp",
-        lambda o, log_scales, v: v.copy(),
-        "The exponential's slope is missing: the derivative of exp(x) is exp(x).",
-        "v_scales times the scales themselves.",
-    ),
-    Mistake(
-        "unit_quats_from_quats_vjp",
-        lambda o, quats, v: v / np.linalg.norm(quats, axis=1, keepdims=True),
-        "The part along q is still in it: a longer q is the same rotation, so the loss does not ask for it.",
-        "Take u (u . v) from v before you divide by the length.",
-    ),
-    Mistake(
-        "project_means",
-        lambda o, means_cam, K, *given: o["project_means"](means_cam, K[[1, 0, 2]][:, [1, 0, 2]], *given),
-        "The numbers of K for x and for y are exchanged: x goes with fx and cx, y with fy and cy.",
-        "fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2].",
-    ),
-    Mistake(
-        "unit_quats_from_quats",
-        lambda o, quats: quats / np.linalg.norm(quats),
-        "You divide all rows by one length, that of the whole array; each quaternion has a length of its own.",
-        "np.linalg.norm(quats, axis=1, keepdims=True).",
-    ),
-    Mistake(
-        "opacities_from_logits",
-        lambda o, logits: o["opacities_from_logits"](-logits),
-        "The sign of the exponent is wrong: a large logit must give an opacity near 1, and yours goes to 0.",
-        "o = 1 / (1 + exp(-x)).",
-    ),
-    Mistake(
-        "opacities_from_logits_vjp",
-        lambda o, logits, v: o["opacities_from_logits"](logits) * v,
-        "A part of the sigmoid's slope is missing: o (1 - o), and yours is o.",
-        "Near o = 1 the sigmoid is flat, so that the gradient must vanish there, too.",
-    ),
-    Mistake(
-        "scales_from_log_scales_vjp",
-        lambda o, log_scales, v: v / np.exp(log_scales),
-        "You divide by the slope; a cotangent is multiplied by it on the way back.",
-        "v_scales times the scales themselves.",
-    ),
-    Mistake(
-        "unit_quats_from_quats_vjp",
-        lambda o, quats, v: o["unit_quats_from_quats_vjp"](quats, v) * np.linalg.norm(quats, axis=1, keepdims=True),
-        "The division by the length is missing: twice as long a q turns half as fast.",
-        "v_q = (v - u (u . v)) / |q|.",
-    ),
-    Mistake(
-        "means_cam_from_means",
-        lambda o, means, viewmat: means @ viewmat[:3, :3].T,
-        "You turn the points and do not move them: t is missing.",
-        "p = R mean + t, with t = viewmat[:3, 3].",
-    ),
-    Mistake(
-        "covars_cam_from_covars",
-        lambda o, covars, viewmat: viewmat[:3, :3] @ covars,
-        "You turn one side of the covariance only; a matrix of second moments is turned on both.",
-        "A linear map A turns a covariance S into A S A^T; here A is R = viewmat[:3, :3].",
-    ),
-    Mistake(
-        "projection_jacobians_vjp",
-        _without_z_of_the_diagonal,
-        "Two terms of z are missing: fx / z and fy / z on the Jacobian's diagonal depend on z, too.",
-        "Add -(fx v_xx + fy v_yy) / z^2 to the cotangent of z.",
-    ),
-    Mistake(
-        "radii_from_covars2d",
-        _reach(squared=False),
-        "A 2 is missing under the root: alpha is o exp(-d^2 / 2), so that it falls to 1/255 at d^2 = 2 ln(255 o).",
-        "The reach is min(3.33, sqrt(2 ln(255 o))) standard deviations.",
-    ),
-    Mistake(
-        "radii_from_covars2d",
-        _reach(squared=True, k=3.0),
-        "Your reach is three standard deviations whatever the opacity; it ends where alpha falls to 1/255.",
-        "The reach is min(3.33, sqrt(2 ln(255 o))) standard deviations: a faint splat ends sooner.",
-    ),
-    Mistake(
-        "radii_from_covars2d",
-        _reach(squared=True, k=3.33),
-        "Your reach is 3.33 standard deviations whatever the opacity; that is its upper bound only.",
-        "The reach is min(3.33, sqrt(2 ln(255 o))) standard deviations: a faint splat ends sooner.",
-    ),
-    Mistake(
-        "tile_lists",
-        _lists(lambda depth, i: (-depth, -i)),
-        "Your lists run from back to front; the nearest splat comes first.",
-        "Sort by (depth, index), the smaller depth first.",
-    ),
-    Mistake(
-        "radii_from_covars2d",
-        lambda o, covars2d, *given: (
-            o["radii_from_covars2d"](covars2d * covars2d * np.eye(2), *given)
-            * (o["radii_from_covars2d"](covars2d, *given) > 0)
+        (
+            lambda o, log_scales, v: v.copy(),
+            "The exponential's slope is missing: the derivative of exp(x) is exp(x).",
+            "v_scales times the scales themselves.",
         ),
-        "You take variances for standard deviations: the covariance's diagonal holds squares.",
-        "The reach is k times the root of the diagonal's entry.",
+        (
+            lambda o, log_scales, v: v / np.exp(log_scales),
+            "You divide by the slope; a cotangent is multiplied by it on the way back.",
+            "v_scales times the scales themselves.",
+        ),
     ),
-)
+    "opacities_from_logits": (
+        (
+            lambda o, logits: o["opacities_from_logits"](-logits),
+            "The sign of the exponent is wrong: a large logit must give an opacity near 1, and yours goes to 0.",
+            "o = 1 / (1 + exp(-x)).",
+        ),
+        (
+            lambda o, logits: 1.0 / (1.0 + np.exp(-np.abs(logits))),
+            "The logit's sign is lost: no opacity of yours is below a half.",
+            "Where the logit is negative the opacity is exp(logit) / (1 + exp(logit)).",
+        ),
+    ),
+    "opacities_from_logits_vjp": (
+        (
+            lambda o, logits, v: v.copy(),
+            "The sigmoid's slope is missing.",
+            "o = 1 / (1 + exp(-x)) has the derivative o (1 - o).",
+        ),
+        (
+            lambda o, logits, v: o["opacities_from_logits"](logits) * v,
+            "A part of the sigmoid's slope is missing: o (1 - o), and yours is o.",
+            "Near o = 1 the sigmoid is flat, so that the gradient must vanish there, too.",
+        ),
+        (
+            lambda o, logits, v: o["opacities_from_logits"](logits) ** 2 * v,
+            "You multiply o by itself: the slope of the sigmoid is o (1 - o).",
+            "1 - o is the sigmoid of -logit.",
+        ),
+    ),
+    "unit_quats_from_quats": (
+        (
+            lambda o, quats: quats / np.linalg.norm(quats),
+            "You divide all rows by one length, that of the whole array; each quaternion has a length of its own.",
+            "np.linalg.norm(quats, axis=1, keepdims=True).",
+        ),
+        (
+            lambda o, quats: quats / np.sum(quats * quats, axis=1, keepdims=True),
+            "You divide by the square of the length: the root is missing.",
+            "|q| is the root of the sum of the squares.",
+        ),
+        (
+            lambda o, quats: quats / np.max(np.abs(quats), axis=1, keepdims=True),
+            "You divide by the largest entry; a unit quaternion has the length 1.",
+            "|q| is the root of the sum of the squares.",
+        ),
+    ),
+    "unit_quats_from_quats_vjp": (
+        (
+            lambda o, quats, v: v / np.linalg.norm(quats, axis=1, keepdims=True),
+            "The part along q is still in it: a longer q is the same rotation, so the loss does not ask for it.",
+            "Take u (u . v) from v before you divide by the length.",
+        ),
+        (
+            lambda o, quats, v: o["unit_quats_from_quats_vjp"](quats, v) * np.linalg.norm(quats, axis=1, keepdims=True),
+            "The division by the length is missing: twice as long a q turns half as fast.",
+            "v_q = (v - u (u . v)) / |q|.",
+        ),
+        (
+            _along_q,
+            "The part along q is taken out with q itself, whose length is not 1; it must be taken out with u = q /"
+            " |q|.",
+            "v_q = (v - u (u . v)) / |q|: both u have length 1.",
+        ),
+        (
+            lambda o, quats, v: 2.0 * v / np.linalg.norm(quats, axis=1, keepdims=True) - o[_UNIT_BACK](quats, v),
+            "The part along q is added where it must be taken away.",
+            "v_q = (v - u (u . v)) / |q|, with a minus.",
+        ),
+    ),
+    "rotmats_from_quats": (
+        (
+            _turned("rotmats_from_quats"),
+            f"Your rotation is transposed. {_TRANSPOSED}",
+            "Turn (1, 0, 0) by a quarter about z, q = (1, 0, 0, 1): it must land on (0, 1, 0), so the first column of R"
+            " is (0, 1, 0). Exchange the signs of the terms with w.",
+        ),
+        (
+            lambda o, quats: o["rotmats_from_quats"](quats[:, [3, 0, 1, 2]]),
+            "Your quaternion is read as (x, y, z, w); here the real part comes first, (w, x, y, z).",
+            "The identity is (1, 0, 0, 0).",
+        ),
+        (
+            _without_length,
+            "Your quaternion is used as it is given; it must be divided by its length first, since only then is it a"
+            " rotation.",
+            "Training moves its four numbers freely, so that its length is anything; unit_quats_from_quats divides.",
+        ),
+    ),
+    "rotmats_from_quats_vjp": (
+        (
+            _without_length_back,
+            "The division by the length is not walked back: yours is the cotangent of the unit quaternion, not of q.",
+            "End with unit_quats_from_quats_vjp(quats, v_units).",
+        ),
+        *(
+            (
+                lambda o, quats, v, k=k: _two_of_one(o, quats, v, half=k),
+                f"A two is missing from the cotangent of {letter} of the unit quaternion; the other three have it.",
+                "Every entry of R has a two before its products, as in 2 (x y - w z).",
+            )
+            for k, letter in enumerate("wxyz")
+        ),
+        (
+            lambda o, quats, v_rotmats: o["rotmats_from_quats_vjp"](quats, np.swapaxes(v_rotmats, 1, 2)),
+            "The cotangent is read with its rows and columns exchanged.",
+            "v_rotmats[i, j, k] belongs to row j and column k of the i-th matrix.",
+        ),
+    ),
+    "covars_from_quats_scales": (
+        (
+            _transposed_covars,
+            f"Your rotation is transposed: the covariance is R^T S S R and not R S S R^T. {_TRANSPOSED}",
+            "With M = R diag(s) the covariance is M M^T. M^T M is another matrix.",
+        ),
+        (
+            lambda o, quats, scales: o["covars_from_quats_scales"](quats, np.sqrt(scales)),
+            "Your scales enter once; a covariance holds squares, because scales are standard deviations.",
+            "With M = R diag(s) the covariance is M M^T, in which every scale stands twice.",
+        ),
+        (
+            lambda o, quats, scales: np.stack([np.diag(s * s) for s in scales]),
+            "The rotation has gone from your covariance, diag(s)^2 is left: you multiply M^T M where M M^T is asked"
+            " for, or your M scales its rows, diag(s) R.",
+            "M = R diag(s) scales columns, R * s in NumPy; a column of R is an axis of the Gaussian. Then M @ M.T.",
+        ),
+        (
+            lambda o, quats, scales: o["covars_from_quats_scales"](quats, scales**2),
+            "Your scales enter four times; a covariance holds squares of standard deviations, so each enters twice.",
+            "With M = R diag(s), without a square, the covariance is M M^T.",
+        ),
+    ),
+    "covars_from_quats_scales_vjp": (
+        (
+            _covars_back(widths=False),
+            "The widths are missing from the cotangent of R: a column of M is a column of R times its width.",
+            "M_ij = R_ij s_j, so v_R_ij = v_M_ij s_j, and then rotmats_from_quats_vjp.",
+        ),
+        (
+            _covars_back(turned=False),
+            "R is missing from the cotangent of the widths: a width multiplies a column of R.",
+            "M_ij = R_ij s_j, so v_s_j is the sum over i of R_ij v_M_ij.",
+        ),
+    ),
+    "sh_basis": (
+        (
+            _positive_first_harmonics,
+            "Two of your harmonics of degree 1 have the wrong sign: they are (-y, z, -x) times a constant.",
+            "The signs are a convention, and every file of splats follows it.",
+        ),
+        (
+            lambda o, dirs, degree: o["sh_basis"](-dirs, degree),
+            "Your direction runs from the Gaussian to the camera; it is asked for from the camera to the Gaussian.",
+            "Use (x, y, z) as they are given: the harmonics of degree 1 are (-y, z, -x) times a constant.",
+        ),
+        *(
+            (
+                _first_degree(*signs),
+                "Your harmonics of degree 1 stand in the order x, y, z; they are (-y, z, -x) times a constant.",
+                "The order is a convention as well as the signs, and every file of splats follows it.",
+            )
+            for signs in ((1.0, 1.0, 1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, -1.0))
+        ),
+        (
+            lambda o, dirs, *given: o["sh_basis"](dirs[:, [0, 2, 1]], *given),
+            "y and z are exchanged in the basis.",
+            "The three functions of degree 1 are those of -y, z and -x, in this order.",
+        ),
+    ),
+    "sh_basis_vjp": (
+        (
+            lambda o, dirs, *given: o["sh_basis_vjp"](dirs[:, ::-1], *given),
+            "x and z are exchanged in the slopes of the basis.",
+            "The columns of a direction are x, y and z.",
+        ),
+    ),
+    "colors_from_sh": (
+        (
+            _colors(half=0.0, unit=True),
+            "The half is missing: a Gaussian whose coefficients are 0 is grey, not black.",
+            "c = max(sum_k Y_k h_k + 0.5, 0).",
+        ),
+        (
+            _colors(half=0.5, unit=False),
+            "Your direction is used as it is given; the harmonics ask for one of length 1.",
+            "Divide each direction by its length before sh_basis.",
+        ),
+    ),
+    "colors_from_sh_vjp": (
+        *(
+            (
+                _colors_back(divided),
+                "The division of the direction by its length is not walked back: a longer direction has the same"
+                " colour, so that nothing may be left along it.",
+                "v_d = (v_u - u (u . v_u)) / |d|, as for the quaternion of chapter 1b.",
+            )
+            for divided in (True, False)
+        ),
+    ),
+    "camera_center": (
+        (
+            lambda o, viewmat: -viewmat[:3, 3],
+            "Your centre is -t, which is in the camera's frame; it is asked for in the world's.",
+            "The centre is the point that viewmat takes to 0: solve R c + t = 0.",
+        ),
+        (
+            lambda o, viewmat: -viewmat[:3, :3] @ viewmat[:3, 3],
+            "Your rotation is not transposed: the centre is -R^T t, and yours is -R t.",
+            "Solve R c + t = 0; the inverse of a rotation is its transpose.",
+        ),
+        (
+            lambda o, viewmat: viewmat[:3, 3].copy(),
+            "Your centre is t, which is where the camera sees the world's origin.",
+            "The centre is the point that viewmat takes to 0: solve R c + t = 0, so c = -R^T t.",
+        ),
+    ),
+    "view_dirs": (
+        (
+            lambda o, means, viewmat: means - viewmat[:3, 3],
+            "You take t for the camera's centre; t is the world's origin as the camera sees it.",
+            "camera_center(viewmat) has the centre, -R^T t.",
+        ),
+        (
+            lambda o, means, viewmat: means.copy(),
+            "The camera's centre is missing: a direction leads from the camera to the Gaussian.",
+            "means - camera_center(viewmat).",
+        ),
+    ),
+    "means_cam_from_means": (
+        (
+            _with_transposed_camera("means_cam_from_means"),
+            "Your camera's rotation is transposed.",
+            "viewmat takes the world into the camera: p = R mean + t, without a transpose.",
+        ),
+        (
+            lambda o, means, viewmat: (means + viewmat[:3, 3]) @ viewmat[:3, :3].T,
+            "You add t before it turns; a point is turned first and moved then.",
+            "p = R mean + t.",
+        ),
+        (
+            lambda o, means, viewmat: means @ viewmat[:3, :3].T,
+            "You turn the points and do not move them: t is missing.",
+            "p = R mean + t, with t = viewmat[:3, 3].",
+        ),
+        (
+            lambda o, means, viewmat: o["means_cam_from_means"](means, viewmat) - 2.0 * viewmat[:3, 3],
+            "You take t away; it is added.",
+            "p = R mean + t: viewmat takes the world into the camera.",
+        ),
+    ),
+    "means_cam_from_means_vjp": (_rotation_left("means_cam_from_means", "v_mean = R^T v_p, in rows v_p @ R"),),
+    "covars_cam_from_covars": (
+        (
+            _with_transposed_camera("covars_cam_from_covars"),
+            "Your camera's rotation is transposed.",
+            "A linear map A turns a covariance S into A S A^T; here A is R = viewmat[:3, :3].",
+        ),
+        (
+            lambda o, covars, viewmat: viewmat[:3, :3] @ covars,
+            "You turn one side of the covariance only; a matrix of second moments is turned on both.",
+            "A linear map A turns a covariance S into A S A^T; here A is R = viewmat[:3, :3].",
+        ),
+        (
+            lambda o, covars, viewmat: viewmat[:3, :3] @ covars @ viewmat[:3, :3],
+            "The second rotation is not transposed.",
+            "A linear map A turns a covariance S into A S A^T; here A is R = viewmat[:3, :3].",
+        ),
+    ),
+    "covars_cam_from_covars_vjp": (_rotation_left("covars_cam_from_covars", "v_Sigma = R^T V R"),),
+    "project_means": (
+        (
+            lambda o, means_cam, K, width, height, *profile: (
+                o["project_means"](means_cam, K, width, height, *profile) - K[:2, 2]
+            ),
+            "The principal point is missing: you measure from the optical axis, pixels are counted from the corner.",
+            "Add (cx, cy) = (K[0, 2], K[1, 2]).",
+        ),
+        (
+            lambda o, means_cam, K, *given: o["project_means"](means_cam, K[[1, 0, 2]][:, [1, 0, 2]], *given),
+            "The numbers of K for x and for y are exchanged: x goes with fx and cx, y with fy and cy.",
+            "fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2].",
+        ),
+        (
+            _point_over_z,
+            "The principal point is divided by z: a point is first divided by its depth and then moved by (cx, cy).",
+            "u = fx x / z + cx.",
+        ),
+        (
+            lambda o, means_cam, K, *given: (
+                means_cam[:, :2] / means_cam[:, 2:] * np.array([K[1, 1], K[0, 0]]) + K[:2, 2]
+            ),
+            "The focal lengths are exchanged: fx is K[0, 0] and goes with x, fy is K[1, 1] and goes with y.",
+            "u = (fx x / z + cx, fy y / z + cy).",
+        ),
+        (
+            lambda o, means_cam, K, *given: means_cam[:, :2] * np.diag(K)[:2] + K[:2, 2],
+            "You do not divide by the depth: what is twice as far is half as large.",
+            "u = fx x / z + cx and v = fy y / z + cy.",
+        ),
+    ),
+    "project_means_vjp": (
+        (
+            lambda o, means_cam, K, *given: o["project_means_vjp"](means_cam, np.eye(3), *given),
+            "The focal lengths are missing: u changes by fx / z where x changes by 1.",
+            "v_x = fx / z v_u, and v_z has fx x / z^2 and fy y / z^2.",
+        ),
+        (
+            lambda o, means_cam, *given: (
+                o["project_means_vjp"](means_cam, *given) * np.where(np.arange(3) < 2, means_cam[:, 2:], 1.0)
+            ),
+            "The depth is missing under fx and fy: u changes by fx / z where x changes by 1.",
+            "v_x = fx / z v_u and v_y = fy / z v_v.",
+        ),
+    ),
+    "projection_jacobians": (
+        (
+            lambda o, means_cam, *given: (
+                o["projection_jacobians"](means_cam, *given) * np.where(np.arange(3) < 2, 1.0, means_cam[:, None, 2:])
+            ),
+            "The column of z lacks one division by the depth: the slope of 1 / z is -1 / z^2.",
+            "The entries of z are -fx tx / z^2 and -fy ty / z^2.",
+        ),
+    ),
+    "projection_jacobians_vjp": (
+        (
+            _without_z_of_the_diagonal,
+            "Two terms of z are missing: fx / z and fy / z on the Jacobian's diagonal depend on z, too.",
+            "Add -(fx v_xx + fy v_yy) / z^2 to the cotangent of z.",
+        ),
+        (
+            _once_by_z,
+            "A two is missing from the cotangent of z: fx x / z^2 has z under it twice.",
+            "The derivative of -fx x / z^2 by z is 2 fx x / z^3 where x/z is not clamped.",
+        ),
+    ),
+    "project_covars": (
+        (
+            lambda o, covars_cam, jacobians: jacobians @ np.swapaxes(jacobians, 1, 2),
+            "The covariance is missing between the two Jacobians.",
+            "J S J^T, with the Gaussian's S in the middle.",
+        ),
+    ),
+}

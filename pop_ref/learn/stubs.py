@@ -124,17 +124,17 @@ def stub(stage: Stage) -> str:
 
 def answer(stage: Stage) -> str:
     """Return the oracle's functions of a stage, without their docstrings."""
-    parts = []
-    for module, names in stage.functions.items():
-        lines = _source(module).splitlines()
-        for name in names:
-            node = _functions(module)[name]
-            text = [
-                *lines[node.lineno - 1 : node.body[0].lineno - 1],
-                *lines[node.body[1].lineno - 1 : node.end_lineno],
-            ]
-            parts.append("\n".join(text))
-    return "\n\n".join(parts)
+    homes = [(module, name) for module, names in stage.functions.items() for name in names]
+    return "\n\n".join(without_docstring(_source(module), _functions(module)[name]) for module, name in homes)
+
+
+def without_docstring(text: str, node: ast.FunctionDef) -> str:
+    """Return a function's lines, of its module's text, but for its docstring."""
+    lines = text.split("\n")[node.lineno - 1 : node.end_lineno]
+    if ast.get_docstring(node) is not None:
+        told = node.body[0]
+        del lines[told.lineno - node.lineno : (told.end_lineno or told.lineno) - node.lineno + 1]
+    return "\n".join(lines)
 
 
 def formulas(module: str, name: str) -> list[str]:

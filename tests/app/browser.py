@@ -9,7 +9,7 @@ import os
 import shutil
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -27,7 +27,6 @@ _FLAGS = (
     "--hide-scrollbars",
     "--no-first-run",
     "--disable-background-networking",
-    "--remote-debugging-pipe",
 )
 _PATIENCE = 120.0
 
@@ -109,8 +108,8 @@ class Browser:
 
 
 @contextmanager
-def browser(folder: Path) -> Iterator[Browser]:
-    """Start a browser with its profile in a folder, and end it."""
+def browser(folder: Path, tab: type[Browser] = Browser, flags: Sequence[str] = _FLAGS) -> Iterator[Any]:
+    """Start a browser with its profile in a folder, give its tab, and end it."""
     program = find_chromium()
     read_there, write_here = os.pipe()
     read_here, write_there = os.pipe()
@@ -122,7 +121,7 @@ def browser(folder: Path) -> Iterator[Browser]:
             os.dup2(end, number)
 
     process = subprocess.Popen(
-        [program, *_FLAGS, f"--user-data-dir={folder}"],
+        [program, *flags, "--remote-debugging-pipe", f"--user-data-dir={folder}"],
         close_fds=False,
         preexec_fn=pipes,
         stdout=subprocess.DEVNULL,
@@ -132,7 +131,7 @@ def browser(folder: Path) -> Iterator[Browser]:
     os.close(write_there)
     try:
         with os.fdopen(write_here, "wb", buffering=0) as to, os.fdopen(read_here, "rb", buffering=0) as back:
-            yield Browser(to, back)
+            yield tab(to, back)
     finally:
         process.terminate()
         try:

@@ -1,4 +1,7 @@
-"""The adapters that come with the kit: what is not here is skipped with the reason, what is stands up to the laws."""
+"""The adapters of the kit: what is not here is skipped with the reason, what is stands up to the laws.
+
+Sound implementations that lack a piece, or add in another order, are not refused; and what fails is told about.
+"""
 
 from __future__ import annotations
 
@@ -6,28 +9,31 @@ import importlib.util
 import re
 import sys
 from collections.abc import Callable
+from functools import partial
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+import torch
+from torch import Tensor
 
+from pop_fast.api.rasterize import rasterization as fast
 from pop_ref.compositing import composite, composite_vjp
-from pop_ref.conformance import Adapter, Scene
-from pop_ref.conformance.adapter import under
+from pop_ref.conformance import Adapter, Scene, capabilities
+from pop_ref.conformance.adapter import OracleAdapter, View, stage_function, under
 from pop_ref.conformance.backends import ELSEWHERE, Absent, Unavailable, made_by, shipped, shipped_or_absent
-from pop_ref.conformance.capabilities import DERIVATIVES, EXTENTS, GRADIENTS, INRIAS, LOWER_CEILING, PROFILES, RENDER
 from pop_ref.conformance.failure_report import failure_report
 from pop_ref.conformance.foreign_adapters import inria
 from pop_ref.conformance.law import missing
+from pop_ref.conformance.laws.test_whole import test_an_empty_scene_is_the_background as empty_scene_law
 from pop_ref.conformance.mutants import MUTANTS, living
 from pop_ref.conformance.mutants.trial import every_law, law_named, obeys
 from pop_ref.conformance.scenes import golden_scene, scene_as_code
 from pop_ref.conformance.torch_adapter import TorchAdapter
-from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER
-from pop_ref.constants import PROFILES as ALL_PROFILES
+from pop_ref.conformance.views import ASKED
+from pop_ref.constants import GSPLAT_1_5, GSPLAT_1_6, INRIA, PAPER, PROFILES, Profile
 from pop_ref.projection import project_means
-from tests.meta import inria_stub
 
 LAWS = every_law()
 FEW = 4
@@ -83,10 +89,127 @@ def test_a_package_that_is_not_installed_is_named() -> None:
     assert shipped_or_absent("gsplat").reason == "gsplat needs gsplat, which is not installed"
 
 
-def test_a_rasterizer_that_needs_a_gpu_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    import torch
+# diff-gaussian-rasterization's interface, as its users know it, on top of pop_fast. It insists on what Inria's code
+# takes for granted: transposed matrices that belong together, unit quaternions, shapes.
 
-    monkeypatch.setitem(sys.modules, "diff_gaussian_rasterization", inria_stub)
+
+class GaussianRasterizationSettings(NamedTuple):
+    image_height: int
+    image_width: int
+    tanfovx: float
+    tanfovy: float
+    bg: Tensor
+    scale_modifier: float
+    viewmatrix: Tensor
+    projmatrix: Tensor
+    sh_degree: int
+    campos: Tensor
+    prefiltered: bool
+    debug: bool
+    antialiasing: bool
+
+
+class GaussianRasterizer(torch.nn.Module):
+    def __init__(self, raster_settings: GaussianRasterizationSettings) -> None:
+        super().__init__()
+        self.raster_settings = raster_settings
+
+    def forward(
+        self,
+        means3D: Tensor,
+        means2D: Tensor,
+        opacities: Tensor,
+        shs: Tensor | None = None,
+        colors_precomp: Tensor | None = None,
+        scales: Tensor | None = None,
+        rotations: Tensor | None = None,
+        cov3D_precomp: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        s = self.raster_settings
+        n = len(means3D)
+        assert (shs is None) != (colors_precomp is None)
+        assert cov3D_precomp is None
+        assert scales is not None
+        assert rotations is not None
+        assert means2D.shape == (n, 3)
+        assert opacities.shape == (n, 1)
+        # the kernels do not normalise
+        assert torch.allclose(rotations.norm(dim=1), torch.ones_like(rotations[:, 0]), atol=1e-6)
+        colors = shs if shs is not None else colors_precomp
+        assert colors is not None
+        given = (means3D, means2D, opacities, colors, scales, rotations)
+        image, radii = _Drawn.apply(*given, s, shs is not None)
+        return image, radii, torch.zeros_like(image[:1])
+
+
+class _Drawn(torch.autograd.Function):
+    """The render; its gradient of a screen centre is in halves of the image, as Inria's is."""
+
+    @staticmethod
+    def forward(ctx: Any, *given: Any) -> Any:
+        *tensors, s, harmonics = given
+        with torch.enable_grad():
+            leaves = [tensor.detach().requires_grad_(True) for tensor in tensors]
+            image, meta = _rasterized(leaves, s, harmonics)
+        ctx.graph = image, [leaves[0], meta["means2d"], *leaves[2:]], (s.image_width, s.image_height)
+        radii = meta["radii"][0].amax(dim=1).int()
+        ctx.mark_non_differentiable(radii)
+        return image[0].permute(2, 0, 1).detach(), radii
+
+    @staticmethod
+    def backward(ctx: Any, *v: Any) -> Any:
+        image, wrt, size = ctx.graph
+        v_means, v_points, *rest = torch.autograd.grad(
+            image, wrt, v[0].permute(1, 2, 0)[None], allow_unused=True, materialize_grads=True
+        )
+        halves = v_points[0] * 0.5 * torch.tensor(size, dtype=v_points.dtype)
+        return v_means, torch.nn.functional.pad(halves, (0, 1)), *rest, None, None
+
+
+def _rasterized(leaves: list[Tensor], s: GaussianRasterizationSettings, harmonics: bool) -> tuple[Tensor, Any]:
+    means, _, opacities, colors, scales, rotations = leaves
+    viewmat = s.viewmatrix.T
+    half = torch.tensor([0.5 * s.image_width, 0.5 * s.image_height], dtype=means.dtype)
+    focal = half / torch.tensor([s.tanfovx, s.tanfovy], dtype=means.dtype)
+    _check_camera(s, viewmat, focal, half)
+    K = torch.eye(3, dtype=means.dtype)
+    K[0, 0], K[1, 1], K[0, 2], K[1, 2] = *focal, *half
+    image, _, meta = fast(
+        means,
+        rotations,
+        scales * s.scale_modifier,
+        opacities[:, 0],
+        colors,
+        viewmat[None],
+        K[None],
+        s.image_width,
+        s.image_height,
+        near_plane=INRIA.near_plane,
+        sh_degree=s.sh_degree if harmonics else None,
+        packed=False,
+        backgrounds=s.bg[None],
+        rasterize_mode="antialiased" if s.antialiasing else "classic",
+        profile="inria",
+    )
+    return image, meta
+
+
+def _check_camera(s: GaussianRasterizationSettings, viewmat: Tensor, focal: Tensor, half: Tensor) -> None:
+    # a point through the projection matrix lands where the pinhole puts it, and the camera stands at campos
+    there = torch.tensor([0.3, -0.2, 2.0, 1.0], dtype=viewmat.dtype)
+    world = torch.linalg.solve(viewmat, there)
+    clip = world @ s.projmatrix
+    assert torch.allclose(clip[:2] / clip[3] * half + half, focal * there[:2] / there[2] + half, atol=1e-3)
+    assert torch.allclose(viewmat[:3, :3] @ s.campos, -viewmat[:3, 3], rtol=1e-4, atol=1e-4)
+
+
+STUB = SimpleNamespace(
+    GaussianRasterizationSettings=GaussianRasterizationSettings, GaussianRasterizer=GaussianRasterizer
+)
+
+
+def test_a_rasterizer_that_needs_a_gpu_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "diff_gaussian_rasterization", STUB)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     reason = shipped_or_absent("diff-gaussian-rasterization").reason
     assert reason == "diff-gaussian-rasterization needs a CUDA device, and torch finds none"
@@ -94,10 +217,12 @@ def test_a_rasterizer_that_needs_a_gpu_says_so(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_inrias_interface_is_judged_through_its_adapter(dtype: str) -> None:
-    adapter = inria("stub", inria_stub, dtype, "cpu")
+    adapter = inria("stub", STUB, dtype, "cpu")
     assert not broken(adapter)
-    assert not missing(adapter, (RENDER, GRADIENTS, INRIAS))
-    assert missing(adapter, (PROFILES, EXTENTS, DERIVATIVES, LOWER_CEILING))
+    assert not missing(adapter, (capabilities.RENDER, capabilities.GRADIENTS, capabilities.INRIAS))
+    assert missing(
+        adapter, (capabilities.PROFILES, capabilities.EXTENTS, capabilities.DERIVATIVES, capabilities.LOWER_CEILING)
+    )
     g = adapter.gradients(adapter.sees(golden_scene()), np.ones((16, 16, 3)), np.zeros((16, 16)))
     assert set(g) == {"means", "quats", "scales", "opacities", "sh", "means2d"}
 
@@ -106,11 +231,11 @@ def _changed(change: Callable[[Any], dict[str, Any]]) -> SimpleNamespace:
     """Return the stub with other settings than the adapter gave it."""
 
     def settings(**given: Any) -> Any:
-        made = inria_stub.GaussianRasterizationSettings(**given)
+        made = GaussianRasterizationSettings(**given)
         return made._replace(**change(made))
 
-    settings._fields = inria_stub.GaussianRasterizationSettings._fields  # type: ignore[attr-defined]
-    return SimpleNamespace(GaussianRasterizationSettings=settings, GaussianRasterizer=inria_stub.GaussianRasterizer)
+    settings._fields = GaussianRasterizationSettings._fields  # type: ignore[attr-defined]
+    return SimpleNamespace(GaussianRasterizationSettings=settings, GaussianRasterizer=GaussianRasterizer)
 
 
 @pytest.mark.parametrize(
@@ -135,19 +260,19 @@ def fixed(profile: str) -> TorchAdapter:
     from pop_fast.api.rasterize import rasterization as sound
 
     def rasterization(*args: Any, rasterize_mode: str = "classic", **options: Any) -> Any:
-        options["near_plane"] = ALL_PROFILES[profile].near_plane
+        options["near_plane"] = PROFILES[profile].near_plane
         options["rasterize_mode"] = rasterize_mode
         image, alphas, meta = sound(*args, profile=profile, **options)
         return image, alphas, {"means2d": meta["means2d"], "radii": meta["radii"]}
 
-    return TorchAdapter(f"fixed {profile}", rasterization, profile=ALL_PROFILES[profile])
+    return TorchAdapter(f"fixed {profile}", rasterization, profile=PROFILES[profile])
 
 
 @pytest.mark.parametrize("profile", ["gsplat_1_6", "inria"])
 def test_a_rasterizer_with_one_profile_is_judged_under_it(profile: str) -> None:
     adapter = fixed(profile)
     assert not broken(adapter)
-    assert adapter.sees(golden_scene()).profile == ALL_PROFILES[profile]
+    assert adapter.sees(golden_scene()).profile == PROFILES[profile]
 
 
 def test_a_rasterizer_of_another_profile_than_it_claims_is_noticed() -> None:
@@ -202,15 +327,15 @@ def test_a_stage_is_judged_through_an_adapter_of_a_few_lines() -> None:
     judged = [path for path, law in LAWS.items() if not missing(adapter, law.needs)]
     assert judged == ["test_alpha:the_falloff_is_one_at_the_centre_and_multiplies_over_sums"]
     assert not broken(adapter, *judged)
-    assert not adapter.has(RENDER)
+    assert not adapter.has(capabilities.RENDER)
     with pytest.raises(LookupError, match="one stage has no stage function sigma_at_pixel"):
         adapter.stage("sigma_at_pixel")
 
 
 def test_blending_alone_is_judged_by_the_laws_of_images_and_gradients() -> None:
     adapter = Blending()
-    assert adapter.has(RENDER)
-    assert adapter.has(GRADIENTS)
+    assert adapter.has(capabilities.RENDER)
+    assert adapter.has(capabilities.GRADIENTS)
     assert not broken(adapter, IMAGE, GRADIENT, BACKGROUND)
     assert broken(ForgetsBackground(), GRADIENT, BACKGROUND) == [BACKGROUND]
 
@@ -244,6 +369,7 @@ def test_a_wrong_gradient_of_a_right_image_is_told() -> None:
     with living(by_name["conic_off_diagonal_twice"]) as backend:
         text = failure_report("test_some_law", backend, {"scene": golden_scene()})
     assert "first pixel" not in text
+    assert "first stage" not in text
     assert re.search(r"first gradient that differs: v_scales, Gaussian \d, entry \[\d\]: oracle \S+, backend \S+", text)
     assert "nearest decision: D" in text
 
@@ -260,24 +386,24 @@ def test_an_adapter_is_found_by_its_path_and_must_be_one() -> None:
         made_by("no_such.module:Mine")
 
 
-def test_a_scene_of_the_kit_is_a_public_name() -> None:
-    assert isinstance(golden_scene(), Scene)
+def _here(name: str) -> Any:
+    backend = shipped_or_absent(name)
+    if isinstance(backend, Absent):
+        pytest.skip(backend.reason)
+    return backend
 
 
 @pytest.mark.parametrize("name", ["compiled64", "compiled32"])
 def test_what_the_compiled_backend_has_of_its_own_is_judged(name: str) -> None:
-    backend = shipped_or_absent(name)
-    if isinstance(backend, Absent):
-        pytest.skip(backend.reason)
+    backend = _here(name)
     own = ("tile_lists", "contributions", "sensitivities", "fisher_blocks", "dominant_points", "adam_step")
     assert [stage for stage in own if not backend.has(stage)] == []
     assert all("compiled" in backend._stage(stage).__module__ for stage in own[:-1])
 
 
-def test_an_engines_own_adam_moves_what_strategies_edit(monkeypatch: pytest.MonkeyPatch) -> None:
-    backend = shipped_or_absent("compiled32")
-    if isinstance(backend, Absent):
-        pytest.skip(backend.reason)
+@pytest.mark.parametrize("name", ["compiled32", "mirror32"])
+def test_an_engines_own_adam_moves_what_strategies_edit(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    backend = _here(name)
     law = law_named("test_strategies:a_training_by_gsplat_is_the_oracles_at_every_step")
     assert obeys(law, backend) is None
     # an engine that takes steps of half the length is no longer the oracle's, whatever torch's own Adam does
@@ -290,3 +416,296 @@ def test_an_engines_own_adam_moves_what_strategies_edit(monkeypatch: pytest.Monk
 
     monkeypatch.setattr(module, "_step_by", halved)
     assert "training.rows" in (obeys(law, backend) or "")
+
+
+sound = partial(fast, backend="fast")
+TWICE = "test_gradients:twice_the_cotangent_is_exactly_twice_the_gradient"
+SCALED = "test_whole:scaling_the_world_by_a_power_of_two_changes_no_bit"
+
+
+def only_drawing(*args: Any, **options: Any) -> Any:
+    with torch.no_grad():
+        return sound(*args, **options)
+
+
+def leaving_torch(means: Any, *args: Any, **options: Any) -> Any:
+    return sound(torch.as_tensor(means.numpy()), *args, **options)
+
+
+@pytest.mark.parametrize("rasterization", [only_drawing, leaving_torch])
+def test_a_rasterizer_that_only_draws_is_judged_by_its_images(rasterization: Callable[..., Any]) -> None:
+    backend = TorchAdapter("drawing", rasterization, dtype="float32")
+    assert backend.has(capabilities.RENDER)
+    assert not backend.has(capabilities.GRADIENTS)
+    of_gradients = [stated for stated in LAWS.values() if capabilities.GRADIENTS in stated.needs]
+    assert len(of_gradients) > 15
+    assert all(capabilities.GRADIENTS in missing(backend, stated.needs) for stated in of_gradients)
+    # the laws of the signature compare its images all the same
+    cameras = law_named("test_signature_cameras:several_cameras_in_one_call_see_what_each_sees_alone")
+    assert not missing(backend, cameras.needs)
+    assert obeys(cameras, backend) is None
+
+
+def test_a_gradient_that_fails_is_a_failure_and_not_a_missing_piece() -> None:
+    def broken(*args: Any, **options: Any) -> Any:
+        raise RuntimeError("illegal memory access")
+
+    with pytest.raises(RuntimeError, match="illegal memory access"):
+        TorchAdapter("broken", broken).has(capabilities.GRADIENTS)
+
+
+def ids_alone(*args: Any, **options: Any) -> Any:
+    image, alphas, meta = sound(*args, dominance=True, **options)
+    return image, alphas, {"dominant_ids": meta["dominant_ids"]}
+
+
+def test_dominant_ids_are_judged_without_weights_and_counts() -> None:
+    backend = TorchAdapter("ids", ids_alone, dtype="float32")
+    assert backend.has(capabilities.DOMINANCE)
+    assert not backend.has(capabilities.DOMINANT_WEIGHTS)
+    judged = [path for path, s in LAWS.items() if capabilities.DOMINANCE in s.needs and not missing(backend, s.needs)]
+    assert len(judged) >= 6
+    assert {path: broken for path in judged if (broken := obeys(LAWS[path], backend, 10))} == {}
+
+
+def _refuses_packed(error: Callable[[], Any]) -> Callable[..., Any]:
+    def rasterization(*args: Any, packed: bool = True, **options: Any) -> Any:
+        return error() if packed else sound(*args, packed=False, **options)
+
+    return rasterization
+
+
+def _raises(error: Exception) -> Any:
+    raise error
+
+
+def _asserts() -> None:
+    allowed = False
+    assert allowed, "packed rows come later"
+
+
+def _refuses_packed_by(alone: Callable[[], Any], with_backgrounds: Callable[[], Any]) -> Callable[..., Any]:
+    def rasterization(*args: Any, packed: bool = True, backgrounds: Any = None, **options: Any) -> Any:
+        if packed:
+            return alone() if backgrounds is None else with_backgrounds()
+        return sound(*args, packed=False, backgrounds=backgrounds, **options)
+
+    return rasterization
+
+
+def _states() -> Any:
+    return _raises(NotImplementedError("packed"))
+
+
+def without_packed(means: Any, quats: Any, scales: Any, opacities: Any, colors: Any, viewmats: Any, Ks: Any,
+                   width: int, height: int, sh_degree: int | None = None, backgrounds: Any = None) -> Any:  # fmt: skip
+    return sound(means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree=sh_degree,
+                 backgrounds=backgrounds, packed=False)  # fmt: skip
+
+
+REFUSALS: dict[str, Callable[..., Any]] = {
+    "not implemented": _refuses_packed(lambda: _raises(NotImplementedError("packed"))),
+    "a ValueError by a statement": _refuses_packed(lambda: _raises(ValueError("packed=True is not for me"))),
+    "words of compiled code": _refuses_packed(lambda: _raises(RuntimeError("packed mode is not supported"))),
+    "no such argument": without_packed,
+    "a statement, and an assertion with backgrounds": _refuses_packed_by(_states, _asserts),
+}
+DEFECTS: dict[str, Callable[..., Any]] = {
+    "an assertion": _refuses_packed(_asserts),
+    "an operation on types that have none": _refuses_packed(lambda: {} | ()),  # type: ignore[operator]
+    "arrays that do not fit": _refuses_packed(lambda: np.zeros(2) + np.zeros(3)),
+    "a key that is not there": _refuses_packed(lambda: {}["packed"]),
+    "an argument of something inside": _refuses_packed(lambda: dict.fromkeys(values=())),  # type: ignore[call-arg]
+    "an assertion, and a statement with backgrounds": _refuses_packed_by(_asserts, _states),
+    "a kernel that fails": _refuses_packed(lambda: _raises(RuntimeError("illegal memory access"))),
+}
+PACKED_LAW = "test_signature_cameras:packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same"
+
+
+@pytest.mark.parametrize("words", REFUSALS)
+def test_what_is_refused_on_purpose_is_skipped_in_the_words_of_the_refusal(words: str) -> None:
+    backend = TorchAdapter("refusing", REFUSALS[words], dtype="float32")
+    assert missing(backend, law_named(PACKED_LAW).needs) == [capabilities.PACKED]
+    assert "packed" in str(backend.why_not(capabilities.PACKED))
+
+
+def test_a_rasterizer_with_fewer_arguments_than_gsplats_is_judged_by_those_it_has() -> None:
+    backend = TorchAdapter("short", without_packed, dtype="float32")
+    for path in (
+        "test_agreement:the_image_is_one_of_the_oracles_outcomes",
+        "test_signature_cameras:several_cameras_in_one_call_see_what_each_sees_alone",
+    ):
+        assert not missing(backend, law_named(path).needs)
+        assert obeys(law_named(path), backend, 5) is None
+
+
+@pytest.mark.parametrize("defect", DEFECTS)
+def test_an_error_that_nobody_raised_on_purpose_is_a_defect_that_a_law_reports(defect: str) -> None:
+    backend = TorchAdapter("crashing", DEFECTS[defect], dtype="float32")
+    assert not missing(backend, law_named(PACKED_LAW).needs)
+    assert obeys(law_named(PACKED_LAW), backend, 5) is not None
+
+
+class _Unordered(torch.autograd.Function):
+    """A sum whose gradient is taken in an order that another run does not repeat: its last bit varies."""
+
+    run = 0
+
+    @staticmethod
+    def forward(ctx: Any, value: Any) -> Any:
+        return value.clone()
+
+    @staticmethod
+    def backward(ctx: Any, v: Any) -> Any:
+        _Unordered.run += 1
+        return v * (1.0 + (_Unordered.run % 3) * torch.finfo(v.dtype).eps)
+
+
+def unordered(means: Any, *args: Any, **options: Any) -> Any:
+    return sound(_Unordered.apply(means), *args, **options)
+
+
+def test_sums_without_an_order_are_not_held_to_equal_bits() -> None:
+    assert obeys(law_named(TWICE), TorchAdapter("careless", unordered, dtype="float32"), 10) is not None
+    backend = TorchAdapter("atomic", unordered, dtype="float32", deterministic=False)
+    skipped = {path for path, stated in LAWS.items() if capabilities.DETERMINISTIC in missing(backend, stated.needs)}
+    assert {TWICE, "test_gradients:gradients_ignore_the_coefficients_of_other_bands"} <= skipped
+    assert "test_agreement:gradients_are_the_oracles" not in skipped
+    assert obeys(law_named("test_agreement:gradients_are_the_oracles"), backend, 10) is None
+
+
+class OneProfile(Adapter):
+    """An author's adapter: the oracle's stages as methods, and an error for constants that it does not have."""
+
+    name, dtype, profile = "one profile", np.float64, GSPLAT_1_5
+
+    def __getattr__(self, name: str) -> Any:
+        function = stage_function("pop_ref", name)
+        if function is None:
+            raise AttributeError(name)
+
+        def checked(*args: Any, **options: Any) -> Any:
+            for value in (*args, *options.values()):
+                if isinstance(value, Profile):
+                    assert {**vars(value), "name": ""} == {**vars(GSPLAT_1_5), "name": ""}, f"handed {value.name}"
+            return function(*args, **options)
+
+        return checked
+
+
+@pytest.mark.parametrize("stage", ["projection", "camera", "alpha", "footprint", "tiles"])
+def test_an_adapter_of_one_profile_is_handed_no_other(stage: str) -> None:
+    backend = OneProfile()
+    judged = {path: s for path, s in LAWS.items() if s.stage == stage and not missing(backend, s.needs)}
+    assert len(judged) >= 4
+    assert {path: broken for path, s in judged.items() if (broken := obeys(s, backend, 20))} == {}
+
+
+class InriasDivision(OracleAdapter):
+    """The oracle with Inria's divisor w + 1e-7, which a world of another size meets elsewhere."""
+
+    def render(self, scene: Scene) -> View:
+        R, t = scene.camera.viewmat[:3, :3], scene.camera.viewmat[:3, 3]
+        p = scene.gaussians.means @ R.T + t
+        aside = p * np.array([1.0, 1.0, 0.0]) * (p[:, 2:] / (p[:, 2:] + 1e-7) - 1.0)
+        return super().render(scene.with_overrides(means=scene.gaussians.means + aside @ R))
+
+
+def test_inrias_divisor_breaks_no_law_of_its_profile() -> None:
+    backend = InriasDivision()
+    assert obeys(law_named(SCALED), backend) is not None
+    backend.profile = INRIA
+    assert Adapter.has(backend, capabilities.HOMOGENEOUS) is False
+    assert capabilities.HOMOGENEOUS in law_named(SCALED).needs
+
+
+class Greyish(OracleAdapter):
+    """The oracle with a background that is a little too bright."""
+
+    def render(self, scene: Scene) -> View:
+        return super().render(scene.with_overrides(background=scene.background + 2.0**-10))
+
+
+def test_an_empty_scene_has_a_report() -> None:
+    with pytest.raises(AssertionError) as caught:
+        empty_scene_law(Greyish())
+    report = "\n".join(caught.value.__notes__)
+    assert "no report" not in report
+    assert "first pixel that differs: image, pixel (0, 0)" in report
+    no_gaussians = golden_scene().rows([])
+    assert "no report" not in failure_report("test_some_law", OracleAdapter(), {"scene": no_gaussians})
+
+
+class WrongGradients(OracleAdapter):
+    """The oracle with a wrong gradient of the background."""
+
+    def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
+        found = super().gradients(scene, v_image, v_T_final)
+        return found | {"background": found["background"] + 1.0}
+
+
+def test_a_law_that_asked_for_no_gradient_is_not_explained_by_one() -> None:
+    backend = WrongGradients()
+    assert "first gradient that differs: v_background" in failure_report(
+        "test_some_law", backend, {"scene": golden_scene()}
+    )
+    backend.asked_for_gradients = False  # type: ignore[attr-defined]
+    report = failure_report("test_some_law", backend, {"scene": golden_scene()})
+    assert "gradient" not in report
+    assert "the law breaks in what it compares" in report
+
+
+def refusing(*args: Any, render_mode: str = "RGB", radius_clip: float = 0.0, **options: Any) -> Any:
+    if render_mode != "RGB":
+        raise NotImplementedError("no depth")
+    if radius_clip:
+        raise ValueError("radius_clip must be 0")
+    return sound(*args, **options)
+
+
+def bare(means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane=0.01, eps2d=0.3,
+         sh_degree=None, packed=True, tile_size=16, backgrounds=None):  # fmt: skip
+    named = {"sh_degree": sh_degree, "packed": packed, "tile_size": tile_size, "backgrounds": backgrounds}
+    planes = {"near_plane": near_plane, "eps2d": eps2d}
+    return sound(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **planes, **named)
+
+
+def test_an_argument_that_is_refused_or_not_there_is_a_skip_by_name() -> None:
+    lacks = {
+        refusing: {"depth modes", "radius_clip"},
+        bare: {
+            "depth modes",
+            "radius_clip",
+            "covariances in place of quaternions and scales",
+            "planes and low-pass other than its defaults",
+        },
+    }
+    for rasterization, expected in lacks.items():
+        backend = TorchAdapter("partial", rasterization, dtype="float32")
+        assert {name for name in ASKED if not backend.has(name)} == expected | {"sparse_grad"}
+        assert backend.has(capabilities.GRADIENTS), "an argument absgrad is no condition of gradients"
+
+
+def of_one_profile(profile: Profile) -> Any:
+    """Give a rasterizer that has the constants of one profile, and no argument to choose another."""
+
+    def rasterization(means: Any, quats: Any, scales: Any, opacities: Any, colors: Any, viewmats: Any, Ks: Any,
+                      width: int, height: int, packed: bool = True, render_mode: str = "RGB", absgrad: bool = False,
+                      covars: Any = None, **options: Any) -> Any:  # fmt: skip
+        given = {"packed": packed, "render_mode": render_mode, "absgrad": absgrad, "covars": covars, **options}
+        return sound(
+            means, quats, scales, opacities, colors, viewmats, Ks, width, height, profile=profile.name, **given
+        )
+
+    return TorchAdapter(profile.name, rasterization, dtype="float32", profile=profile)
+
+
+@pytest.mark.slow  # all laws of the signature
+@pytest.mark.parametrize("profile", [GSPLAT_1_6, INRIA], ids=lambda profile: profile.name)
+def test_the_laws_of_the_signature_and_of_scale_judge_constants_of_any_profile(profile: Profile) -> None:
+    backend, judged = of_one_profile(profile), 0
+    for path, stated in LAWS.items():
+        if path.startswith(("test_signature", "test_scale")) and not missing(backend, stated.needs):
+            assert obeys(stated, backend) is None, path
+            judged += 1
+    assert judged >= (24 if profile is INRIA else 36)

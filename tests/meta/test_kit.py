@@ -1,12 +1,22 @@
-"""The checks checked: scenes survive pasting and storing, strategies cover what they promise, reports say enough."""
+"""The checks checked: scenes survive pasting and storing, strategies cover what they promise, reports say enough.
+
+A failing law's report names the right cause, and is about the example that broke the law. The examples that tests draw
+are the same on every machine, whatever is installed or imported.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import importlib
+import inspect
 import json
+import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from importlib.metadata import entry_points
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +24,30 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from jaxtyping import TypeCheckError
+from pop_ref.conformance.poison import POISONED_INTEGER, poisoned_allocations
 
+from pop_fast.api.rasterize import rasterization as fast
+from pop_ref.activations import scales_from_log_scales
+from pop_ref.conformance import laws
+from pop_ref.conformance.adapter import OracleAdapter, View
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
-from pop_ref.conformance.backends import Absent, shipped_or_absent
+from pop_ref.conformance.backends import Absent, shipped, shipped_or_absent
+from pop_ref.conformance.calls import Call, call_as_code
 from pop_ref.conformance.failure_report import failure_report
-from pop_ref.conformance.law import missing
-from pop_ref.conformance.mutants import MUTANTS, living
+from pop_ref.conformance.hypothesis_profiles import EXAMPLES
+from pop_ref.conformance.law import is_crash, missing
+from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, living
 from pop_ref.conformance.mutants.trial import every_law, law_named, obeys
+from pop_ref.conformance.pairs import (
+    FACTORS,
+    accepted,
+    call_of,
+    covering_rows,
+    judged_pairs,
+    pairs_of,
+    possible_pairs,
+)
 from pop_ref.conformance.scenes import (
     Scene,
     cotangents,
@@ -31,10 +58,14 @@ from pop_ref.conformance.scenes import (
     scene_as_code,
 )
 from pop_ref.conformance.scorecard import Entry, Scorecard, outcomes
-from pop_ref.conformance.strategies import FLOOR, scenes
+from pop_ref.conformance.signature import made
+from pop_ref.conformance.strategies import FLOOR, corners, scenes
 from pop_ref.conformance.tolerances import TABLE
+from pop_ref.conformance.torch_adapter import TorchAdapter
 from pop_ref.conformance.torch_strategy import StrategyAdapter
 from pop_ref.constants import INRIA
+from pop_ref.covariance import covars_from_quats_scales
+from pop_ref.losses import l2
 from pop_ref.records import Camera, Gaussians
 from tests.judged import POISONED_INTEGER, poisoned_allocations
 
@@ -101,29 +132,26 @@ def test_rounding_a_scene_twice_is_rounding_it_once() -> None:
     assert not _same(once, golden_scene())
 
 
-def test_a_comparison_reports_index_values_and_units() -> None:
-    with pytest.raises(AssertionError, match=r"first at \[1\].*differs by .* units, allowed") as caught:
-        assert_close("alpha.sigma", np.array([1.0, 2.5]), np.array([1.0, 2.0]), 1.0, np.float64)
-    assert "got 2.5, expected 2.0" in str(caught.value)
+@pytest.mark.parametrize(
+    ("actual", "expected", "scale", "dtype", "said"),
+    [
+        ([1.0, 2.5], [1.0, 2.0], 1.0, np.float64, r"first at \[1\].*differs by .* units, allowed"),
+        ([1.0, 2.5], [1.0, 2.0], 1.0, np.float64, "got 2.5, expected 2.0"),
+        # one wrong entry among a million
+        (np.where(np.arange(10**6) == 123_456, 1e-6, 0.0), np.zeros(10**6), 1.0, np.float32, r"first at \[123456\]"),
+        *(([bad], [1.0], 1e300, np.float64, "not finite") for bad in (np.nan, np.inf, -np.inf)),
+        (np.zeros(2), np.zeros((2, 1)), 1.0, np.float64, "shape"),
+    ],
+    ids=["index", "values", "million", "nan", "inf", "-inf", "shape"],
+)
+def test_what_differs_is_told_with_index_values_and_units(
+    actual: Any, expected: Any, scale: float, dtype: Any, said: str
+) -> None:
+    with pytest.raises(AssertionError, match=said):
+        assert_close("alpha.sigma", np.array(actual), np.array(expected), scale, dtype)
 
 
-def test_one_wrong_entry_among_a_million_fails() -> None:
-    expected = np.zeros(1_000_000)
-    actual = expected.copy()
-    actual[123_456] = 1e-6
-    with pytest.raises(AssertionError, match=r"first at \[123456\]"):
-        assert_close("alpha.sigma", actual, expected, 1.0, np.float32)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_what_is_not_finite_never_passes(bad: float) -> None:
-    with pytest.raises(AssertionError, match="not finite"):
-        assert_close("alpha.sigma", np.array([bad]), np.array([1.0]), 1e300, np.float64)
-
-
-def test_shapes_must_agree() -> None:
-    with pytest.raises(AssertionError, match="shape"):
-        assert_close("alpha.sigma", np.zeros(2), np.zeros((2, 1)), 1.0, np.float64)
+def test_bits_of_other_shapes_are_not_the_same() -> None:
     with pytest.raises(AssertionError, match="shape"):
         assert_same_bits("x", np.zeros(2), np.zeros(3))
 
@@ -203,17 +231,8 @@ def test_a_session_that_judges_nothing_is_left_alone(tmp_path: Path) -> None:
         f"    assert {entry.value!r} in sys.modules\n"
         "    assert not {'pop_ref', 'torch'} & set(sys.modules)\n"
     )
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "-p",
-        "no:hypothesispytest",
-        "--profile=cpu",
-    ]
+    plugins = ["-p", "no:cacheprovider", "-p", "no:hypothesispytest"]
+    command = [sys.executable, "-m", "pytest", "-q", *plugins, "--profile=cpu"]
     done = subprocess.run([*command, str(tmp_path)], capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
 
@@ -229,6 +248,9 @@ def test_a_session_that_judges_nothing_is_left_alone(tmp_path: Path) -> None:
         (("--backend", "gsplt"), "backend 'gsplt' is unknown; use one of oracle, fast64"),
         (("--scorecard", "card.txt"), "scorecard card.txt must end in .json or .html"),
         (("--stage", "order"), "invalid choice: 'order' (choose from"),
+        (("--strategy", "nowhere.at_all:Strategy"), "needs nowhere, which is not installed"),
+        (("--strategy", "math:Strategy"), "module math has no function Strategy"),
+        (("--strategy", "math"), "must be written module:name"),
     ],
     ids=lambda value: value[1] if isinstance(value, tuple) else None,
 )
@@ -279,15 +301,28 @@ def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, 
 """
 
 
+Judged = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture
+def stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Judged:
+    """Give a function that writes a rasterizer into a module and has the kit judge it."""
+
+    def judged(text: str, *options: str, name: str = "stranger") -> subprocess.CompletedProcess[str]:
+        (tmp_path / f"{name}.py").write_text(text)
+        monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{ROOT}")
+        return _kit("--rasterizer", f"{name}:rasterization", *options)
+
+    return judged
+
+
 @pytest.mark.parametrize("shift", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
 def test_a_stranger_with_gsplats_signature_is_judged_by_what_it_offers(
-    tmp_path: Path, shift: float, monkeypatch: pytest.MonkeyPatch
+    stranger: Judged, tmp_path: Path, shift: float
 ) -> None:
     # nothing but gsplat's arguments and meta keys; with half a pixel's shift it must fail and say where
-    (tmp_path / "stranger.py").write_text(STRANGER.format(shift=shift))
-    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{ROOT}")
-    done = _kit("--rasterizer", "stranger:rasterization", "--dtype", "float64", "--profile", "gsplat_1_5", "-rs",
-                "-k", "round_splat or stop_itself or any_tile", "--failures", str(tmp_path / "broken"))  # fmt: skip
+    done = stranger(STRANGER.format(shift=shift), "--dtype", "float64", "--profile", "gsplat_1_5", "-rs",
+                    "-k", "round_splat or stop_itself or any_tile", "--failures", str(tmp_path / "broken"))  # fmt: skip
     assert "has no stops" in done.stdout, done.stdout + done.stderr
     assert done.returncode == (1 if shift else 0), done.stdout + done.stderr
     if shift:
@@ -306,13 +341,11 @@ PACKED = STRANGER.replace("absgrad=False,", "sparse_grad=False, absgrad=False,")
 
 
 def test_one_cause_that_breaks_several_laws_is_told_once_with_where_it_was_raised(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stranger: Judged, tmp_path: Path
 ) -> None:
-    (tmp_path / "stranger.py").write_text(PACKED.format(shift=0.0))
-    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{ROOT}")
     chosen = "packed_rows_are_those or arguments_that_are_taken_alone or sparse_gradients"
     options = ("--profile", "gsplat_1_5", "-v", "-k", chosen, "--failures", str(tmp_path))
-    done = _kit("--rasterizer", "stranger:rasterization", *options)
+    done = stranger(PACKED.format(shift=0.0), *options)
     _, _, told = done.stdout.partition("= conformance =")
     assert "stranger:rasterization: 0 laws hold, broken 2, not judged 1" in told, done.stdout
     assert told.count("with packed=True and backgrounds together, and not with fewer: answer: fails an assertion") == 1
@@ -322,13 +355,10 @@ def test_one_cause_that_breaks_several_laws_is_told_once_with_where_it_was_raise
     assert "sparse_grad (NotImplementedError: sparse_grad)" in " ".join(done.stdout.split())
 
 
-def test_who_has_gsplat_and_nothing_else_reads_first_what_is_judged_and_what_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_has_gsplat_and_nothing_else_reads_first_what_is_judged_and_what_is_refused(stranger: Judged) -> None:
     # nothing is said of constants: a module of that name tells them by its version
-    (tmp_path / "gsplat.py").write_text(f'__version__ = "1.5.3"\n{STRANGER.format(shift=0.0)}')
-    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{ROOT}")
-    done = _kit("-v", "--rasterizer", "gsplat:rasterization", "-k", "empty_scene")
+    text = f'__version__ = "1.5.3"\n{STRANGER.format(shift=0.0)}'
+    done = stranger(text, "-v", "-k", "empty_scene", name="gsplat")
     told = " ".join(done.stdout.split())
     assert done.returncode == 0, done.stdout + done.stderr
     assert "conformance: gsplat:rasterization, float32, constants gsplat_1_5, on cpu (--dtype, --profile" in told
@@ -336,6 +366,16 @@ def test_who_has_gsplat_and_nothing_else_reads_first_what_is_judged_and_what_is_
     assert "arguments taken: several cameras in one call; batch dimensions; packed rows; plain colours" in told
     assert "refused, and not judged: depth modes (TypeError: " in told
     assert "--strategy name an implementation that offers them next: a broken law prints where" in told
+
+
+def _obeys_on(name: str, law: str, gaussians: Gaussians, K: Any, tile_size: int) -> None:
+    """Hold a backend to a law on a scene of 4 x 4 pixels that a camera at the origin sees."""
+    backend = shipped_or_absent(name)
+    if isinstance(backend, Absent):
+        pytest.skip(backend.reason)
+    scene = Scene(gaussians, Camera(np.eye(4), np.array(K), 4, 4), tile_size=tile_size)
+    sentence = law_named(law).sentence
+    settings(max_examples=1, database=None)(given(scene=st.just(scene))(lambda scene: sentence(backend, scene=scene)))()
 
 
 @pytest.mark.parametrize("name", ["fast32", "compiled32"])
@@ -349,9 +389,6 @@ def test_who_has_gsplat_and_nothing_else_reads_first_what_is_judged_and_what_is_
 def test_no_law_compares_a_render_with_a_gradient_where_rounding_decides(law: str, name: str) -> None:
     # the alpha of the nearer splat at pixel (2, 2) is the floor to 6e-8, and tiles of another size round it to its
     # other side
-    backend = shipped_or_absent(name)
-    if isinstance(backend, Absent):
-        pytest.skip(backend.reason)
     K = [[8.0, 0.0, 2.0], [0.0, 8.0, 2.0], [0.0, 0.0, 1.0]]
     gaussians = Gaussians(
         means=[[0.078125, 0.078125, 2.5], [0.0625, 0.0625, 1.0]],
@@ -360,18 +397,13 @@ def test_no_law_compares_a_render_with_a_gradient_where_rounding_decides(law: st
         opacities=[0.5, 1.0 / 255.0],
         sh=[[[1.0, 0.5, 0.25]], [[0.0, 0.0, 0.0]]],
     )
-    scene = Scene(gaussians, Camera(np.eye(4), np.array(K), 4, 4), tile_size=4)
-    sentence = law_named(f"test_gradients:{law}").sentence
-    settings(max_examples=1, database=None)(given(scene=st.just(scene))(lambda scene: sentence(backend, scene=scene)))()
+    _obeys_on(name, f"test_gradients:{law}", gaussians, K, 4)
 
 
 @pytest.mark.parametrize("name", ["fast32", "compiled32"])
 def test_a_weight_is_charged_for_an_exponent_that_is_expanded_about_a_tile_far_from_it(name: str) -> None:
     # the last splat is a point widened by the low-pass alone; its pixel lies 8 px from the middle of its tile, so that
     # terms of 200 cancel in its exponent
-    backend = shipped_or_absent(name)
-    if isinstance(backend, Absent):
-        pytest.skip(backend.reason)
     near = [0.4871794879436493, 0.10256410390138626, 1.0]
     gaussians = Gaussians(
         means=[[1.0897436141967773, 0.12820513546466827, 2.5], near, near, near, [0.28205129504203796, *near[1:]]],
@@ -381,9 +413,7 @@ def test_a_weight_is_charged_for_an_exponent_that_is_expanded_about_a_tile_far_f
         sh=[[[1.0, 0.5, 0.25]], *[[[0.0] * 3]] * 4],
     )
     K = [[4.875, 0.0, 0.125], [0.0, 4.875, 2.0], [0.0, 0.0, 1.0]]
-    scene = Scene(gaussians, Camera(np.eye(4), np.array(K), 4, 4), tile_size=16)
-    sentence = law_named("test_agreement:dominant_weights_are_the_oracles").sentence
-    settings(max_examples=1, database=None)(given(scene=st.just(scene))(lambda scene: sentence(backend, scene=scene)))()
+    _obeys_on(name, "test_agreement:dominant_weights_are_the_oracles", gaussians, K, 16)
 
 
 class _OneCall:
@@ -428,16 +458,259 @@ def test_somebodys_strategy_is_judged_by_the_laws_that_are_about_no_method() -> 
     assert "edited_parameters_are_trained_as_they_were" in broken_laws(_FreezesAll)
 
 
+BOXES = {box.name: box for box in BLACK_BOXES}
+
+
+def report(path: str, backend: Any) -> str:
+    """Run a law as pytest does, and return its failure with the report."""
+    module, _, name = path.partition(":")
+    test = getattr(importlib.import_module(f"{laws.__name__}.{module}"), f"test_{name}")
+    with pytest.raises(AssertionError) as caught:
+        test(backend=backend)
+    return "\n".join([str(caught.value), *caught.value.__notes__])
+
+
+CAUSES = {
+    "near_plane_ignored": ("first difference: images", "first cause: with near_plane=2\n"),
+    "eps2d_ignored": ("first difference: images", "first cause: with eps2d=0.0625\n"),
+    "radius_clip_ignored": ("first difference: images", "first cause: with radius_clip=6\n"),
+    "background_of_the_camera_before": ("camera 0, pixel (", "first cause: with 2 cameras and backgrounds together"),
+    "intrinsics_of_the_first_camera": ("camera 1, pixel (", "first cause: with 2 cameras\n"),
+    "expected_depth_not_divided": ("first difference: images", "first cause: with render_mode='ED'\n"),
+    "expected_depth_of_a_constant_opacity": ("first difference: gradients", "first cause: with render_mode='ED'\n"),
+    "tiles_counted_in_a_byte": ("first difference: tiles: meta tiles_per_gauss", "tiles together"),
+    "dominant_packed_rows": ("first difference: dominance: meta dominant_ids", "first cause: with packed=True\n"),
+    "covariances_counted_once": ("first difference: gradients", "first cause: with covars\n"),
+    "white_by_default": ("pixel (0, 0), channel 0: got 1.0, expected 0.0", "first cause: with backgrounds=None\n"),
+    "dominant_counts_of_the_first_camera": ("dominant_counts beside dominant_ids, camera 1", "with 2 cameras\n"),
+    "packed_is_classic": ("first difference: images", "with packed=True and rasterize_mode='antialiased' together"),
+    "depth_of_the_first_entry": ("batch entry 1, pixel (", "with batch dimensions [2] and render_mode="),
+    "packed_fails_with_backgrounds": ("fails an assertion of its own", "packed=True and backgrounds together"),
+    "packed_view_gradients_are_of_one_camera": ("agreement.v_viewmat: camera 0", "2 cameras and packed=True together"),
+}
+
+
+@pytest.mark.slow  # a run of the kit for each of twelve
+@pytest.mark.parametrize("name", CAUSES)
+def test_the_report_of_a_broken_rasterizer_names_its_cause(name: str) -> None:
+    text = report(BOXES[name].law, BOXES[name].adapter())
+    for words in CAUSES[name]:
+        assert words in text
+    # stages are spoken of where they have been compared, and these show none before the pixel but in meta
+    assert "stages" not in text
+
+
+class WrongAlone(OracleAdapter):
+    """The oracle, with a gradient of scales that is wrong for a scene of one Gaussian, the first that a law tries."""
+
+    def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
+        found = super().gradients(scene, v_image, v_T_final)
+        return found | {"scales": found["scales"] * (1.0 + (len(scene.gaussians) == 1))}
+
+
+def test_a_report_is_about_the_example_that_raised_the_error() -> None:
+    text = report("test_agreement:gradients_are_the_oracles", WrongAlone())
+    assert "first gradient that differs: v_scales, Gaussian 0" in text
+    pasted: dict[str, Any] = {}
+    exec(text[text.index("from pop_ref.conformance.scenes") :].partition("\nlaw ")[0], pasted)
+    assert len(pasted["scene"].gaussians) == 1
+
+
+class Darker(OracleAdapter):
+    """The oracle with colours that are a little too dark: nothing before the pixel differs, nor does T_final."""
+
+    def has(self, need: str) -> bool:
+        return need in ("render", "gradients") or (super().has(need) and not need.isidentifier())
+
+    def render(self, scene: Scene) -> View:
+        view = super().render(scene)
+        return View(**{**vars(view), "image": view.image * 0.75})
+
+
+def test_what_follows_from_meta_is_said_only_as_far_as_it_follows() -> None:
+    text = report("test_agreement:the_image_is_one_of_the_oracles_outcomes", Darker())
+    assert "no stage that its meta shows differs: depths, means2d, conics, and so is T_final, so it is colours" in text
+
+
+def test_a_printed_call_can_be_pasted() -> None:
+    backend = shipped("fast32")
+    rows = covering_rows(accepted(backend).levels)
+    for number, row in enumerate(rows[:12]):
+        call, scope = call_of(backend, row, number), {}
+        exec(call_as_code(call), scope)
+        pasted = scope["call"]
+        assert isinstance(pasted, Call)
+        assert (repr(pasted), pasted.described()) == (repr(call), call.described())
+        for name, value in call.tensors().items():
+            assert np.array_equal(value, pasted.tensors()[name])
+
+
+def test_every_pair_of_levels_meets_in_some_row_and_every_level_moves_something() -> None:
+    levels = {factor: tuple(one.name for one in values) for factor, values in FACTORS.items()}
+    rows = covering_rows(levels)
+    assert pairs_of(rows) >= set(possible_pairs(levels))
+    assert len(rows) < 60
+    backend = shipped("fast32")
+    taken = covering_rows(accepted(backend).levels)
+    clipped = [call_of(backend, row, k) for k, row in enumerate(taken) if row["radius_clip"] != "0"]
+    assert len(clipped) > 10
+    first = made(backend, clipped[0])
+    assert any(np.any(~e.render.splats.visible) for _, _, e in first.each())
+
+
+@pytest.mark.slow  # all pairs of arguments
+def test_pairs_that_only_failing_calls_hold_are_named_and_count_as_not_judged() -> None:
+    backend = BOXES["packed_fails_with_backgrounds"].adapter()
+    assert judged_pairs(backend) == {}
+    with pytest.raises(AssertionError) as caught:
+        every_law()["test_signature_pairs:arguments_that_are_taken_alone_are_taken_together"].sentence(backend)
+    assert is_crash(caught.value)
+    found = judged_pairs(backend)
+    assert found["judged"] < found["taken"] <= found["of"]
+    assert "packed=True with backgrounds=given" in found["only in calls that fail"]
+    assert found["by arguments"]["packed x backgrounds"] == "3 of 4"
+
+
+@pytest.mark.slow  # all laws of the signature
+@pytest.mark.parametrize(("argument", "keys"), [("tile_size", ()), ("backend", ("camera_ids", "batch_ids"))])
+def test_a_sound_rasterizer_without_tile_size_or_camera_ids_breaks_no_law_of_the_signature(
+    argument: str, keys: tuple[str, ...]
+) -> None:
+    def rasterization(*args: Any, **options: Any) -> Any:
+        images, alphas, meta = shipped("fast32")._rasterization(*args, **options)
+        return images, alphas, {key: meta[key] for key in meta if key not in keys}
+
+    without = {"profile", "dominance", "counts", "backend", argument}
+    taken = [p for name, p in inspect.signature(fast).parameters.items() if name not in without]
+    rasterization.__signature__ = inspect.Signature(taken)  # type: ignore[attr-defined]
+    backend = TorchAdapter("sound", rasterization, dtype="float32")
+    judged = 0
+    for path, stated in every_law().items():
+        if path.startswith("test_signature") and not [need for need in stated.needs if not backend.has(need)]:
+            with contextlib.suppress(pytest.skip.Exception):
+                stated.sentence(backend)
+                judged += 1
+    assert judged >= 24
+
+
+UNHEARD_OF = (0.1234567, -77123.25, 31.0625)
+
+
+def drawn(count: int = 400) -> list[float]:
+    found: list[float] = []
+
+    @settings(max_examples=count)
+    @given(st.floats(-1e6, 1e6))
+    def collect(value: float) -> None:
+        found.append(value)
+
+    collect()
+    return found
+
+
+def test_the_constants_of_a_local_module_are_not_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = drawn()
+    file = tmp_path / "a_local_module.py"
+    file.write_text(f"VALUES = {UNHEARD_OF!r}\n")
+    spec = spec_from_file_location("a_local_module", file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "a_local_module", module)
+    spec.loader.exec_module(module)
+    after = drawn()
+    assert not set(UNHEARD_OF) & set(after)
+    assert after == before
+
+
+@pytest.mark.parametrize("profile", [name for name in EXAMPLES if name != "explore"])
+def test_every_profile_but_explore_ignores_seeds_and_what_earlier_runs_kept(profile: str) -> None:
+    kept = settings.get_profile(profile)
+    assert kept.derandomize
+    assert kept.database is None
+    assert kept.max_examples == EXAMPLES[profile]
+
+
+def test_exploring_draws_by_the_seed(tmp_path: Path) -> None:
+    test = tmp_path / "test_drawn.py"
+    test.write_text(
+        "from hypothesis import given, strategies as st\n"
+        "from pop_ref.conformance.hypothesis_profiles import load_profile\n"
+        "load_profile('explore')\n"
+        "@given(st.integers(0, 10**9))\n"
+        "def test_it(n):\n"
+        "    print('drew', n)\n"
+    )
+
+    def under(seed: int) -> list[str]:
+        command = [sys.executable, "-m", "pytest", "-s", "-q", f"--hypothesis-seed={seed}", str(test)]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        told = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment, check=True)
+        return [line for line in told.stdout.splitlines() if "drew" in line]
+
+    one = under(1)
+    assert len(one) == EXAMPLES["explore"]
+    assert under(1) == one
+    assert under(2) != one
+
+
+# What laws are tried on before anything is drawn: enough to kill what random scenes kill by luck.
+
+IMAGE, GRADIENTS = "test_agreement:the_image_is_one_of_the_oracles_outcomes", "test_agreement:gradients_are_the_oracles"
+DYING = {
+    "sorted_by_distance": IMAGE,
+    "gradient_of_unit_quaternions": GRADIENTS,
+    "camera_in_world_axes": IMAGE,
+}
+
+
+@pytest.mark.parametrize(("name", "path"), DYING.items())
+def test_a_mutant_dies_without_a_drawn_scene(name: str, path: str) -> None:
+    (mutant,) = (each for each in MUTANTS if each.name == name)
+    with living(mutant) as backend:
+        assert obeys(law_named(path), backend, examples=0) is not None
+
+
+def test_laws_of_rendering_and_gradients_are_tried_on_them_first() -> None:
+    laws = [stated for stated in every_law().values() if "scene" in stated.strategies]
+    tried = [stated for stated in laws if stated.first]
+    assert len(tried) >= 35
+    for stated in tried:
+        for values in stated.first:
+            assert set(values) == set(stated.strategies), stated.name
+
+
+def test_the_scenes_hold_what_they_are_for() -> None:
+    scenes = [values["scene"] for values in corners(3)]
+    views = [OracleAdapter().render(scene) for scene in scenes]
+    assert all(view.n_blended.max() >= 2 for view in views[1:])
+    norms = np.concatenate([np.linalg.norm(scene.gaussians.quats, axis=1) for scene in scenes])
+    assert norms.min() < 0.6
+    assert norms.max() > 2.0
+    assert all(scene.gaussians.sh.shape[1] == 16 for scene in scenes)
+    assert all(not np.allclose(scene.camera.viewmat[:3, :3], np.eye(3)) for scene in scenes)
+    assert any(scene.camera.width % scene.tile_size for scene in scenes)
+    assert any(np.any(view.T_final < 1e-3) for view in views)
+    # depth is not distance in the third of them
+    scene = corners()[2]["scene"]
+    p = scene.gaussians.means @ scene.camera.viewmat[:3, :3].T + scene.camera.viewmat[:3, 3]
+    assert np.argsort(p[:, 2]).tolist() != np.argsort(np.linalg.norm(p, axis=1)).tolist()
+
+
+# The shapes in the oracle's annotations are checked while tests run: the hook came before the modules.
+
+
 @pytest.mark.parametrize(
-    ("path", "words"),
+    ("function", "given", "named"),
     [
-        ("nowhere.at_all:Strategy", "needs nowhere, which is not installed"),
-        ("math:Strategy", "module math has no function Strategy"),
-        ("math", "must be written module:name"),
+        (covars_from_quats_scales, (np.zeros((2, 3)), np.ones((2, 3))), "quats"),
+        # lengths that share a letter must be equal
+        (covars_from_quats_scales, (np.ones((2, 4)), np.ones((3, 3))), "scales"),
+        (l2, (np.zeros((2, 2, 3)), np.zeros((2, 3, 3))), ""),
+        (scales_from_log_scales, (np.zeros((1, 3), dtype=np.float32),), ""),
     ],
+    ids=["columns", "lengths", "widths", "float32"],
 )
-def test_a_strategy_that_is_not_there_is_one_line(path: str, words: str) -> None:
-    done = _kit("--strategy", path, "--stage", "training")
-    assert done.returncode == 4
-    assert words in done.stderr
-    assert "Traceback" not in done.stderr
+def test_a_wrong_shape_or_type_is_told(function: Callable[..., Any], given: tuple[Any, ...], named: str) -> None:
+    with pytest.raises(TypeCheckError, match=named):
+        function(*given)

@@ -35,8 +35,9 @@ from pop_ref.polarization import importance_mask
 from pop_ref.polarization import pop_loss as oracle_loss
 
 ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+PAGES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")))
 TEXT = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
 
 # functions whose fast twin cannot have the oracle's parameters, and why
@@ -46,23 +47,20 @@ OTHER_PARAMETERS = {
 }
 
 
-def load(name: str) -> ModuleType:
+def load(file: str, name: str = "") -> ModuleType:
     """Import a script of docs/ by its path."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    spec = importlib.util.spec_from_file_location(name or file, DOCS / f"{file}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
+    sys.modules[name or file] = module
     spec.loader.exec_module(module)
     return module
 
 
-tables = load("tables")
-FAST = {
-    name: given
-    for path in (ROOT / "pop_fast" / "stages").glob("*.py")
-    for name, given in tables.functions(path).items()
-}
+stages, kit_tables, tables = load("stages"), load("kit_tables"), load("tables")
+# Python has a module of that name
+site = load("site", "site_hook")
 BOTH_ROOMS = [
     (f"{module}.{name}", reference, FAST[name])
     for stage in tables.STAGES
@@ -98,7 +96,7 @@ def test_marks_of_no_table_are_refused(text: str, tmp_path: Path, monkeypatch: p
 
 def test_the_results_script_agrees_with_the_readme() -> None:
     script = ROOT / "benchmarks" / "results_table.py"
-    pages = [ROOT / "README.md", ROOT / "docs" / "results.md"]
+    pages = [ROOT / "README.md", DOCS / "results.md"]
     done = subprocess.run([sys.executable, script, "--check", *pages], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
 
@@ -118,17 +116,14 @@ def test_every_stage_has_functions_and_laws(stage) -> None:
     assert all(path.is_file() for path in tables.files("pop_fast", stage))
 
 
-def test_the_rooms_share_most_of_their_functions() -> None:
-    assert len(BOTH_ROOMS) >= 40
-
-
 @pytest.mark.parametrize(("name", "reference", "fast"), BOTH_ROOMS, ids=lambda value: value if value else "")
 def test_twins_take_the_same_parameters(name: str, reference: list[str], fast: list[str]) -> None:
     """The fast twin may add parameters of its own, after the oracle's."""
     assert (fast[: len(reference)] == reference) == (name not in OTHER_PARAMETERS), (reference, fast)
 
 
-def test_documented_differences_are_still_there() -> None:
+def test_the_rooms_share_most_of_their_functions_and_documented_differences_are_still_there() -> None:
+    assert len(BOTH_ROOMS) >= 40
     assert set(OTHER_PARAMETERS) <= {name for name, _, _ in BOTH_ROOMS}
 
 
@@ -233,15 +228,10 @@ def test_the_pictures_are_small_and_made_of_our_own_scene() -> None:
 
 # docs/FORMATS.md says what the program's table of formats says.
 
-DOCS = Path(__file__).resolve().parents[2] / "docs"
 
-
-def test_the_page_is_the_one_that_is_made() -> None:
+def test_the_page_of_formats_is_the_one_that_is_made_and_tells_every_loss() -> None:
     made = runpy.run_path(str(DOCS / "formats.py"))["page"]()
     assert (DOCS / "FORMATS.md").read_text(encoding="utf-8") == made, "run 'python docs/formats.py --write'"
-
-
-def test_every_format_says_what_it_loses_of_every_field() -> None:
     fields = ["centre", "scale", "rotation", "opacity", "colour", "view dependence"]
     assert all(list(format.losses) == fields for format in FORMATS.values())
 
@@ -252,17 +242,11 @@ SCRIPT = runpy.run_path(str(DOCS / "commands.py"), run_name="commands")
 PAGE = (DOCS / "commands.md").read_text(encoding="utf-8")
 
 
-def test_every_command_was_run_and_is_shown() -> None:
+def test_every_command_was_run_and_is_shown_and_none_failed() -> None:
     assert SCRIPT["lacking"](PAGE) == [], "run 'python docs/commands.py --write'"
     assert SCRIPT["lacking"](PAGE.replace("## pop eval", "## pop evaluate")) == ["pop eval"]
-
-
-def test_every_command_line_of_the_script_is_on_the_page() -> None:
     typed = [run.words for run in (*SCRIPT["RUNS"], *SCRIPT["REPRO"])]
     assert re.findall(r"^\$ (.*)$", PAGE, flags=re.MULTILINE) == typed
-
-
-def test_no_command_failed_and_no_path_of_the_machine_is_shown() -> None:
     assert "Traceback" not in PAGE
     assert "error:" not in PAGE
     assert not re.search(r"(^|[\s\"'(])/(tmp|home|root|work|Users)\b", PAGE)
@@ -283,12 +267,6 @@ def test_a_long_output_is_cut_in_the_middle() -> None:
 
 
 # The hook of `make site`: links of the repository lead to the same files on the site.
-
-spec = importlib.util.spec_from_file_location("site_hook", ROOT / "docs" / "site.py")
-assert spec is not None
-assert spec.loader is not None
-site = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(site)
 
 
 @pytest.mark.parametrize(
@@ -380,25 +358,20 @@ def scene() -> tuple[dict[str, torch.nn.Parameter], dict[str, torch.optim.Optimi
 @pytest.mark.filterwarnings("error::UserWarning")
 def test_the_step_of_the_page_trains_with_the_prior_and_changes_the_gaussians() -> None:
     page = names_of(STEP)
-    moved = {}
+    K = torch.tensor([[16.0, 0.0, 8.0], [0.0, 16.0, 6.0], [0.0, 0.0, 1.0]])
+    seen, moved = (torch.zeros(12, 16, 3), torch.eye(4), K), {}
     for prior in (True, False):
         settings = {"refine_start_iter": 0, "refine_every": 4, "grow_grad2d": 0.0, "blur_stop_iter": -1}
         strategy = type(page["strategy"])(**settings, lambda_pop=10.0 if prior else 0.0)
         page["strategy"] = strategy
         params, optimizers = scene()
         state = strategy.initialize_state(1.0)
-        K = torch.tensor([[16.0, 0.0, 8.0], [0.0, 16.0, 6.0], [0.0, 0.0, 1.0]])
-        photograph = torch.zeros(12, 16, 3)
-        losses = [
-            page["step_with_prior"](step, params, optimizers, state, photograph, torch.eye(4), K) for step in range(4)
-        ]
+        losses = [page["step_with_prior"](step, params, optimizers, state, *seen) for step in range(4)]
         assert losses[-1] < losses[0]
         moved[prior] = params["opacities"].detach().clone()
-        losses += [page["step_with_prior"](4, params, optimizers, state, photograph, torch.eye(4), K)]
+        page["step_with_prior"](4, params, optimizers, state, *seen)
         assert len(params["means"]) > 12
-        assert all(
-            len(optimizer.param_groups[0]["params"][0]) == len(params["means"]) for optimizer in optimizers.values()
-        )
+        assert {len(o.param_groups[0]["params"][0]) for o in optimizers.values()} == {len(params["means"])}
     # with the prior some opacities rise, where the black photograph alone would lower every one
     assert (moved[True] > 0).any()
     assert not (moved[False] > 0).any()
@@ -414,13 +387,9 @@ def test_the_prior_of_the_page_is_the_oracles(rows: list[tuple[float, int]]) -> 
 def test_authors_place_and_version_are_said_once_and_repeated_rightly() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
-    assert (cited["title"], cited["version"], cited["license"]) == (
-        project["name"],
-        project["version"],
-        project["license"],
-    )
-    assert cited["repository-code"] == project["urls"]["Repository"]
-    assert cited["authors"] == project["authors"]
+    assert (cited["title"], cited["repository-code"]) == (project["name"], project["urls"]["Repository"])
+    for key in ("version", "license", "authors"):
+        assert cited[key] == project[key]
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / ".github").rglob("*.yml")), ids=lambda path: path.stem)

@@ -155,7 +155,7 @@ def lines(made: Drawn) -> list[dict]:
 
 
 def texts(made: Drawn) -> str:
-    """Read all that is written in a figure."""
+    """Read all that is written in a figure, in one line."""
     from matplotlib.text import Text
 
-    return "\n".join(found.get_text() for found in made.figure.findobj(Text))
+    return " ".join(found.get_text().replace("\n", " ") for found in made.figure.findobj(Text))

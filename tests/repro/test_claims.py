@@ -1,25 +1,49 @@
-"""Claims, readings and experiments on results whose answer is known by hand."""
+"""Claims, readings and experiments on results whose answer is known by hand.
+
+The noise floor and its intervals are held to numbers made by hand, to scipy, and to how often they decide what is
+noise.
+"""
 
 from __future__ import annotations
 
+import random
 import re
 import shlex
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
+from itertools import count
+from math import exp, inf, sqrt
 from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
 
-from paper_repro.claims import HEADLINES, METHODS, SWEEP, WINDOWS, claims, questions
-from paper_repro.claims_page import READINGS, Answer, answers, columns, experiments, markdown, outcome, telling
+from paper_repro.claims import HEADLINES, METHODS, SWEEP, WINDOWS, claims, noise_of, questions
+from paper_repro.claims_page import markdown, outcome, telling
 from paper_repro.cli import main
-from paper_repro.evidence import DATASETS, Claim, is_shortened, paper_ratios
+from paper_repro.evidence import (
+    COUNT,
+    DATASETS,
+    MOST_SEEDS,
+    PSNR,
+    SECONDS,
+    Claim,
+    Comparison,
+    Noise,
+    compare,
+    groups,
+    is_shortened,
+    paper_ratios,
+)
 from paper_repro.jobs import ROWS, job_named, load_row
-from paper_repro.judging import OTHERS
+from paper_repro.judging import OTHERS, judge
 from paper_repro.paper import paper
 from paper_repro.results import Result
-from tests.repro.made import WHOLE, curve
-from tests.repro.made import whole as result
+from tests.repro.made import WHOLE, curve, whole
 
 SCHEDULE = {
     "max_steps": 10_000,
@@ -39,9 +63,7 @@ def two(row: str, scene: str = "fox", n: int = 100_000, psnr: float = 30.0, **ch
     """Make a row with two seeds that differ by 0.02 dB, 0.2 % of their Gaussians and 0.0002 of SSIM."""
     ssim = changes.pop("ssim", 0.9)
     return [
-        result(
-            row, scene, seed=seed, n=round(n * (1.0 + off / 10.0)), psnr=psnr + off, ssim=ssim + off / 100, **changes
-        )
+        whole(row, scene, seed=seed, n=round(n * (1.0 + off / 10.0)), psnr=psnr + off, ssim=ssim + off / 100, **changes)
         for seed, off in _OFF
     ]
 
@@ -66,14 +88,14 @@ def test_one_scene_that_fails_is_enough_and_scenes_are_told_one_by_one() -> None
 
 
 def test_without_runs_nothing_is_decided_and_every_claim_names_the_runs() -> None:
-    for found in ([], [result("pop"), replace(result("l2_blur"), scale="toy")]):
+    for found in ([], [whole("pop"), replace(whole("l2_blur"), scale="toy")]):
         for claim in claims("small", found):
             assert claim.verdict == "not decided", claim.id
             assert claim.told.deciders, claim.id
 
 
 def test_one_seed_decides_nothing_where_no_row_has_two_and_else_beyond_the_noise() -> None:
-    pop, reset = result("pop", psnr=31.0), result("reset", psnr=30.0)
+    pop, reset = whole("pop", psnr=31.0), whole("reset", psnr=30.0)
     alone = judged("reset", [pop, reset])
     assert alone.verdict == "not decided"
     assert "no row has two seeds" in alone.told.evidence[0].why
@@ -88,11 +110,11 @@ def test_every_command_that_would_decide_is_one(capsys: pytest.CaptureFixture[st
     # of a folder without results, so that no row which is done here is missing from the list
     empty = ["--results", str(tmp_path)]
     found = [
-        result("pop", psnr=30.01),
-        result("reset"),
+        whole("pop", psnr=30.01),
+        whole("reset"),
         *two("l2"),
         *two("gsplat", "bear_512"),
-        result("pop_size_prune"),
+        whole("pop_size_prune"),
     ]
     for claim in claims("small", found):
         for told in (claim.told, *claim.others):
@@ -122,8 +144,8 @@ def test_a_shortened_schedule_decides_no_question_of_duration(id: str) -> None:
         assert told.verdict == "not decided"
         assert [e.why for e in told.told.evidence] == ["a shortened schedule decides no question of duration"]
         assert "--scale small" in told.told.deciders[0]
-    assert is_shortened([replace(result(), schedule={})])
-    assert not is_shortened([result(schedule={"max_steps": 30_000})])
+    assert is_shortened([replace(whole(), schedule={})])
+    assert not is_shortened([whole(schedule={"max_steps": 30_000})])
 
 
 def test_pop_against_reset_is_told_under_both_readings_of_a16() -> None:
@@ -381,14 +403,14 @@ def with_curve(row: str, closing: int, end: int, scene: str = "fox", blur_stop: 
     """Make a result whose N is known when the blur window closes and when density control ends."""
     steps = curve({0: 100, 2333: closing, 5000: end, 9999: end})
     schedule = {**SCHEDULE, "strategy.blur_stop_iter": blur_stop}
-    return result(row, scene, n=end, curve=steps, schedule=schedule, **changes)
+    return whole(row, scene, n=end, curve=steps, schedule=schedule, **changes)
 
 
 def test_a_reading_is_judged_by_every_column_and_by_no_pair_of_rows_alone() -> None:
     # as the paper's first data set, against half as many Gaussians and a decibel less
     near, far = {"n": 268, "psnr": 27.01, "ssim": 0.760}, {"n": 134, "psnr": 26.01, "ssim": 0.700}
-    base = [result("l2_blur", n=583, psnr=27.22, ssim=0.771), result("reset", n=548, psnr=26.82, ssim=0.780)]
-    told = a12([*base, result("pop", **near), result("pop_visible", **far)])
+    base = [whole("l2_blur", n=583, psnr=27.22, ssim=0.771), whole("reset", n=548, psnr=26.82, ssim=0.780)]
+    told = a12([*base, whole("pop", **near), whole("pop_visible", **far)])
     assert told.says == (
         "The runs speak for the default: of 6 columns 6 are nearer to the paper's under the default, 0 under "
         "A12 visible, 0 alike, also without any one pair."
@@ -400,17 +422,17 @@ def test_a_reading_is_judged_by_every_column_and_by_no_pair_of_rows_alone() -> N
         *(("pop and l2_blur", column) for column in ("PSNR", "SSIM")),
         *(("pop and reset", column) for column in ("N over N", "PSNR", "SSIM")),
     ]
-    swapped = a12([*base, result("pop", **far), result("pop_visible", **near)])
+    swapped = a12([*base, whole("pop", **far), whole("pop_visible", **near)])
     assert swapped.says.startswith("The runs speak for A12 visible: of 6 columns 0 ")
     # the pair that a claim rests on does not decide the reading under which that claim is judged
-    alone = a12([base[0], result("pop", **near), result("pop_visible", **far)])
+    alone = a12([base[0], whole("pop", **near), whole("pop_visible", **far)])
     assert alone.says.startswith("Not decided: of 3 columns 3 ")
     assert [a.id for a in answers([])] == [r.id for r in READINGS] == ["A2", "A2, added up", "A12", "A16"]
 
 
 def test_both_readings_within_the_papers_range_are_alike() -> None:
-    base = result("l2_blur", n=1000, psnr=27.0, ssim=0.77)
-    pop, other = (result(row, n=n, psnr=26.9, ssim=0.765) for row, n in (("pop", 460), ("pop_visible", 400)))
+    base = whole("l2_blur", n=1000, psnr=27.0, ssim=0.77)
+    pop, other = (whole(row, n=n, psnr=26.9, ssim=0.765) for row, n in (("pop", 460), ("pop_visible", 400)))
     told = a12([base, pop, other])
     assert [line[-1] for line in told.lines] == ["alike"] * 3
     assert told.says.startswith("Not decided: of 3 columns 0 are nearer")
@@ -418,10 +440,10 @@ def test_both_readings_within_the_papers_range_are_alike() -> None:
 
 def test_a_reading_needs_the_rows_that_it_changes() -> None:
     # any view changes L2+Blur too, which is not there under it
-    found = answers([result("pop"), result("l2_blur"), result("l2_pop"), result("pop_any_view")])
+    found = answers([whole("pop"), whole("l2_blur"), whole("l2_pop"), whole("pop_any_view")])
     assert {line[2] for line in found[0].lines} == {"pop and l2_pop"}
-    assert answers([result("pop"), result("l2_blur")])[0].says.startswith("Not decided: no scene")
-    assert a12([replace(r, scale="toy") for r in (result("pop"), result("pop_visible"), result("reset"))]).lines == ()
+    assert answers([whole("pop"), whole("l2_blur")])[0].says.startswith("Not decided: no scene")
+    assert a12([replace(r, scale="toy") for r in (whole("pop"), whole("pop_visible"), whole("reset"))]).lines == ()
 
 
 def test_columns_are_those_of_the_tables_and_growth_is_a_share_a_step() -> None:
@@ -433,10 +455,10 @@ def test_columns_are_those_of_the_tables_and_growth_is_a_share_a_step() -> None:
 
 
 def test_a_longer_schedule_at_one_weight_answers_in_part() -> None:
-    dev = [with_curve("pop", 100, 50), result("l2_blur", n=100)]
+    dev = [with_curve("pop", 100, 50), whole("l2_blur", n=100)]
     full = [
         replace(r, scale="full", scene="bonsai_800", schedule={**SCHEDULE, "max_steps": 30_000})
-        for r in (with_curve("pop", 100, 40), result("l2_blur", n=100))
+        for r in (with_curve("pop", 100, 40), whole("l2_blur", n=100))
     ]
     alone, apart = experiments(dev)[0], experiments([*dev, *full])[0]
     assert alone.says.startswith("Not decided")
@@ -454,7 +476,143 @@ def test_a_longer_schedule_at_one_weight_answers_in_part() -> None:
 
 
 def test_pruning_harder_is_told_beside_pop_and_gsplat() -> None:
-    pop, pruned = result("pop", n=100, psnr=30.0), result("final_prune", n=70, psnr=29.9)
-    told = experiments([pop, pruned, result("gsplat", n=200)])[1]
+    pop, pruned = whole("pop", n=100, psnr=30.0), whole("final_prune", n=70, psnr=29.9)
+    told = experiments([pop, pruned, whole("gsplat", n=200)])[1]
     assert told.lines[0][:6] == ("small", "fox", "final_prune", "70.0%", "-0.10 dB", "35.0%")
     assert experiments([pruned])[1].says.startswith("Not decided")
+
+
+RESET = next(question for question in questions(paper()) if question.id == "reset")
+
+
+def runs(row: str, *psnr: float, scene: str = "fox", n: int = 1000) -> list[Result]:
+    """Make the runs of a row, a seed each."""
+    return [whole(row, scene, seed=seed, n=n, psnr=value) for seed, value in zip(count(42), psnr, strict=False)]
+
+
+def compared(pop: list[Result], reset: list[Result], more: Sequence[Result] = ()) -> Comparison:
+    """Compare PSNR of two rows on fox."""
+    found = compare(
+        "PSNR", groups([*pop, *reset])["fox"], noise_of([*pop, *reset, *more]), PSNR, {"pop": 1.0, "reset": -1.0},
+        "at least",
+    )  # fmt: skip
+    assert found is not None
+    return found
+
+
+def test_the_spread_is_pooled_over_rows_and_scenes_about_each_mean() -> None:
+    found = noise_of([*runs("pop", 1.0, 3.0), *runs("l2", 5.0, 5.0, 8.0, scene="bear_512"), *runs("reset", 77.0)])
+    spread = found.of(PSNR)
+    assert spread is not None
+    # 2 and 6, over one and two degrees of freedom
+    assert (spread.s, spread.df, spread.groups) == (pytest.approx(sqrt(8.0 / 3.0)), 3, 2)
+    assert (spread.least, spread.largest) == (pytest.approx(sqrt(2.0)), pytest.approx(sqrt(3.0)))
+    # no noise is no floor of zero
+    assert noise_of(runs("pop", 1.0)).of(PSNR) is Noise([]).of(PSNR) is None
+
+
+def test_counts_vary_by_their_ratios_and_times_on_each_machine_alone() -> None:
+    two = [whole(seed=s, n=n, machine=m) for s, n, m in ((1, 1000, "a"), (2, 2000, "b"))]
+    spread = noise_of(two).of(COUNT)
+    assert spread is not None
+    assert exp(spread.s * sqrt(2.0)) == pytest.approx(2.0)
+    assert noise_of(two).of(SECONDS) is None
+    same = [replace(r, machine="a", seconds={**r.seconds, "cpu": 100.0 * r.seed}) for r in two]
+    known = noise_of(same).of(SECONDS)
+    assert known is not None
+    assert exp(known.s * sqrt(2.0)) == pytest.approx(2.0)
+    # a CPU's time by the clock is no time of a method
+    by_clock = [replace(r, seconds={"load": 1.0, "train": 100.0 * r.seed, "evaluate": 1.0}) for r in same]
+    assert noise_of(by_clock).of(SECONDS) is None
+
+
+def test_the_interval_of_two_rows_is_that_of_the_t_test_with_one_variance() -> None:
+    pop, reset = (30.0, 30.3, 30.1), (29.5, 29.9)
+    found = compared(runs("pop", *pop), runs("reset", *reset))
+    expected = stats.ttest_ind(pop, reset).confidence_interval(0.95)
+    half = found.half_width(1)
+    assert (found.value - half, found.value + half) == (pytest.approx(expected.low), pytest.approx(expected.high))
+    # four at once: each with a quarter of the probability to miss
+    wider = stats.ttest_ind(pop, reset).confidence_interval(1.0 - 0.05 / 4.0)
+    assert found.half_width(4) == pytest.approx((wider.high - wider.low) / 2.0)
+
+
+def test_one_seed_decides_nothing_without_a_noise_floor_and_only_beyond_it_with_one() -> None:
+    bare = compared(runs("pop", 40.0), runs("reset", 30.0))
+    assert (bare.holds(1), bare.half_width(1)) == (None, inf)
+    assert bare.text(1) == "PSNR +10.00 dB (no interval)"
+    floor = runs("l2", 30.0, 30.1, 30.2)
+    # t for two degrees of freedom is 4.303, and s sqrt(2) is 0.1414
+    beyond, within = (compared(runs("pop", 30.0 + d), runs("reset", 30.0), floor) for d in (0.62, 0.60))
+    assert (beyond.holds(1), within.holds(1)) == (True, None)
+    assert compared(runs("pop", 29.3), runs("reset", 30.0), floor).holds(1) is False
+    assert beyond.text(1) == "PSNR +0.62 ± 0.61 dB"
+
+
+def test_the_seeds_that_are_asked_for_decide_when_the_difference_stays() -> None:
+    floor = runs("l2", 30.0, 30.1, 30.2)
+    pop, reset = 30.2, 30.0
+    n = compared(runs("pop", pop), runs("reset", reset), floor).seeds_needed(1)
+    assert 2 < n < MOST_SEEDS
+
+    # the same spread about the same means with so many seeds, and with one less
+    def with_seeds(seeds: int) -> bool | None:
+        each = [0.1 * sqrt((seeds - 1) / seeds) * (-1) ** i for i in range(seeds - seeds % 2)] + [0.0] * (seeds % 2)
+        return compared(runs("pop", *(pop + e for e in each)), runs("reset", *(reset + e for e in each)), floor).holds(
+            1
+        )
+
+    assert with_seeds(n) is True
+    assert with_seeds(n - 2) is None
+    assert compared(runs("pop", 30.0001), runs("reset", 30.0), floor).seeds_needed(1) == MOST_SEEDS
+    assert compared(runs("pop", 31.0), runs("reset", 30.0)).seeds_needed(1) == 3
+
+
+@cache
+def made(row: str, scene: str, seed: int) -> Result:
+    """Make a run once: its hashes take longer than a verdict."""
+    return whole(row, scene, seed=seed)
+
+
+def drawn(rng: random.Random, effects: dict[str, float], seeds: dict[str, int], sigma: float) -> list[Result]:
+    """Draw results of POP, Reset and L2 on scenes, where POP is better by a scene's effect."""
+    return [
+        replace(made(row, scene, 42 + i), psnr=rng.gauss(30.0 + (effect if row == "pop" else 0.0), sigma))
+        for scene, effect in effects.items()
+        for row, n in seeds.items()
+        for i in range(n)
+    ]
+
+
+@pytest.mark.parametrize("scenes", [("fox",), ("fox", "bear_512")])
+@pytest.mark.parametrize("seeds", [{"pop": 2, "reset": 2, "l2": 2}, {"pop": 1, "reset": 1, "l2": 3}])
+def test_without_a_difference_a_verdict_is_as_rare_as_stated(scenes: tuple[str, ...], seeds: dict[str, int]) -> None:
+    rng, trials, decided = random.Random(7), 500, 0
+    for _ in range(trials):
+        found = drawn(rng, dict.fromkeys(scenes, 0.0), seeds, 0.2)
+        told = judge(RESET, groups(found), noise_of(found), "small").told
+        decided += any(e.verdict != "not decided" for e in told.evidence)
+    # 5 %, or somewhat less where scenes share one noise floor; four standard errors are 3.9 %
+    assert 0.01 < decided / trials < 0.09
+
+
+@given(
+    effects=st.dictionaries(
+        st.sampled_from(("fox", "bear_512", "garden_512", "bonsai_800")), st.sampled_from((-40.0, 40.0)), min_size=1
+    ),
+    seeds=st.fixed_dictionaries({"pop": st.integers(1, 3), "reset": st.integers(1, 3), "l2": st.integers(1, 3)}),
+    repeated=st.integers(5, 8),
+    sigma=st.floats(0.001, 0.5),
+    seed=st.integers(0, 10**6),
+)
+def test_a_difference_far_beyond_the_noise_is_decided_by_its_sign_in_results_of_any_shape(
+    effects: dict[str, float], seeds: dict[str, int], repeated: int, sigma: float, seed: int
+) -> None:
+    rng = random.Random(seed)
+    found = drawn(rng, {scene: effect * sigma for scene, effect in effects.items()}, seeds, sigma)
+    # without this row shapes of one seed each have no noise floor
+    found += [whole("gsplat", "fox", seed=42 + i, psnr=rng.gauss(31.0, sigma)) for i in range(repeated)]
+    told = next(claim for claim in claims("small", found) if claim.id == "reset")
+    verdicts = {e.scene: e.verdict for e in told.told.evidence}
+    assert verdicts == {scene: "holds" if effect > 0.0 else "does not hold" for scene, effect in effects.items()}
+    assert told.verdict == ("holds" if min(effects.values()) > 0.0 else "does not hold")

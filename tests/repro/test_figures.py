@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import re
+import shutil
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
@@ -19,14 +20,15 @@ from hypothesis import strategies as st
 from paper_repro import figures
 from paper_repro.claims import SWEEP, claims
 from paper_repro.cli import main
-from paper_repro.figures import FIGURES, curves, style
+from paper_repro.figures import FIGURES, artifact, curves, qualitative, style
 from paper_repro.figures.data import NoDataError, choose, curve_of
 from paper_repro.figures.style import foot, save
 from paper_repro.figures.tradeoffs import Marker, along, places
-from paper_repro.jobs import load_rows
+from paper_repro.jobs import job_named, load_rows
 from paper_repro.paper import paper
 from paper_repro.record import BINS
-from paper_repro.results import Result, write
+from paper_repro.results import RESULTS, Result, write
+from paper_repro.train_row import Options, capture_folder, load_capture_of
 from pop_fast.errors import PopError
 from tests.repro.made import asked, curve, drawn, lines, result, texts
 
@@ -108,10 +110,8 @@ def test_the_same_results_are_the_same_bytes(tmp_path):
         save_as.parent.mkdir()
         with style.look():
             save(drawn("7", full()), save_as)
-    for suffix in ("svg", "png", "csv"):
-        assert (tmp_path / "a" / f"figure_7.{suffix}").read_bytes() == (
-            tmp_path / "b" / f"figure_7.{suffix}"
-        ).read_bytes()
+    for path in (tmp_path / "a").iterdir():
+        assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
 
 
 def test_curves_in_the_table_are_the_means_of_the_results(written):
@@ -142,7 +142,7 @@ def test_gaussians_per_pixel_are_of_the_probed_views_and_else_of_the_held_out_on
     of_pop = [r for r in full() if r.row == "pop"]
     means = [sum(r.curve[i]["probe_traversed"] for r in of_pop) / 2 for i in range(3)]
     assert [x["value"] for x in lines(made) if (x["row"], x["quantity"]) == ("pop", "probe_traversed")] == means
-    assert "three training views" in texts(made).replace("\n", " ")
+    assert "three training views" in texts(made)
     older = [
         result(row, curve=logged(100, n_blended=8.0, n_traversed=32.0, psnr_test=20.0), schedule=STEPS)
         for row in ("3dgs", "pop")
@@ -151,14 +151,14 @@ def test_gaussians_per_pixel_are_of_the_probed_views_and_else_of_the_held_out_on
     alone = {"step": 3, "num_gaussians": 100, "n_blended": 99.0, "n_traversed": 99.0, "psnr_test": None}
     older = [replace(r, curve=(r.curve[0], alone, *r.curve[1:])) for r in older]
     made = drawn("4b", older)
-    assert "the held-out views" in texts(made).replace("\n", " ")
+    assert "the held-out views" in texts(made)
     assert [x["value"] for x in lines(made) if (x["row"], x["quantity"]) == ("pop", "n_blended")] == [8.0, 4.0, 2.0]
 
 
-def test_figure_1_has_every_run_and_the_means(written):
-    made = lines(drawn("1", full()))
-    means = {line["row"]: line for line in made if line["scene"] == "mean"}
-    runs = {(line["row"], line["scene"]): line for line in made if line["scene"] != "mean"}
+def test_figure_1_has_every_run_and_the_means_in_markers_as_large_as_their_numbers():
+    made = drawn("1", full())
+    means = {line["row"]: line for line in lines(made) if line["scene"] == "mean"}
+    runs = {(line["row"], line["scene"]): line for line in lines(made) if line["scene"] != "mean"}
     assert (len(means), len(runs)) == (9, 18)
     for one in full():
         if one.row in means:
@@ -168,6 +168,9 @@ def test_figure_1_has_every_run_and_the_means(written):
     for row, line in means.items():
         assert line["psnr"] == sum(runs[row, scene]["psnr"] for scene in ("fox", "bear_512")) / 2
         assert line["num_gaussians"] == sum(runs[row, s]["num_gaussians"] for s in ("fox", "bear_512")) / 2
+    sizes = sorted(s for s in (float(c.get_sizes()[0]) for c in made.figure.axes[0].collections) if s > 2.0)
+    counts = sorted(line["num_gaussians"] for line in means.values())
+    assert sizes == pytest.approx([max(sizes) * n / counts[-1] for n in counts], rel=1e-12)
 
 
 def test_figure_6b_has_every_run_in_the_panel_of_its_capture_and_no_mean_over_captures():
@@ -181,8 +184,8 @@ def test_figure_6b_has_every_run_in_the_panel_of_its_capture_and_no_mean_over_ca
             line = runs[one.row, one.scene]
             assert (line["run"], line["psnr"], line["num_gaussians"]) == (one.run, one.psnr, one.num_gaussians)
     assert [axes.get_title(loc="left").partition(":")[0] for axes in made.figure.axes] == ["fox", "bear_512"]
-    four = [replace(r, scene=scene) for r in full() for scene in ("fox", "bear_512", "garden_512", "bonsai_800")
-            if r.scene == "fox"]  # fmt: skip
+    scenes = ("fox", "bear_512", "garden_512", "bonsai_800")
+    four = [replace(r, scene=scene) for r in full() for scene in scenes if r.scene == "fox"]
     assert len(drawn("6b", four).figure.axes) == 4
 
 
@@ -229,14 +232,6 @@ def test_the_star_of_figure_6b_lies_on_that_side_of_the_curve_that_the_claim_say
             assert verdict == ("holds" if expected[scene] > 0.0 else "does not hold")
 
 
-def test_areas_of_markers_are_as_the_numbers_of_gaussians():
-    made = drawn("1", full())
-    means = {line["row"]: line["num_gaussians"] for line in lines(made) if line["scene"] == "mean"}
-    sizes = sorted(s for s in (float(c.get_sizes()[0]) for c in made.figure.axes[0].collections) if s > 2.0)
-    largest = max(means.values())
-    assert sizes == pytest.approx(sorted(max(sizes) * n / largest for n in means.values()), rel=1e-12)
-
-
 def test_the_marked_shares_are_those_of_the_histogram():
     # edges belong to the bin above them: 0.1 opens b5, 0.9 opens b45
     counts = histogram(b0=30, b4=70, b5=500, b44=150, b45=200, b49=50)
@@ -254,7 +249,7 @@ def test_the_marked_shares_are_those_of_the_histogram():
     # with another capture stands no number of the paper's
     other = drawn("2", [result("3dgs", n=1000, opacity_histogram=counts, schedule=STEPS)])
     assert "paper:" not in texts(other)
-    assert "The paper's figure is of another capture, kitchen." in texts(other).replace("\n", " ")
+    assert "The paper's figure is of another capture, kitchen." in texts(other)
     assert {line["what"] for line in lines(other)} == {"bin", "ours under 0.1", "ours over 0.9"}
     with pytest.raises(ValueError, match=r"edge is 0\.15; it must lie between two of 50 bins"):
         curves.share_below(np.ones(BINS), 0.15)
@@ -287,7 +282,7 @@ def test_results_without_the_curve_that_is_shown_are_named():
 def test_rows_that_were_not_run_are_named_below_the_figure():
     some = [r for r in full() if r.row in ("pop", "gsplat")]
     made = drawn("7", some)
-    said = texts(made).replace("\n", " ")
+    said = texts(made)
     assert "Not run: 3DGS, PUP-3DGS, Mini-Splatting, Taming-3DGS and Speedy-Splat." in said
     assert {line["row"] for line in lines(made)} == {"gsplat", "pop"}
 
@@ -307,10 +302,10 @@ def test_the_note_says_captures_steps_seeds_and_whether_it_is_the_protocol():
 
 def test_times_of_different_machines_are_said_not_to_compare():
     runs = [result("pop"), result("gsplat", machine="another")]
-    assert "2 machines, so that times do not compare" in texts(drawn("1", runs)).replace("\n", " ")
-    assert "Time on a machine, native, 1 thread." in texts(drawn("1", runs[:1])).replace("\n", " ")
+    assert "2 machines, so that times do not compare" in texts(drawn("1", runs))
+    assert "Time on a machine, native, 1 thread." in texts(drawn("1", runs[:1]))
     untimed = [result("pop", seconds={"load": 1.0, "train": 9.0, "evaluate": 1.0})]
-    assert "1 thread, by the clock though" in texts(drawn("1", untimed)).replace("\n", " ")
+    assert "1 thread, by the clock though" in texts(drawn("1", untimed))
 
 
 def test_captures_whose_times_are_by_the_clock_are_left_out_where_another_has_every_row():
@@ -318,13 +313,13 @@ def test_captures_whose_times_are_by_the_clock_are_left_out_where_another_has_ev
     fox, bear = [result("pop"), result("gsplat", **clock)], [result(row, "bear_512") for row in ("pop", "gsplat")]
     made = drawn("1", [*fox, *bear])
     assert {line["scene"] for line in lines(made)} == {"bear_512", "mean"}
-    said = texts(made).replace("\n", " ")
+    said = texts(made)
     assert "Without fox: time there is by the clock. Capture bear_512" in said
     assert "by the clock though" not in said
     # not where that would leave a row out
     made = drawn("1", [*fox, bear[0]])
     assert {line["scene"] for line in lines(made)} == {"fox", "mean"}
-    assert "by the clock though" in texts(made).replace("\n", " ")
+    assert "by the clock though" in texts(made)
 
 
 def test_at_the_papers_scale_a_figure_is_of_the_papers_scenes():
@@ -474,8 +469,125 @@ def test_names_of_close_markers_cover_nothing_and_are_nearest_to_their_own_or_jo
         if not place.is_joined:
             assert distance(place.box, marker) <= min(distance(place.box, other) for other in others)
     assert sum(place.is_joined for place in found) <= 2
-
-
-def test_the_order_of_markers_changes_no_place_of_markers_far_apart():
+    # their order changes no place of markers far apart
     apart = [CLUSTERS[2], CLUSTERS[3], CLUSTERS[1]]
     assert places(apart, FRAME) == places(apart[::-1], FRAME)[::-1]
+
+
+def keep(folder: Path, row: str, scene: str, render: np.ndarray, photo: np.ndarray, psnr: float) -> None:
+    """Leave what a run keeps of its first held-out view."""
+    kept = folder / "small" / row / f"{scene}_42" / "report_data"
+    kept.mkdir(parents=True)
+    np.savez(kept / "val_step9999_0000.npz", name="0001.jpg", render=render, photo=photo, psnr=psnr, ssim=0.9)
+
+
+@pytest.fixture
+def renders(tmp_path):
+    """Two scenes with the renders of both rows, which differ in one place each."""
+    generator, places = np.random.default_rng(1), {"fox": (30, 50), "bear_512": (5, 2)}
+    for scene, (x, y) in places.items():
+        height, width = (80, 45) if scene == "fox" else (40, 60)
+        photo = generator.integers(0, 200, (height, width, 3), dtype=np.uint8)
+        other = photo.copy()
+        other[y : y + 10, x : x + 10] += 40
+        keep(tmp_path, "pop", scene, photo, photo, 30.0)
+        keep(tmp_path, "3dgs", scene, other, photo, 20.5)
+    return tmp_path, places
+
+
+def test_the_grid_of_renders_boxes_the_place_where_they_differ(renders):
+    folder, places = renders
+    runs = [result(row, scene) for row in ("pop", "3dgs") for scene in places]
+    with style.look():
+        made = qualitative.renders_and_photographs(asked("5", runs, folder))
+        paths = save(made, folder / "figure_5")
+    ET.parse(paths[0])
+    for line in lines(made):
+        # the whole of the place is in the box
+        for inside, corner in zip(places[line["scene"]], (line["box_x"], line["box_y"]), strict=True):
+            assert 0 <= inside - corner <= line["box_side"] - 10
+        assert line["psnr"] == (30.0 if line["row"] == "pop" else 20.5)
+    assert "30.00 dB" in texts(made)
+    # a scene that was trained elsewhere is not said not to be run
+    shutil.rmtree(folder / "small" / "pop" / "bear_512_42")
+    with style.look():
+        without = texts(qualitative.renders_and_photographs(asked("5", runs, folder)))
+    assert "The work folder has no renders of bear_512." in without
+    assert all("Not every row was run on garden_512 and bonsai_800." in said for said in (texts(made), without))
+
+
+def test_the_grid_in_the_repository_is_of_the_still_life_and_worth_showing():
+    with (RESULTS / "shown" / "figures" / "figure_5.csv").open(encoding="utf-8", newline="") as file:
+        found = list(csv.DictReader(file))
+    assert [(line["scene"], line["row"]) for line in found] == [("still_life", "pop"), ("still_life", "3dgs")]
+    assert all(float(line["psnr"]) > 25.0 for line in found)
+
+
+def test_without_renders_or_a_scene_figures_say_where_they_looked(tmp_path):
+    runs = [result("pop"), result("3dgs")]
+    with pytest.raises(NoDataError, match=f"whose renders are in {tmp_path}; give the folder"):
+        qualitative.renders_and_photographs(asked("5", runs, tmp_path))
+    with pytest.raises(PopError, match=f"{tmp_path} has none of kitchen; name another --data"):
+        artifact.pushed(asked("3", [], tmp_path, scale="paper"))
+
+
+def test_the_most_different_square_is_that_of_a_search_over_all():
+    generator = np.random.default_rng(2)
+    for _ in range(10):
+        one, other = generator.integers(0, 256, (2, 9, 13, 3), dtype=np.uint8)
+        squares = ((one.astype(int) - other.astype(int)) ** 2).sum(axis=2)
+        places = [(y, x) for y in range(9 - 4 + 1) for x in range(13 - 4 + 1)]
+        y, x = max(places, key=lambda p: squares[p[0] : p[0] + 4, p[1] : p[1] + 4].sum())
+        assert qualitative.most_different(one, other, 4) == (x, y)
+
+
+@pytest.fixture(scope="module")
+def artifacts(tmp_path_factory):
+    """Figure 3 of a few steps from the demo capture's first Gaussians instead of a finished run's."""
+    from pop_fast.data import initialize_params
+    from pop_fast.io.ply import save_ply
+
+    folder = tmp_path_factory.mktemp("artifact")
+    how = Options(data=folder, work=folder)
+    job = job_named("3dgs", "demo", "toy")
+    config = job.config(data=str(capture_folder(job.scene, how)), result_dir=str(folder / "none"))
+    params = initialize_params(load_capture_of(job, config)[0], 0)
+    save_ply(job.work(folder) / "ply" / "point_cloud_299.ply", params)
+    base = result("3dgs", "demo", scale="toy", schedule={"max_steps": 300})
+    with pytest.MonkeyPatch.context() as patch, style.look():
+        patch.setattr(opacity_one, "STEPS", 12)
+        toy = asked("3", [base], folder, scale="toy")
+        first = artifact.pushed(toy)
+        patch.setattr(opacity_one, "_train", lambda *_: pytest.fail("trained again"))
+        made = artifact.six_panels(toy)
+        return params, first, made, save(made, folder / "figure_3")
+
+
+def test_the_run_behind_the_artifacts_raises_every_opacity(artifacts):
+    params, found, *_ = artifacts
+    before = 1.0 / (1.0 + np.exp(-params["opacities"].numpy()))
+    assert len(before) == len(found.opacities)
+    assert float((found.opacities.numpy() > before).mean()) > 0.99
+
+
+def test_the_six_panels_have_the_gradients_of_their_losses(artifacts):
+    _, found, made, paths = artifacts
+    ET.parse(paths[0])
+    panels = {panel.key: panel for panel in artifact.panels_of(found)}
+    error = np.abs(found.image.numpy().astype(float) - found.photo.numpy()).mean(axis=2)
+    np.testing.assert_allclose(panels["error"].values, error, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(panels["grad_l2"].values, 2.0 * error, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(panels["grad_l1"].values[error > 1e-3].max(), 1.0, rtol=1e-5)
+    assert panels["grad_l2"].correlation == pytest.approx(1.0, abs=1e-6)
+    assert panels["grad_l1"].correlation is None or abs(panels["grad_l1"].correlation) < 0.2
+    r = np.corrcoef(panels["grad_ssim"].values.ravel().astype(float), error.ravel())[0, 1]
+    assert panels["grad_ssim"].correlation == pytest.approx(r, rel=1e-4)
+    told = {line["quantity"]: line for line in lines(made)}
+    assert told["grad_ssim"]["mean"] == pytest.approx(float(panels["grad_ssim"].values.mean()), rel=1e-6)
+    assert "not the paper's protocol" in texts(made)
+
+
+def test_a_constant_map_has_no_correlation():
+    ramp = np.arange(12.0).reshape(3, 4)
+    assert artifact.correlation(np.full((3, 4), 0.3), ramp) is None
+    assert artifact.correlation(ramp, -2.0 * ramp + 1.0) == pytest.approx(-1.0, rel=1e-12)

@@ -43,14 +43,8 @@ def test_help_is_quick_and_loads_nothing_heavy(command):
         "import sys; from paper_repro.cli import main; status = main(sys.argv[1:])\n"
         f"loaded = [name for name in {HEAVY!r} if name in sys.modules]; assert not loaded, loaded; sys.exit(status)"
     )
-    start = os.times().children_user
-    done = subprocess.run(
-        [sys.executable, "-c", script, *command.split(), "--help"],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        check=False,
-    )
+    start, words = os.times().children_user, [sys.executable, "-c", script, *command.split(), "--help"]
+    done = subprocess.run(words, capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     # of the processor, since the machine may be busy
     assert os.times().children_user - start < 0.5
@@ -175,23 +169,17 @@ def queued(tmp_path_factory):
     words = ["--scale", "toy", "--rows", "l2_pop", "l1_div_100", "--results", "results", "--work", "work"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     command = [sys.executable, "-m", "paper_repro", "queue", *words, "--checkpoint-every", "50"]
-    said = []
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=folder, env=environment
-    )
+    how = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "cwd": folder, "env": environment}
+    process = subprocess.Popen(command, **how)
     metrics = folder / "work" / "toy" / "l1_div_100" / "demo_42" / "metrics.jsonl"
     end = time.monotonic() + 120.0
     while not (metrics.is_file() and metrics.stat().st_size > 0) and time.monotonic() < end and process.poll() is None:
         time.sleep(0.05)
     process.send_signal(signal.SIGTERM)
-    said.append((process.communicate(timeout=120)[0], process.returncode))
+    stopped = process.communicate(timeout=120)[0], process.returncode
     left = sorted(path.parent.name for path in folder.rglob("ckpts/*.pt"))
-    command.append("--commit")
-    done = subprocess.run(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=folder, env=environment
-    )
-    said.append((done.stdout, done.returncode))
-    return folder, said, left
+    done = subprocess.run([*command, "--commit"], **how)
+    return folder, [stopped, (done.stdout, done.returncode)], left
 
 
 @pytest.mark.slow  # a queue that trains

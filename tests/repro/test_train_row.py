@@ -1,4 +1,7 @@
-"""Training a row: its result is whole, the same whether it was interrupted or not, and made once."""
+"""Training a row: its result is whole, the same whether it was interrupted or not, and made once.
+
+A row that begins from another's checkpoint, or from a capture that was prepared for a node, is the same row.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,7 @@ import numpy as np
 import pytest
 import torch
 
+from paper_repro import prepared
 from paper_repro import train_row as module
 from paper_repro.collect import PROBE, collect, file_hash, first_change
 from paper_repro.jobs import NotTrainableError, job_named, jobs_of, load_rows
@@ -34,12 +38,15 @@ from paper_repro.train_row import (
     steps_for_others,
     train_row,
 )
+from pop_fast.data import load_capture
 from pop_fast.errors import PopError
 from pop_fast.io.formats.files import load_splat_file
 from pop_fast.io.images import read_image
 from pop_fast.stages import losses
-from pop_fast.train import TrainingRun
+from pop_fast.train import TrainConfig, TrainingRun
+from pop_fast.train.checkpoint import capture_fingerprint
 from pop_fast.train.choose import choose_backend
+from tests.app.captures import colmap_capture
 from tests.app.tiny import interrupt, interrupted
 from tests.repro.made import options, toy, values
 
@@ -371,7 +378,7 @@ STEPS = 24
 
 
 @pytest.fixture(scope="module")
-def prepared(tmp_path_factory):
+def short(tmp_path_factory):
     """A configuration of a few steps in some folder, and the demo capture."""
     folder = tmp_path_factory.mktemp("probe")
     job = job_named("pop", "demo", "toy")
@@ -394,8 +401,8 @@ def points(run: ProbedRun) -> dict:
     return json.loads((run._results.path / PROBE).read_text())
 
 
-def test_a_probed_training_is_the_same_training(prepared):
-    config, capture = prepared
+def test_a_probed_training_is_the_same_training(short):
+    config, capture = short
     plain = TrainingRun(config("plain"), capture)
     plain.run()
     run = probed(config, "probed", capture)
@@ -404,8 +411,8 @@ def test_a_probed_training_is_the_same_training(prepared):
     assert list(points(run)) == ["0", "5", "10", "15", "20"]
 
 
-def test_a_probe_is_the_mean_over_its_views(prepared):
-    config, capture = prepared
+def test_a_probe_is_the_mean_over_its_views(short):
+    config, capture = short
     run = ProbedRun(config("alone"), capture, every=5)
     views = capture.train_views(run.config.test_every)
     assert [view.name for view in run._probed] == [views[i].name for i in (0, len(views) // 2, len(views) - 1)]
@@ -421,8 +428,8 @@ def test_a_probe_is_the_mean_over_its_views(prepared):
     assert together["probe_traversed"] >= together["probe_blended"] > 1.0
 
 
-def test_what_was_probed_before_a_stop_is_taken_up(prepared):
-    config, capture = prepared
+def test_what_was_probed_before_a_stop_is_taken_up(short):
+    config, capture = short
     whole = probed(config, "whole", capture)
     with interrupted(at=12):
         probed(config, "stopped", capture)
@@ -453,3 +460,112 @@ def test_gradients_are_those_of_autograd_in_units_of_the_slope_of_l1():
             inside = gradient if kept is None else gradient[kept]
             assert found[name] == pytest.approx(float(inside.abs().mean()) * n, rel=1e-12), name
         assert found["grad_l1"] == pytest.approx(1.0, rel=1e-12)
+
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """A capture with a mask, a split of its own, tracks and notes."""
+    found = load_capture(colmap_capture(tmp_path_factory.mktemp("capture") / "scene"))
+    masks = [None, np.arange(found.views[1].width) < 9, *[None] * (len(found.views) - 2)]
+    views = [
+        replace(
+            view,
+            mask=None if mask is None else np.broadcast_to(mask, view.image.shape[:2]).copy(),
+            split="test" if k == 2 else "train",
+            seen=None if k == 0 else np.arange(k % 3, dtype=np.int32),
+        )
+        for k, (view, mask) in enumerate(zip(found.views, masks, strict=True))
+    ]
+    return replace(found, views=tuple(views), notes=("two lines", "of notes"))
+
+
+def test_what_is_read_is_what_was_loaded(capture, tmp_path):
+    config = TrainConfig()
+    path = prepared.write(capture, config, tmp_path)
+    assert path == prepared.path_of(tmp_path, config)
+    assert [file.name for file in tmp_path.iterdir()] == ["prepared_1.npz"]
+    found = prepared.read(path, config)
+    assert capture_fingerprint(found, 0) == capture_fingerprint(capture, 0)
+    assert (found.name, found.source, found.notes) == (capture.name, capture.source, capture.notes)
+    assert np.array_equal(found.world_transform, capture.world_transform)
+    for ours, theirs in zip(found.views, capture.views, strict=True):
+        assert (ours.name, ours.split) == (theirs.name, theirs.split)
+        assert np.array_equal(ours.image, theirs.image)
+        assert (ours.mask is None) == (theirs.mask is None)
+        assert (ours.seen is None) == (theirs.seen is None)
+        assert ours.seen is None or np.array_equal(ours.seen, theirs.seen)
+
+
+def test_a_row_that_asks_for_other_photographs_is_refused(capture, tmp_path):
+    path = prepared.write(capture, TrainConfig(), tmp_path)
+    with pytest.raises(PopError, match=r"prepared_1\.npz: was prepared for .*; pack it again"):
+        prepared.read(path, TrainConfig(background=(1.0, 1.0, 1.0)))
+    clear = replace(capture.views[0], alpha=np.full(capture.views[0].image.shape[:2], 9, np.uint8))
+    with pytest.raises(PopError, match="photographs with transparency"):
+        prepared.write(replace(capture, views=(clear, *capture.views[1:])), TrainConfig(), tmp_path / "clear")
+
+
+def saying(arrays, **other):
+    """Return what the file says in words, with some of it replaced."""
+    return np.frombuffer(json.dumps(json.loads(arrays["said"].tobytes()) | other).encode(), np.uint8)
+
+
+DAMAGES = {
+    "sizes": lambda a: a | {"sizes": a["sizes"][:-1]},
+    "residuals": lambda a: a | {"residuals": a["residuals"][:-1]},
+    "splits": lambda a: a | {"said": saying(a, splits=["else"])},
+    "viewmats": lambda a: a | {"viewmats": a["viewmats"][:-1]},
+    "Ks": lambda a: a | {"Ks": a["Ks"].astype(np.float32)},
+    "points": lambda a: a | {"points": a["points"] * np.nan},
+    "points_rgb": lambda a: a | {"points_rgb": a["points_rgb"][:-1]},
+    "world_transform": lambda a: a | {"world_transform": a["world_transform"][:3]},
+    "masks": lambda a: a | {"masked": ~a["masked"]},
+    "tracks": lambda a: a | {"tracks": a["tracks"] + 1},
+    "seen": lambda a: a | {"seen": a["seen"] + 10**6},
+    "said": lambda a: a | {"said": a["said"][1:]},
+    "names": lambda a: a | {"said": saying(a, names=["one", "one"])},
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_arrays_that_do_not_fit_each_other_are_named(capture, tmp_path, name):
+    path = prepared.write(capture, TrainConfig(), tmp_path)
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    np.savez(path, **DAMAGES[name](arrays))
+    with pytest.raises(PopError, match=rf"prepared_1\.npz: .*\b{name}\b.*; pack it again"):
+        prepared.read(path, TrainConfig())
+
+
+def test_a_row_of_what_was_prepared_is_the_row_of_the_photographs(tmp_path, monkeypatch):
+    how, job = options(tmp_path / "whole"), toy("l1_div_100", steps_scaler=0.001)
+    before = train_row(job, how)
+    folder = capture_folder(job.scene, how)
+    config = job.config(data=str(folder), result_dir=str(tmp_path / "run"), progress=False)
+    there = options(tmp_path / "node")
+    alone = there.work / job.scene.folder
+    prepared.write(load_capture_of(job, config)[0], config, alone)
+    monkeypatch.setattr("pop_fast.cli.train.open_capture", lambda *words: pytest.fail("photographs were read"))
+    after = train_row(job, there)
+    assert (after.run, after.data_hash, after.per_view) == (before.run, before.data_hash, before.per_view)
+
+
+def test_the_pack_holds_what_rows_see_of_a_scene(tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import gpu_pack
+
+    data = tmp_path / "data"
+    source = colmap_capture(data / "fox")
+    words = ["--no-wheels", "--data", str(data), "--prepared", "fox", "moon"]
+    monkeypatch.setattr(sys, "argv", ["gpu_pack", str(tmp_path / "pack"), *words])
+    assert gpu_pack.main() == 1
+    told = json.loads((tmp_path / "pack" / "manifest.json").read_text())
+    assert told["absent"][0].startswith("scene moon: there is no scene 'moon'")
+    (path,) = (tmp_path / "pack" / "captures" / "fox").iterdir()
+    found = prepared.read(path, TrainConfig(factor=int(path.stem.split("_")[1])))
+    assert len(found.views) == len(load_capture(source).views)
+    shutil.rmtree(data)
+    assert "absent: scene moon" in capsys.readouterr().err

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import base64
-import fcntl
 import json
 import os
-import shutil
-import subprocess
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, BinaryIO
 
 from pop_ref.walkthrough.builder.command import CHROMIUM_OPTIONS as OPTIONS
-from pop_ref.walkthrough.builder.command import chromium
+from tests.app.browser import Browser, browser
 
 # where pictures are kept to be looked at
 SCREENSHOTS = os.environ.get("POP_SCREENSHOTS")
-
-WHY_NOT = "" if chromium() else "there is no Chromium here (apt install chromium)"
+CODES = {"ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40, "Home": 36, "End": 35, "Enter": 13, " ": 32}
 
 
 def keep(png: bytes, name: str) -> None:
@@ -28,67 +26,21 @@ def keep(png: bytes, name: str) -> None:
         (Path(SCREENSHOTS) / name).write_bytes(png)
 
 
-class Page:
+@contextmanager
+def opened() -> Iterator[Page]:
+    """Start a browser and give its tab, or skip the test with the reason."""
+    profile = tempfile.TemporaryDirectory(prefix="chromium-", ignore_cleanup_errors=True)
+    with profile as folder, browser(Path(folder), Page, OPTIONS) as page:
+        yield page
+
+
+class Page(Browser):
     """One tab. Everything that the page logs or throws is kept in `complaints`."""
 
-    def __init__(self) -> None:
+    def __init__(self, to: BinaryIO, back: BinaryIO) -> None:
         self.complaints: list[str] = []
-        self._profile = tempfile.mkdtemp(prefix="chromium-")
-        to_browser, self._to = os.pipe()
-        self._from, from_browser = os.pipe()
-        # the protocol is spoken on descriptors 3 and 4: first lift both ends over those, so that neither is lost
-        lifted = [fcntl.fcntl(each, fcntl.F_DUPFD, 10) for each in (to_browser, from_browser)]
-
-        def wire() -> None:
-            os.dup2(lifted[0], 3)
-            os.dup2(lifted[1], 4)
-
-        self._process = subprocess.Popen(
-            [chromium() or "", *OPTIONS, "--remote-debugging-pipe", f"--user-data-dir={self._profile}", "about:blank"],
-            preexec_fn=wire,
-            pass_fds=(3, 4),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        for each in (to_browser, from_browser, *lifted):
-            os.close(each)
-        self._rest, self._number, self._session = b"", 0, ""
-        try:
-            self._attach()
-        except BaseException:
-            self.__exit__()
-            raise
-
-    def _attach(self) -> None:
-        page = next(t for t in self.call("Target.getTargets")["targetInfos"] if t["type"] == "page")
-        self._session = self.call("Target.attachToTarget", targetId=page["targetId"], flatten=True)["sessionId"]
-        for domain in ("Page", "Runtime", "Log"):
-            self.call(f"{domain}.enable")
+        super().__init__(to, back)
         self.call("Page.setLifecycleEventsEnabled", enabled=True)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._process.kill()
-        self._process.wait()
-        os.close(self._to)
-        os.close(self._from)
-        shutil.rmtree(self._profile, ignore_errors=True)
-
-    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """Call a method of the DevTools protocol and wait for its answer."""
-        self._number += 1
-        message = {"id": self._number, "method": method, "params": parameters}
-        if self._session:
-            message["sessionId"] = self._session
-        os.write(self._to, json.dumps(message).encode() + b"\0")
-        while True:
-            told = self._next()
-            if told.get("id") == self._number:
-                if "error" in told:
-                    raise RuntimeError(f"{method}: {told['error']}")
-                return told["result"]
 
     def open(
         self,
@@ -107,7 +59,7 @@ class Page:
         self.call("Emulation.setTouchEmulationEnabled", enabled=width < 600)
         self._prefer(dark)
         loader = self.call("Page.navigate", url=path.as_uri() + fragment)["loaderId"]
-        while (told := self._next()).get("method") != "Page.lifecycleEvent" or (
+        while (told := self._receive()).get("method") != "Page.lifecycleEvent" or (
             told["params"]["name"] != "load" or told["params"]["loaderId"] != loader
         ):
             pass
@@ -128,20 +80,10 @@ class Page:
 
     def press(self, key: str) -> None:
         """Press and release a key where the focus is."""
-        codes = {
-            "ArrowLeft": 37,
-            "ArrowUp": 38,
-            "ArrowRight": 39,
-            "ArrowDown": 40,
-            "Home": 36,
-            "End": 35,
-            "Enter": 13,
-            " ": 32,
-        }
         for kind in ("keyDown", "keyUp"):
             text = {"text": "\r"} if key == "Enter" and kind == "keyDown" else {}
             text = {"text": key} if len(key) == 1 and kind == "keyDown" else text
-            code = codes.get(key, ord(key[0].upper()))
+            code = CODES.get(key, ord(key[0].upper()))
             self.call("Input.dispatchKeyEvent", type=kind, key=key, windowsVirtualKeyCode=code, **text)
 
     def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
@@ -176,19 +118,13 @@ class Page:
     def _wait_for_frames(self) -> None:
         self.ask("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))")
 
-    def _next(self) -> dict[str, Any]:
-        while b"\0" not in self._rest:
-            more = os.read(self._from, 1 << 20)
-            if not more:
-                raise RuntimeError("Chromium has gone away")
-            self._rest += more
-        line, self._rest = self._rest.split(b"\0", 1)
-        told = json.loads(line)
-        if told.get("method") == "Runtime.exceptionThrown":
-            details = told["params"]["exceptionDetails"]
-            self.complaints.append(details.get("exception", {}).get("description", details["text"]))
-        if told.get("method") == "Runtime.consoleAPICalled" and told["params"]["type"] in ("error", "warning"):
-            self.complaints.append(str([each.get("value") for each in told["params"]["args"]]))
-        if told.get("method") == "Log.entryAdded":
-            self.complaints.append(told["params"]["entry"]["text"])
+    def _receive(self) -> dict[str, Any]:
+        told = super()._receive()
+        match told.get("method"), told.get("params"):
+            case "Runtime.exceptionThrown", {"exceptionDetails": details}:
+                self.complaints.append(details.get("exception", {}).get("description", details["text"]))
+            case "Runtime.consoleAPICalled", {"type": "error" | "warning", "args": args}:
+                self.complaints.append(str([each.get("value") for each in args]))
+            case "Log.entryAdded", {"entry": entry}:
+                self.complaints.append(entry["text"])
         return told

@@ -85,9 +85,7 @@ const readings = {};
 everything.forEach((each, k) => { if (each.tag === "dt") readings[each.text] = everything[k + 1].textContent; });
 console.log(JSON.stringify({
   readings,
-  sliders: everything.filter((each) => each.tag === "input").map((each) => each.getAttribute("aria-label")),
   texts: everything.filter((each) => ["text", "p", "small", "span", "h5", "button"].includes(each.tag)).map((each) => each.textContent),
   numbers: everything.filter((each) => each.attributes.class === "pw-numbers").map((each) => each.children.map((cell) => cell.children[1].textContent)),
-  ellipses: everything.filter((each) => each.tag === "ellipse").map((each) => each.attributes),
   canvases: everything.filter((each) => each.pixels).map(({ pixels }) => ({ width: pixels.width, height: pixels.height, data: [...pixels.data] })),
 }));

@@ -1,4 +1,7 @@
-"""Every chapter runs and becomes a page; a chapter that is broken says in which file and line."""
+"""Every chapter runs and becomes a page; a chapter that is broken says in which file and line.
+
+Prose, formulas and code are set as they should be on a page.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +21,8 @@ from pop_ref.walkthrough.builder.chapter import (
     TIERS,
     ChapterError,
     Part,
+    as_wide_as_a_page,
+    chapter_files,
     chapter_number,
     parts,
     read_chapter,
@@ -25,7 +30,7 @@ from pop_ref.walkthrough.builder.chapter import (
 )
 from pop_ref.walkthrough.builder.command import main
 from pop_ref.walkthrough.builder.glossary import GLOSSARY_PAGE, TERMS, Term
-from pop_ref.walkthrough.builder.layout import chapter_page, index_page
+from pop_ref.walkthrough.builder.layout import chapter_page, index_page, prose
 from pop_ref.walkthrough.pages import run_chapter
 from tests.walkthrough.ran import CHAPTERS, ran
 
@@ -179,25 +184,7 @@ def test_a_chapter_becomes_a_page(path: Path) -> None:
 
 def test_numbers_follow_each_other_and_the_contents_names_them_all() -> None:
     chapters = [read_chapter(path) for path in CHAPTERS]
-    assert [chapter.number for chapter in chapters] == [
-        "0",
-        "1",
-        "1b",
-        "2",
-        "3",
-        "4",
-        "4b",
-        "5",
-        "5b",
-        "6",
-        "7",
-        "8",
-        "9",
-        "9b",
-        "10",
-        "11",
-        "12",
-    ]
+    assert " ".join(chapter.number for chapter in chapters) == "0 1 1b 2 3 4 4b 5 5b 6 7 8 9 9b 10 11 12"
     page = index_page(chapters)
     assert _read(page).links == [GLOSSARY_PAGE, *(chapter.page for chapter in chapters)]
 
@@ -262,6 +249,8 @@ def test_a_small_chapter_shows_what_it_prints_draws_and_folds() -> None:
     outcomes = run_chapter(chapter)
     assert [outcome.printed for outcome in outcomes] == ["", "1.0\n", "", ""]
     page = chapter_page(chapter, outcomes, [chapter])
+    # the same chapter makes the same bytes
+    assert _whole(GOOD) == page
     assert "A caption &lt; with" in page
     assert page.index("<summary>Answer</summary>") > page.index("What is two?")
     assert "<msup><mi>x</mi><mn>2</mn></msup>" in page
@@ -386,10 +375,6 @@ def _whole(text: str) -> str:
     return chapter_page(chapter, run_chapter(chapter), [chapter])
 
 
-def test_the_same_chapter_makes_the_same_bytes() -> None:
-    assert _whole(GOOD) == _whole(GOOD)
-
-
 def _fails(old: str, new: str) -> str:
     assert GOOD.count(old) == 1
     with pytest.raises(ChapterError) as caught:
@@ -397,12 +382,10 @@ def _fails(old: str, new: str) -> str:
     return str(caught.value)
 
 
-def test_a_false_claim_is_named_with_its_file_and_line() -> None:
+def test_a_false_claim_and_an_error_inside_the_oracle_are_named_with_file_and_line() -> None:
     told = _fails("assert two == 2", "assert two == 3")
     assert told == "chapter_01_small.py:29: AssertionError\n    assert two == 3"
-
-
-def test_an_error_inside_the_oracle_is_named_where_the_chapter_calls() -> None:
+    # where the chapter calls
     told = _fails("two = 2", "from pop_ref.constants import profile_named\ntwo = profile_named('none')")
     assert told.startswith("chapter_01_small.py:29: ValueError: profile 'none' is unknown")
     assert told.endswith("\n    two = profile_named('none')")
@@ -448,3 +431,77 @@ def test_what_is_not_installed_is_named(capsys: pytest.CaptureFixture[str], monk
     assert main(["anywhere"]) == 2
     assert capsys.readouterr().err == "latex2mathml missing; pip install 'pop-ref[walkthrough]'\n"
     assert not Path("anywhere").exists()
+
+
+ANY = read_chapter(chapter_files()[0])
+
+
+def _set(text: str) -> str:
+    return prose(ANY, text)
+
+
+def test_a_signature_is_broken_where_it_is_wider_than_a_page() -> None:
+    short = "def f(x: int) -> int:\n    # why (A27)\n    return x"
+    assert as_wide_as_a_page(short) == "def f(x: int) -> int:\n    # why\n    return x"
+    given = ", ".join(f'{name * 12}: Float64[np.ndarray, "N 3"]' for name in "abc")
+    wide = f"def f({given}) -> tuple[int, int]:\n    return 1, 2"
+    for each in (wide, wide.replace("f(", "f(\n    ").replace(") ->", "\n) ->")):
+        lines = as_wide_as_a_page(each).split("\n")
+        assert lines[1] == '    aaaaaaaaaaaa: Float64[np.ndarray, "N 3"],'
+        assert lines[4:] == [") -> tuple[int, int]:", "    return 1, 2"]
+
+
+def test_a_comma_behind_a_formula_stays_with_it() -> None:
+    assert re.search(r'<span class="math inline stays"><math [^>]*>.*?</math>\.</span>', _set("Of $x^2$."), re.DOTALL)
+
+
+def test_names_of_functions_stand_apart_from_what_is_no_parenthesis() -> None:
+    def formula(latex: str) -> str:
+        return re.sub(r"<mspace[^>]*>", " ", _set(f"${latex}$"))
+
+    assert "<mi>o</mi> <mi>exp</mi><mo" in formula(r"o\exp(x)")
+    assert "<mi>ln</mi> <mi>o</mi>" in formula(r"\ln o")
+    assert "<mi>diag</mi><mo" in formula(r"\operatorname{diag}(2, 1)")
+    assert "<msub><mi>max</mi><mi>i</mi></msub> <mi>x</mi>" in formula(r"\max_i x")
+    assert "<msub><mi>T</mi><mrow><mi>max</mi></mrow></msub>" in formula(r"T_{\max}")
+
+
+@pytest.mark.parametrize(
+    ("latex", "wanted"),
+    [
+        (r"(-y, -x)", '(</mo><mo form="prefix">−</mo><mi>y</mi><mo>,</mo><mo form="prefix">−</mo><mi>x</mi>'),
+        (r"a = -b", '<mo>=</mo><mo form="prefix">−</mo>'),
+        (r"(a) - b", ")</mo><mo>−</mo>"),
+        (r"J^\top", "<mi>⊤</mi>"),
+        (r"/ \partial o", "<mo>/</mo><mi>∂</mi>"),
+        (r"q/\lvert q\rvert", '/</mo><mo stretchy="false" form="prefix">|</mo><mi>q</mi>'),
+        (r"|q| d", '<mi>q</mi><mo stretchy="false" form="postfix">|</mo><mi>d</mi>'),
+        (r"a \;|\; b", '<mo stretchy="false">|</mo>'),
+    ],
+)
+def test_signs_and_bars_of_a_formula_stand_at_what_they_belong_to(latex: str, wanted: str) -> None:
+    assert wanted in _set(f"${latex}$")
+
+
+def test_a_long_line_of_code_hangs_and_short_code_stays_on_a_page() -> None:
+    long = f"n = [\n    {'1, ' * 30}\n]"
+    assert '<span class="hangs" style="--at:8ch">    <span' in _set(f"```python\n{long}\n```")
+    assert '<pre class="short"><code><span class="n">n</span>' in _set("```python\nn = 1\n```")
+    lines = "n = 1\n" * 13
+    assert '<pre><code><span class="n">n</span>' in _set(f"```python\n{lines}```")
+
+
+@pytest.mark.parametrize(
+    ("function", "stage"),
+    [
+        ("projection.projection_jacobians_vjp", ["projection"]),
+        ("projection._offset_vjp", ["projection"]),
+        # it alone states the formula
+        ("harmonics._basis_one", []),
+        ("tiles.listed_pixels", []),
+    ],
+)
+def test_a_function_is_folded_that_the_course_asks_for_or_that_does_its_work(function: str, stage: list[str]) -> None:
+    page = _set(f"{{{{source: pop_ref.{function}}}}}")
+    assert "<pre" in page
+    assert re.findall(r'<details class="yours" data-stage="(\w+)">', page) == stage

@@ -1,24 +1,32 @@
-"""The other forms of the chapters: slides that turn and fit, a printed book, and the command that writes them."""
+"""The other forms of the chapters: notebooks, slides that turn and fit, a printed book, and their command.
+
+Notebooks hold the chapter, run in Jupyter, and every picture appears; the first nine need no torch.
+"""
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Iterator
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
+import numpy
 import pytest
 
+import pop_ref
+from pop_ref.learn.course import COURSE
 from pop_ref.walkthrough.builder import command
 from pop_ref.walkthrough.builder.chapter import Chapter, ChapterError, chapter_number, read_chapter
 from pop_ref.walkthrough.builder.command import main
 from pop_ref.walkthrough.builder.layout import asset, book, document
+from pop_ref.walkthrough.builder.notebooks import notebook
 from pop_ref.walkthrough.builder.slides import FILE, chapters_of, deck, read_slides
 from pop_ref.walkthrough.pages import Outcome, run_chapter
 from pop_ref.walkthrough.widgets import html
-from tests.walkthrough.chromium import SCREENSHOTS, WHY_NOT, Page, keep
-from tests.walkthrough.ran import CHAPTERS, ran
-
-in_browser = pytest.mark.skipif(bool(WHY_NOT), reason=WHY_NOT)
+from tests.walkthrough.chromium import SCREENSHOTS, Page, keep
+from tests.walkthrough.ran import CHAPTERS, MISSING, executed, ran, run_of
 
 TEXT = """# minutes: 5
 
@@ -70,12 +78,6 @@ assert two == 2
 def small() -> tuple[Chapter, list[Outcome]]:
     chapter = read_chapter(Path("chapter_01_small.py"), TEXT)
     return chapter, run_chapter(chapter)
-
-
-@pytest.fixture(scope="module")
-def page() -> Iterator[Page]:
-    with Page() as opened:
-        yield opened
 
 
 SLIDES = """# A title
@@ -156,7 +158,6 @@ def test_the_lecture_has_25_slides_for_ninety_minutes_and_something_to_say_at_ea
     assert chapters_of(slides) <= {chapter_number(path) for path in CHAPTERS}
 
 
-@in_browser
 def test_slides_turn_by_key_button_and_finger_and_show_notes(
     page: Page, small: tuple[Chapter, list[Outcome]], tmp_path: Path
 ) -> None:
@@ -187,7 +188,6 @@ def test_slides_turn_by_key_button_and_finger_and_show_notes(
     assert page.complaints == []
 
 
-@in_browser
 @pytest.mark.slow
 def test_every_slide_of_the_lecture_fits_its_screen(page: Page, tmp_path: Path) -> None:
     slides = read_slides(FILE.read_text(encoding="utf-8"))
@@ -239,7 +239,6 @@ def test_the_book_prints_what_the_course_asks_for_behind_the_questions_and_a_mis
     assert "with one mistake" not in answers
 
 
-@in_browser
 def test_a_training_in_a_book_is_drawn_before_the_page_is_loaded(page: Page, tmp_path: Path) -> None:
     # what is printed is the page as it is when it has loaded, and a worker answers later
     early = "<script>early = [...document.querySelectorAll('dd')].map(each => each.textContent)</script>"
@@ -250,7 +249,7 @@ def test_a_training_in_a_book_is_drawn_before_the_page_is_loaded(page: Page, tmp
     assert page.ask("early.filter(each => / dB$/.test(each))") == ["10.3 dB", "10.3 dB"]
 
 
-@in_browser
+@pytest.mark.skipif(command.chromium() is None, reason="there is no Chromium here (apt install chromium)")
 def test_the_command_prints_a_book(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--pdf", str(tmp_path / "new" / "book.pdf"), "--only", "1"]) == 0
     assert [path.name for path in tmp_path.rglob("*.*")] == ["book.pdf"]
@@ -260,16 +259,13 @@ def test_the_command_prints_a_book(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "book.pdf" in capsys.readouterr().out
 
 
-def test_without_a_browser_the_command_says_what_a_book_needs(
+def test_without_a_browser_or_by_one_that_prints_nothing_a_book_is_an_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CHROMIUM", "no-such-browser")
     assert main(["--pdf", str(tmp_path / "book.pdf"), "--only", "1"]) == 2
     assert capsys.readouterr().err.startswith("a PDF needs Chromium or Chrome: install it")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_browser_that_prints_nothing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CHROMIUM", "false")
     with pytest.raises(command.BrowserError, match="false printed nothing"):
         command._printed("<p>")
@@ -304,3 +300,140 @@ def test_a_command_that_says_nothing_is_told_what_it_may_say(
         main(words)
     assert ended.value.code == 2
     assert told in capsys.readouterr().err
+
+
+runs = pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not installed")
+
+GOOD = """# minutes: 5
+
+# %% [markdown]
+# # 1. Title
+#
+# What the reader will know; see [the next](chapter_02_space_to_screen.py).
+#
+# {{widget: splat2d}}
+#
+# And on.
+
+# %%
+import matplotlib.pyplot as plt
+
+from pop_ref.walkthrough.pages import picture
+
+fig, ax = plt.subplots()
+ax.plot([0, 1])
+picture(fig, "A line with $y$.")
+x = 2
+x + 1
+
+# %% [markdown]
+# ### Exercise 1: predict
+# What is two?
+
+# %% answer
+# It is 2.
+print("two")
+assert x == 2
+"""
+
+
+def _small(text: str = GOOD) -> Chapter:
+    return read_chapter(Path("chapter_01_small.py"), text)
+
+
+def _pictures(outputs: list[dict[str, Any]]) -> int:
+    return sum("image/png" in output.get("data", {}) for output in outputs)
+
+
+def test_a_notebook_folds_the_functions_that_the_course_asks_for() -> None:
+    for path in CHAPTERS:
+        chapter = read_chapter(path)
+        told = ["".join(c["source"]) for c in json.loads(notebook(chapter))["cells"] if c["cell_type"] == "markdown"]
+        # what is left once the folded parts are taken out
+        left = re.sub(r"<details>.*?</details>", "", "\n".join(told), flags=re.DOTALL)
+        assert "yours to write first" not in left
+        for name in (name for stage in COURSE for name in stage.names):
+            assert f"def {name}(" not in left, (path.name, name)
+
+
+def test_a_notebook_holds_the_chapter_and_folds_what_a_page_folds() -> None:
+    written = json.loads(notebook(_small()))
+    cells = [(c["cell_type"], c["metadata"].get("jupyter", {}).get("source_hidden", False)) for c in written["cells"]]
+    texts = ["".join(c["source"]) for c in written["cells"]]
+    assert cells[2:] == [
+        ("markdown", False),
+        ("code", True),
+        ("markdown", False),
+        ("code", True),
+        ("code", True),
+        ("code", False),
+        ("markdown", False),
+        ("markdown", False),
+        ("code", True),
+    ]
+    assert "(chapter_02_space_to_screen.ipynb)" in texts[2]
+    assert 'html("splat2d")' in texts[3]
+    assert texts[4] == "And on."
+    assert texts[7] == "x = 2\nx + 1;"
+    assert texts[9] == "<details><summary>Answer</summary>\n\nIt is 2.\n\n</details>"
+    assert texts[10] == 'print("two")\nassert x == 2'
+    assert len({c["id"] for c in written["cells"]}) == len(cells)
+    assert notebook(_small()) == notebook(_small())
+
+
+@runs
+def test_a_small_notebook_shows_its_picture_caption_widget_and_print_and_nothing_else() -> None:
+    # a port that the kernel is to take may be taken before it does
+    no_port = 'import ipykernel; assert ipykernel.get_connection_info(unpack=True)["transport"] == "ipc"'
+    outputs = [output for cell in executed(notebook(_small()), behind=no_port) for output in cell["outputs"]]
+    assert _pictures(outputs) == 1
+    data = [output["data"] for output in outputs if "data" in output]
+    assert ["text/html" in each for each in data] == [True, False, False]
+    assert data[2]["text/markdown"] == "A line with $y$."
+    assert [output["text"] for output in outputs if output["output_type"] == "stream"] == ["two\n"]
+    assert len(outputs) == 4
+
+
+def _first_cell(place: Path, path: list[str]) -> subprocess.CompletedProcess[str]:
+    """Run a notebook's first cell in a Python that has these folders on its path and nothing installed."""
+    cells = [each for each in json.loads(notebook(_small()))["cells"] if each["cell_type"] == "code"]
+    code = f"import sys; sys.path += {path!r}\n" + "".join(cells[0]["source"]) + "\nimport pop_ref"
+    return subprocess.run([sys.executable, "-ISc", code], cwd=place, capture_output=True, text=True)
+
+
+def test_the_first_cell_finds_the_clone_that_the_notebook_lies_in(tmp_path: Path) -> None:
+    below = tmp_path / "clone" / "out" / "notebooks"
+    below.mkdir(parents=True)
+    (tmp_path / "clone" / "pop_ref").symlink_to(Path(pop_ref.__file__).parent)
+    packages = [str(Path(numpy.__file__).parents[1])]
+    done = _first_cell(below, packages)
+    assert done.returncode == 0, done.stderr
+    # where there is no clone, one line says what to do
+    done = _first_cell(tmp_path, packages)
+    assert "ImportError: pop_ref missing. Start Jupyter inside the clone of pop-splatting, or" in done.stderr
+    done = _first_cell(below, [])
+    assert "matplotlib missing. Start Jupyter inside the clone" in done.stderr
+    assert f"{sys.executable} -m pip install matplotlib" in done.stderr
+    # chapter 0 reads a capture, for which the clone's other package must be installed
+    cells = json.loads(notebook(read_chapter(CHAPTERS[0])))["cells"]
+    first = "".join(next(each for each in cells if each["cell_type"] == "code")["source"])
+    code = f"import sys; sys.path += {[str(tmp_path / 'clone')]!r}\n{first}"
+    done = subprocess.run([sys.executable, "-ISc", code], cwd=below, capture_output=True, text=True)
+    assert "cv2, matplotlib, numpy, pop_fast missing" in done.stderr
+    assert "-m pip install ./pop_ref . matplotlib numpy\n" in done.stderr
+
+
+# the first nine chapters are read without torch; from the last on, so that two workers seldom wait for one chapter
+@runs
+@pytest.mark.slow
+@pytest.mark.parametrize("path", CHAPTERS[::-1], ids=lambda path: path.stem)
+def test_every_picture_of_a_chapter_appears_in_its_notebook(path: Path) -> None:
+    chapter, run = read_chapter(path), run_of(path)
+    assert run.outputs is not None
+    if int(chapter_number(path).rstrip("b")) <= 9:
+        assert "pop_ref" in run.modules
+        assert "torch" not in run.modules
+    outputs = [output for each in run.outputs for output in each]
+    drawn = sum(cell.text.count("\npicture(") + cell.text.count("\nfilm(") for cell in chapter.cells)
+    assert _pictures(outputs) == drawn > 0
+    assert [output for output in outputs if output["output_type"] == "error" or output.get("name") == "stderr"] == []

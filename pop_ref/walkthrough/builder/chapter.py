@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
 from pop_ref.learn.course import COURSE
-from pop_ref.learn.stubs import formulas
+from pop_ref.learn.stubs import formulas, without_docstring
 
 Kind = Literal["prose", "code", "setup", "answer"]
 Role = Literal["plain", "imports", "checks", "draws"]
@@ -295,15 +295,6 @@ def broken_function(name: str) -> tuple[str, str]:
             if new != without_docstring(sound, before):
                 return new, f"pop_ref/{mutant.file}, with one mistake"
     raise ValueError(f"mutant {name!r} breaks no function")
-
-
-def without_docstring(text: str, node: ast.FunctionDef) -> str:
-    """Return a function's lines but for its docstring, which the prose around it replaces."""
-    lines = text.split("\n")[node.lineno - 1 : node.end_lineno]
-    if ast.get_docstring(node) is not None:
-        told = node.body[0]
-        del lines[told.lineno - node.lineno : (told.end_lineno or told.lineno) - node.lineno + 1]
-    return "\n".join(lines)
 
 
 def as_wide_as_a_page(code: str) -> str:
