@@ -20,6 +20,7 @@ import torch
 
 from cuda_ext.toolkit import find_compiler
 from pop_fast import compiled
+from pop_fast.api.backend import get_backend
 from pop_fast.api.rasterize import rasterization
 from pop_fast.blocks import jobs
 from pop_fast.cli.doctor import backends

@@ -33,7 +33,7 @@ from pop_fast.blocks.run import TAKEN
 from pop_fast.children import module_command
 from pop_fast.cli import main
 from pop_fast.data.capture import Capture
-from pop_fast.data.load import in_picture, list_capture, load_capture
+from pop_fast.data.load import in_picture, list_capture, load_capture, write_block
 from pop_fast.errors import PopError
 from pop_fast.train.checkpoint import load_splats, save_checkpoint
 from pop_fast.train.evaluate import evaluate

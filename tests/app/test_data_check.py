@@ -23,6 +23,7 @@ from cuda_ext import build, toolkit
 from pop_fast.data import Capture, load_capture, sfm
 from pop_fast.data.photo_quality import GAMMA, UNEVEN, Exposures, exposures, exposures_of, levels_at
 from pop_fast.demo import make_demo
+from pop_fast.demo.make import render_view
 from pop_fast.demo.scene import make_scene
 from pop_fast.io import images
 from pop_fast.train import TrainConfig

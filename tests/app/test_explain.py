@@ -17,6 +17,7 @@ import torch
 import cuda_ext
 import pop_fast
 from pop_fast.api.backend import BACKENDS, get_backend
+from pop_fast.api.backends import FAST, TorchBackend
 from pop_fast.api.rasterize import rasterization
 from pop_fast.cli.explain import chosen_view
 from pop_fast.density import POPStrategy

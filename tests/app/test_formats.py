@@ -30,6 +30,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.faults.ksplat import ksplat_of
 from pop_fast.data.unpack import take_frames
 from pop_fast.errors import PopError
+from pop_fast.io import read_back
 from pop_fast.io.formats import FORMATS, encoded, format_names, load_splat_file, loses_frame, named_format, save_as
 from pop_fast.io.formats import decoded as from_bytes
 from pop_fast.io.formats.cloud import SH_C0, Cloud, morton_order
@@ -709,13 +710,13 @@ def test_what_is_not_free_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     for shade in (50, 200):
         film.write(np.full((3072, 3072, 3), shade, np.uint8))
     film.release()
-    monkeypatch.setattr(budget, "free_bytes", lambda: 50 * MB)
+    monkeypatch.setattr(read_back, "free_bytes", lambda: 50 * MB)
     end = "px would take .* and 52\\.4 MB are free"
     with pytest.raises(PopError, match=rf"a\.bmp: its header's size of 4200x3000 {end}"):
         read_image(tmp_path / "a.bmp")
     with pytest.raises(PopError, match=rf"a\.avi: its frames of 3072x3072 {end}; convert"):
         take_frames(tmp_path / "a.avi", tmp_path / "out", 3)
-    monkeypatch.setattr(budget, "free_bytes", lambda: 0)
+    monkeypatch.setattr(read_back, "free_bytes", lambda: 0)
     # a small need is never questioned
     check_memory("a", 2**26, 1, "x", "y")
     with pytest.raises(PopError, match=r"^a: x would take .* and 0\.0 MB are free; y$"):

@@ -20,6 +20,7 @@ import pytest
 import torch
 
 from pop_fast.api import backend
+from pop_fast.api import backend as api_backend
 from pop_fast.api.backend import BACKENDS
 from pop_fast.api.backends import FAST, TorchBackend
 from pop_fast.api.rasterize import rasterization
@@ -312,9 +313,9 @@ def installed() -> Iterator[pytest.MonkeyPatch]:
 
 @pytest.mark.usefixtures("installed")
 def test_a_registered_backend_is_known_by_its_name_and_draws_and_one_that_cannot_be_loaded_is_named() -> None:
-    assert registry.backend_names() == ("fast", "compiled", "cuda", "ref", "mine", "broken")
+    assert api_backend.backend_names() == ("fast", "compiled", "cuda", "ref", "mine", "broken")
     expected = rasterization(**scene(), **cameras(), backend="fast")[0]
-    for mine in ("mine", registry.get_backend("mine")):
+    for mine in ("mine", api_backend.get_backend("mine")):
         assert torch.equal(rasterization(**scene(), **cameras(), backend=mine)[0], expected)
     with pytest.raises(PopError, match=r"the backend at no_such_package:BACKEND cannot be loaded: No module named"):
         backend.get_backend("broken")

@@ -22,7 +22,7 @@ from pop_fast.data import load_capture
 from pop_fast.data.capture import View, neighbour_degrees
 from pop_fast.errors import PopError
 from pop_fast.io import images
-from pop_fast.io.images import colormap_table
+from pop_fast.io.images import colormap_table, depth_picture, depth_range
 from pop_fast.io.ply import Frame, save_ply
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.engines import renderer

@@ -27,6 +27,7 @@ from pop_fast.train import TrainingRun, training_run
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.ranks import ALONE, Ranks, join
 from pop_fast.train.signals import stop_requests
+from pop_fast.train.torch_stepper import check_batch
 from tests.app.captures import PINHOLE, camera, photograph, ring, write_model, write_photograph
 from tests.app.conftest import ROOT, TRAIN, in_a_child, launched, wait_until
 from tests.app.damage import contents

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 
+from pop_fast.api.backends import FAST
 from pop_fast.data import Capture, View
 from pop_fast.data.gaussians import initialize_params
 from pop_fast.density import POPStrategy

@@ -16,7 +16,7 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from pop_fast.data import Capture, load_capture
-from pop_fast.data.exports import read_metashape
+from pop_fast.data.exports import read_metashape, read_transforms
 from pop_fast.data.sfm import photographs
 from pop_fast.errors import CaptureError
 from tests.app.captures import (

@@ -18,7 +18,7 @@ import pytest
 import torch
 
 import pop_fast
-from pop_fast.cli import COMMANDS, main
+from pop_fast.cli import COMMANDS, describe, main, message, printable
 from pop_fast.cli.completion import bash, fish, options_of
 from pop_fast.cli.train import arguments
 from pop_fast.cli.train_options import takes_hours

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from paper_repro.claims import HEADLINES, METHODS, SWEEP, WINDOWS, claims, noise_of, questions
-from paper_repro.claims_page import markdown, outcome, telling
+from paper_repro.claims_page import READINGS, Answer, answers, columns, experiments, markdown, outcome, telling
 from paper_repro.cli import main
 from paper_repro.evidence import (
     COUNT,

@@ -555,10 +555,10 @@ def artifacts(tmp_path_factory):
     save_ply(job.work(folder) / "ply" / "point_cloud_299.ply", params)
     base = result("3dgs", "demo", scale="toy", schedule={"max_steps": 300})
     with pytest.MonkeyPatch.context() as patch, style.look():
-        patch.setattr(opacity_one, "STEPS", 12)
+        patch.setattr(artifact, "STEPS", 12)
         toy = asked("3", [base], folder, scale="toy")
         first = artifact.pushed(toy)
-        patch.setattr(opacity_one, "_train", lambda *_: pytest.fail("trained again"))
+        patch.setattr(artifact, "_train", lambda *_: pytest.fail("trained again"))
         made = artifact.six_panels(toy)
         return params, first, made, save(made, folder / "figure_3")
 

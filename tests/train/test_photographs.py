@@ -21,6 +21,7 @@ from pop_fast.errors import PopError
 from pop_fast.stages import appearance as stages
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
+from pop_fast.train import views as train_views
 from pop_fast.train.appearance import Appearance
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.config import TrainConfig
@@ -120,7 +121,7 @@ STOPPED = {
 @pytest.fixture
 def tiny_may_shrink(monkeypatch: pytest.MonkeyPatch) -> None:
     """Views of 32 x 24 px may be halved."""
-    monkeypatch.setattr(coarse, "SMALLEST_SIDE", 12)
+    monkeypatch.setattr(train_views, "SMALLEST_SIDE", 12)
 
 
 @pytest.mark.usefixtures("tiny_may_shrink")

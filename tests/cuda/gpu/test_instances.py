@@ -9,6 +9,7 @@ import torch
 
 from cuda_ext import load
 from cuda_ext.arrays import N_INSTANCES, OVERFLOW, CudaMemoryError, fill, kernel_profile, new_state, stream_of
+from cuda_ext.render import lists as lists_module
 from cuda_ext.render.lists import TileBuffers, count_instances, splat_struct
 from pop_fast.cuda import rasterization
 from pop_fast.train.steps import Phase
@@ -129,7 +130,7 @@ def test_more_entries_than_the_kernels_can_number_are_refused_in_one_line(gpu):
 
 
 def test_room_shrinks_after_a_phase_of_fat_splats_and_the_steps_stay_the_same(gpu, monkeypatch):
-    monkeypatch.setattr(capacity, "FIRST_GUESS", (0, 64))
+    monkeypatch.setattr(lists_module, "FIRST_GUESS", (0, 64))
     phase, scene = Phase(3, True, True, True), training_scene()
     fat = {**scene.params, "scales": scene.params["scales"] + 1.5}
     (params, m, v), trainer = fused_trainer(replace(scene, params=fat), gpu)
