@@ -8,9 +8,12 @@ import pytest
 
 pytest.register_assert_rewrite("pop_ref.conformance.laws")
 
-from pop_ref.conformance.poison import poisoned_allocations  # noqa: E402  asserts must be rewritten first
-
-from tests.judged import LAW_MODULES, judge_own_backends, law_classes  # noqa: E402
+from tests.judged import (  # noqa: E402
+    LAW_MODULES,
+    judge_own_backends,
+    law_classes,
+    poisoned_allocations,  # noqa: E402  asserts must be rewritten first
+)
 
 globals().update(law_classes(LAW_MODULES))
 pytest_generate_tests = judge_own_backends

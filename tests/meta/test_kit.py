@@ -25,7 +25,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from jaxtyping import TypeCheckError
-from pop_ref.conformance.poison import POISONED_INTEGER, poisoned_allocations
 
 from pop_fast.api.rasterize import rasterization as fast
 from pop_ref.activations import scales_from_log_scales

@@ -344,12 +344,12 @@ FUNCTIONS = public_functions()
 
 STEP = "gradients:a_step_along_any_direction_changes_the_image_as_the_gradient_says"
 FLOOR_MARGIN = "test_margins.test_d5_is_near_where_alpha_is_next_to_the_floor"
-SCHEDULE = "test_density.test_schedule_has_144_densification_steps_41_with_blur_and_4_resets"
+SCHEDULE = "test_training.test_schedule_has_144_densification_steps_41_with_blur_and_4_resets"
 VISIBLE = "density:the_density_statistic_averages_ndc_gradients_over_the_views_that_showed_the_gaussian"
 OUTCOME = "thresholds:at_a_depth_tie_the_order_is_one_of_the_two_and_by_index_where_the_tie_is_exact"
-IMPORTANCE = "mini_splatting:importance_is_weight_indoors_and_weight_a_pixel_for_who_dominates_outdoors"
+IMPORTANCE = "selection:importance_is_weight_indoors_and_weight_a_pixel_for_who_dominates_outdoors"
 RATES = "few_photographs:rates_of_exposures_and_cameras_fall_from_step_to_step_and_not_as_one_another"
-ADDED_IMPORTANCE = "mini_splatting:importance_adds_over_views_and_is_none_where_no_pixel_is_dominated"
+ADDED_IMPORTANCE = "selection:importance_adds_over_views_and_is_none_where_no_pixel_is_dominated"
 
 # a function and its derivative, either of which breaks the law that one is the transpose of the other
 WITH_THEIR_TRANSPOSES = {
@@ -369,11 +369,11 @@ LAWS = {
         for name in names.split()
         for end in ("", "_vjp")
     },
-    "activations.scales_from_log_scales": "activations:scales_are_positive_and_one_at_zero",
+    "activations.scales_from_log_scales": "covariance:scales_are_positive_and_one_at_zero",
     "activations.scales_from_log_scales_vjp": "agreement:scales_from_log_scales_vjp_is_the_transpose",
-    "activations.opacities_from_logits": "activations:opposite_logits_give_opacities_that_sum_to_one",
+    "activations.opacities_from_logits": "covariance:opposite_logits_give_opacities_that_sum_to_one",
     "activations.opacities_from_logits_vjp": "agreement:opacities_from_logits_vjp_is_the_transpose",
-    "activations.unit_quats_from_quats": "activations:unit_quaternions_have_norm_one_and_forget_a_power_of_two",
+    "activations.unit_quats_from_quats": "covariance:unit_quaternions_have_norm_one_and_forget_a_power_of_two",
     "activations.unit_quats_from_quats_vjp": "agreement:unit_quats_from_quats_vjp_is_the_transpose",
     "alpha.sigma_at_pixel": "alpha:the_exponent_is_half_the_squared_distance_in_the_conics_metric",
     "alpha.sigma_at_pixel_vjp": "alpha:the_exponents_gradient_is_its_exact_change_for_a_quadratic",
@@ -414,9 +414,9 @@ LAWS = {
     "pixel.composite_pixel": "compositing:a_round_splat_on_the_axis_looks_as_the_formula_says",
     "pixel.composite_pixel_vjp": STEP,
     "pixel.zero_gradients": STEP,
-    "polarization.importance_mask": "polarization:a_gaussian_is_important_if_it_dominates_one_pixel",
-    "polarization.opacity_entropy": "polarization:the_entropy_of_opacities_is_the_mean_of_what_each_leaves_open",
-    "polarization.opacity_entropy_vjp": "polarization:the_entropy_pulls_every_opacity_to_the_pole_that_it_is_nearer_to",
+    "polarization.importance_mask": "losses:a_gaussian_is_important_if_it_dominates_one_pixel",
+    "polarization.opacity_entropy": "losses:the_entropy_of_opacities_is_the_mean_of_what_each_leaves_open",
+    "polarization.opacity_entropy_vjp": "losses:the_entropy_pulls_every_opacity_to_the_pole_that_it_is_nearer_to",
     "render.render": "compositing:weights_and_remaining_light_sum_to_one",
     "render.render_vjp": STEP,
     "splatting.geometry": "compositing:a_round_splat_on_the_axis_looks_as_the_formula_says",
@@ -426,50 +426,50 @@ LAWS = {
     "tiles.tile_span": OUTCOME,
     "tiles.tile_rects": "tiles:a_tile_is_listed_exactly_if_it_overlaps_the_open_extent",
     "contributions.contributions": "contributions:weights_and_the_light_that_is_left_cover_the_image",
-    "sensitivity.sensitivities": "sensitivity:one_splat_on_one_pixel_scores_its_opacity_times_its_contrast_squared",
-    "fisher.log_det_scores": "fisher:a_score_is_the_logarithm_of_the_determinant",
-    "chord.chord_midpoint": "chord:a_gaussian_is_densest_at_the_midpoint",
-    "chord.dominant_points": "chord:points_lie_on_the_rays_through_their_pixels_and_ahead_of_the_camera",
+    "sensitivity.sensitivities": "contributions:one_splat_on_one_pixel_scores_its_opacity_times_its_contrast_squared",
+    "fisher.log_det_scores": "contributions:a_score_is_the_logarithm_of_the_determinant",
+    "chord.chord_midpoint": "contributions:a_gaussian_is_densest_at_the_midpoint",
+    "chord.dominant_points": "contributions:points_lie_on_the_rays_through_their_pixels_and_ahead_of_the_camera",
     "selection.lowest_share": "selection:the_lowest_go_up_to_the_score_at_the_share_of_the_last_index",
     "selection.least_mass": "selection:the_least_mass_goes_with_the_first_that_exceeds_the_share",
     "selection.sample_without_replacement": "selection:a_draw_takes_the_first_arrivals_of_an_exponential_race",
-    "taming.budget_at": "taming:the_budget_is_a_parabola_from_the_start_to_the_target",
-    "taming.edge_map": "taming:edges_are_eight_times_the_grey_less_its_neighbours_and_the_frame_is_grey",
-    "taming.pixel_weights": "taming:pixels_weigh_up_to_fifty_by_error_and_up_to_fifty_by_edge",
-    "taming.scaled_to_median": "taming:a_term_is_its_weight_at_the_lower_median_of_what_is_positive",
-    "taming.view_score": "taming:a_views_score_is_nine_terms_and_nothing_for_what_it_does_not_show",
-    "taming.quotas": "taming:quotas_share_what_the_budget_leaves_and_never_ask_for_less_than_none",
+    "taming.budget_at": "selection:the_budget_is_a_parabola_from_the_start_to_the_target",
+    "taming.edge_map": "selection:edges_are_eight_times_the_grey_less_its_neighbours_and_the_frame_is_grey",
+    "taming.pixel_weights": "selection:pixels_weigh_up_to_fifty_by_error_and_up_to_fifty_by_edge",
+    "taming.scaled_to_median": "selection:a_term_is_its_weight_at_the_lower_median_of_what_is_positive",
+    "taming.view_score": "selection:a_views_score_is_nine_terms_and_nothing_for_what_it_does_not_show",
+    "taming.quotas": "selection:quotas_share_what_the_budget_leaves_and_never_ask_for_less_than_none",
     "mini_splatting.view_importance": IMPORTANCE,
     "mini_splatting.scene_importance": ADDED_IMPORTANCE,
-    "mini_splatting.samples_per_view": "mini_splatting:views_share_the_points_and_give_no_more_than_their_pixels",
-    "mini_splatting.nearest_log_scales": "mini_splatting:a_point_is_as_large_as_its_three_neighbours_are_far",
-    "tight_tiles.snug_box": "tight_tiles:the_box_touches_the_ellipse_of_what_can_be_seen_on_its_four_sides",
-    "tight_tiles.accutile": "tight_tiles:a_tile_is_kept_exactly_if_it_meets_the_ellipse_of_what_can_be_seen",
-    "tight_tiles.tight_tile_lists": "tight_tiles:tight_lists_are_parts_of_the_rectangles_in_the_same_order",
+    "mini_splatting.samples_per_view": "selection:views_share_the_points_and_give_no_more_than_their_pixels",
+    "mini_splatting.nearest_log_scales": "selection:a_point_is_as_large_as_its_three_neighbours_are_far",
+    "tight_tiles.snug_box": "tiles:the_box_touches_the_ellipse_of_what_can_be_seen_on_its_four_sides",
+    "tight_tiles.accutile": "tiles:a_tile_is_kept_exactly_if_it_meets_the_ellipse_of_what_can_be_seen",
+    "tight_tiles.tight_tile_lists": "tiles:tight_lists_are_parts_of_the_rectangles_in_the_same_order",
     "tiles.listed_pixels": "compositing:a_round_splat_on_the_axis_looks_as_the_formula_says",
     "compositing.background_or_black": "compositing:a_round_splat_on_the_axis_looks_as_the_formula_says",
     "tiles.tile_lists": "tiles:lists_run_front_to_back_and_equal_depths_keep_index_order",
 }
 TESTS = {
-    "optimizer.is_updated": "test_density.test_a_step_that_edits_the_population_moves_nothing_in_inrias_loop",
-    "optimizer.update_numbers": "test_density.test_taming_moves_upper_bands_each_16_steps_and_opacities_until_15_000",
+    "optimizer.is_updated": "test_training.test_a_step_that_edits_the_population_moves_nothing_in_inrias_loop",
+    "optimizer.update_numbers": "test_training.test_taming_moves_upper_bands_each_16_steps_and_opacities_until_15_000",
     "harmonics.lower_degree": (
         "test_projection.test_a_lower_degree_loses_least_where_views_show_it_and_little_elsewhere"
     ),
     "taming.taming_scores": "test_methods.test_scores_of_a_population_add_over_views_that_are_rendered_and_weighed",
     "fisher.screen_moments": "test_methods.test_the_view_direction_counts_and_channels_do_not_leak_into_each_other",
     "fisher.fisher_blocks": "test_methods.test_the_view_direction_counts_and_channels_do_not_leak_into_each_other",
-    "density_config.densifies_at": SCHEDULE,
-    "density_config.resets_at": SCHEDULE,
-    "density_config.blurs_at": "test_density.test_split_only_blur_splits_small_ones_and_may_clone_them_as_well",
-    "appearance.expose": "test_appearance.test_an_exposure_mixes_channels_row_by_row",
-    "appearance.centred_exposures": "test_appearance.test_centred_exposures_have_the_identity_as_mean",
-    "appearance.color_correct": "test_appearance.test_correction_takes_back_gain_and_offset_by_channel",
-    "appearance.over_background": "test_appearance.test_a_photograph_over_another_background_is_as_if_laid_over_it",
-    "appearance.background_at": "test_appearance.test_the_stream_is_splitmix64_by_its_published_numbers",
-    "refinement.rotmat_from_vector": "test_appearance.test_a_rotation_is_the_exponential_of_its_generator",
-    "refinement.without_common_motion": "test_appearance.test_what_is_taken_out_is_orthogonal_to_what_is_left",
-    "refinement.refined_viewmat": "test_appearance.test_a_corrected_camera_is_rigid_and_moves_points_in_its_own_axes",
+    "density.densifies_at": SCHEDULE,
+    "density.resets_at": SCHEDULE,
+    "density.blurs_at": "test_training.test_split_only_blur_splits_small_ones_and_may_clone_them_as_well",
+    "appearance.expose": "test_losses.test_an_exposure_mixes_channels_row_by_row",
+    "appearance.centred_exposures": "test_losses.test_centred_exposures_have_the_identity_as_mean",
+    "appearance.color_correct": "test_losses.test_correction_takes_back_gain_and_offset_by_channel",
+    "appearance.over_background": "test_losses.test_a_photograph_over_another_background_is_as_if_laid_over_it",
+    "appearance.background_at": "test_losses.test_the_stream_is_splitmix64_by_its_published_numbers",
+    "refinement.rotmat_from_vector": "test_losses.test_a_rotation_is_the_exponential_of_its_generator",
+    "refinement.without_common_motion": "test_losses.test_what_is_taken_out_is_orthogonal_to_what_is_left",
+    "refinement.refined_viewmat": "test_losses.test_a_corrected_camera_is_rigid_and_moves_points_in_its_own_axes",
     "regularizers.depth_samples": "test_losses.test_samples_are_the_points_that_a_camera_shows_where_it_shows_them",
     "regularizers.sparse_depth_loss": "test_losses.test_depth_at_points_is_interpolated_and_compared_inverse",
     "regularizers.mean_activation": "test_losses.test_means_of_activations_are_numpys_and_none_is_zero",
@@ -478,12 +478,12 @@ TESTS = {
     "ssim.replace_left_out": "test_losses.test_l1_at_equality_has_the_mean_of_its_one_sided_slopes",
     "magnitudes.in_float32": "test_margins.test_rounded_numbers_inherit_errors_as_their_derivatives_say",
     "magnitudes.frustum_limits": "test_margins.test_values_under_error_analysis_are_those_of_the_stages",
-    "extent_margins.extent_margins": "test_margins.test_d2_is_near_for_an_opacity_next_to_the_floor",
+    "margins.extent_margins": "test_margins.test_d2_is_near_for_an_opacity_next_to_the_floor",
     "magnitudes.constant": FLOOR_MARGIN,
     "magnitudes.depths_magnitudes": FLOOR_MARGIN,
     "magnitudes.splat_magnitudes": FLOOR_MARGIN,
     "margins.margins": FLOOR_MARGIN,
-    "pixel_margins.pixel_margins": FLOOR_MARGIN,
+    "margins.pixel_margins": FLOOR_MARGIN,
 }
 LADDER = (
     "training.start",
@@ -503,7 +503,7 @@ DOCTESTS = (
     "depth.with_depth_channel",
     *("constants.profile_named", "notation.symbol_named", "magnitudes.distance", "magnitudes.colors_magnitudes"),
     *("methods.scripted_steps", "methods.method_settings", "short_training.taken_steps"),
-    *("loss_magnitudes.d_ssim_magnitudes", "loss_magnitudes.pixelwise_magnitudes"),
+    *("magnitudes.d_ssim_magnitudes", "magnitudes.pixelwise_magnitudes"),
 )
 
 

@@ -35,11 +35,6 @@ from pop_ref.polarization import importance_mask
 from pop_ref.polarization import pop_loss as oracle_loss
 
 ROOT = Path(__file__).resolve().parents[2]
-FAST = {
-    name: given
-    for path in (ROOT / "pop_fast" / "stages").glob("*.py")
-    for name, given in tables.functions(path).items()
-}
 DOCS = ROOT / "docs"
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PAGES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")))
@@ -63,7 +58,12 @@ def load(file: str, name: str = "") -> ModuleType:
     return module
 
 
-stages, kit_tables, tables = load("stages"), load("kit_tables"), load("tables")
+tables = load("tables")
+FAST = {
+    name: given
+    for path in (ROOT / "pop_fast" / "stages").glob("*.py")
+    for name, given in tables.functions(path).items()
+}
 # Python has a module of that name
 site = load("site", "site_hook")
 BOTH_ROOMS = [

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cuda_ext.compiler import find_compiler, no_compiler
 from hypothesis import example, given
 
+from cuda_ext.toolkit import find_compiler, no_compiler
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.assertions import assert_same_image
 from pop_ref.conformance.corpus import corpus_scene

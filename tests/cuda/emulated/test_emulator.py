@@ -23,7 +23,7 @@ from pop_fast.cuda import rasterization
 from pop_fast.density.passes import Passes
 from pop_fast.train.steps import Phase
 from pop_ref.conformance.mutants.trial import every_law, law_named
-from pop_ref.conformance.torch_short_training import Watcher
+from pop_ref.conformance.torch_short_training import Trainee
 from pop_ref.constants import PAPER
 from tests.cuda.conftest import FOLDER, emulated_engine
 from tests.cuda.gpu.scene import (
@@ -281,7 +281,7 @@ def test_training_tells_the_same_winners_without_the_counts(gpu):
 LAWS = [path for path, law in every_law().items() if law.needs == ("collected_statistics",)]
 
 
-class FusedStep(Watcher):
+class FusedStep(Trainee):
     """Takes the steps of a `Watch` on the emulated GPU, as an adapter that offers nothing else."""
 
     name, dtype = "the fused step", np.float32
