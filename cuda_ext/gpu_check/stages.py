@@ -67,7 +67,7 @@ _KEPT += ("received_bytes",)
 # of the node in a rehearsal, and the steps that are taken there
 REHEARSED, FEW = 2, 8
 LAWS = ("test_laws.py",)
-STEPS = tuple(f"test_{name}.py" for name in ("ten_steps", "instances", "rows", "device_training", "passes"))
+STEPS = tuple(f"test_{name}.py" for name in ("ten_steps", "instances", "kernels", "device_training"))
 SMOKE = tuple(
     f"test_ten_steps.py::test_{name}"
     for name in (

@@ -324,7 +324,7 @@ def _transpose_of(loss: Callable[..., Tensor]) -> Callable[..., Tensor]:
         with torch.enable_grad():
             render = image.detach().requires_grad_()
             value = loss(render, target, *args, **kwargs)
-        return torch.autograd.grad(value, render, torch.as_tensor(v).to(value))[0]
+        return torch.autograd.grad(value, render, torch.as_tensor(v, dtype=value.dtype, device=value.device))[0]
 
     return transpose
 

@@ -48,7 +48,7 @@ from pop_ref.tiles import tile_lists
 STAGE_MODULES = (
     "activations", "covariance", "harmonics", "camera", "projection", "footprint", "tiles", "alpha", "pixel",
     "compositing", "dominance", "margins", "ssim", "losses", "polarization", "regularizers", "appearance",
-    "refinement", "density_config", "density_rows", "density", "optimizer", "training", "methods",
+    "refinement", "density_rows", "density", "optimizer", "training", "methods",
     "short_training", "contributions", "sensitivity", "fisher", "chord", "selection", "taming", "mini_splatting",
     "tight_tiles",
 )  # fmt: skip

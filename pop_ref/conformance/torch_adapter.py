@@ -197,7 +197,8 @@ class TorchAdapter(Adapter):
         function = self._stage(name)
         if function is None:
             raise LookupError(f"{self.name} has no stage function {name}")
-        own = sys.modules.get(function.__module__)
+        # the types of the function that a decorator has wrapped are those that it takes
+        own = sys.modules.get(inspect.unwrap(function).__module__)
 
         def with_arrays(*args: Any, **kwargs: Any) -> Any:
             if any(isinstance(a, Profile) and not self._implements(a) for a in (*args, *kwargs.values())):

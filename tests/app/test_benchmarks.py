@@ -203,7 +203,7 @@ def counting() -> int:
 def test_busy_processes_end_with_their_block_and_with_who_started_them(
     script: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    busy = script("busy")
+    busy = script("processes")
     alone = subprocess.Popen([sys.executable, "-S", "-c", busy.LOOP, "0"])
     try:
         assert alone.wait(timeout=60) == 0

@@ -200,7 +200,7 @@ def test_building_cuda_says_what_is_missing_first_and_the_compiler_s_words_apart
     pop: Pop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     error = BuildError("compiling the CUDA extension failed; nvcc said:\nerror: expected a ;")
-    monkeypatch.setattr("pop_fast.cli.build.build", raising(error))
+    monkeypatch.setattr("pop_fast.cli.build.build_cuda", raising(error))
     outcome = pop("build-cuda")
     assert outcome.status == 2
     assert outcome.err.strip() == "pop: error: compiling the CUDA extension failed; nvcc said:"
@@ -210,10 +210,10 @@ def test_building_cuda_says_what_is_missing_first_and_the_compiler_s_words_apart
 def test_a_fault_of_the_program_keeps_its_traceback_and_ctrl_c_anywhere_exits_with_130(
     pop: Pop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pop_fast.view.report.page.write_report", raising(ZeroDivisionError("a bug")))
+    monkeypatch.setattr("pop_fast.view.report.source.write_report", raising(ZeroDivisionError("a bug")))
     with pytest.raises(ZeroDivisionError):
         pop("report", ".")
-    monkeypatch.setattr("pop_fast.view.report.page.write_report", raising(KeyboardInterrupt()))
+    monkeypatch.setattr("pop_fast.view.report.source.write_report", raising(KeyboardInterrupt()))
     outcome = pop("report", ".")
     assert (outcome.status, outcome.err.strip()) == (130, "pop: interrupted")
 
@@ -237,7 +237,7 @@ def test_results_are_complete_before_the_report_and_whatever_becomes_of_it(
         raise fault
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pop_fast.view.report.page.write_report", broken)
+        patch.setattr("pop_fast.view.report.source.write_report", broken)
         outcome = pop("train", shared_capture, "--out", folder, *TRAIN)
     assert {"ckpts/ckpt_29_rank0.pt", "ply/point_cloud_29.ply", STATS, "cfg.json"} <= set(found)
     assert outcome.status == status

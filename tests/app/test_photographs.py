@@ -524,7 +524,7 @@ def test_few_photographs_are_all_matched_and_many_with_their_neighbours() -> Non
 def known(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cameras of the first four photographs, without a search for them."""
     monkeypatch.setattr(
-        sfm, "_find_cameras", lambda job, *_: make_model(job.names[:4], ring(len(job.names[:4])), [camera()])
+        sfm, "find_cameras", lambda job, *_: make_model(job.names[:4], ring(len(job.names[:4])), [camera()])
     )
 
 
@@ -590,13 +590,13 @@ def test_folders_called_images_and_subfolders_alone_are_loaded(known: None, tmp_
 
 def test_the_search_for_cameras_is_told_apart_from_loading(known: None, pop: Pop, tmp_path: Path, monkeypatch) -> None:
     fill(tmp_path / "photos", *(f"{i}.png" for i in range(5)))
-    searched = sfm._find_cameras
+    searched = sfm.find_cameras
 
     def slowly(*given: Any) -> Any:
         time.sleep(1.0)
         return searched(*given)
 
-    monkeypatch.setattr(sfm, "_find_cameras", slowly)
+    monkeypatch.setattr(sfm, "find_cameras", slowly)
     done = pop.done("train", tmp_path / "photos", "--out", tmp_path / "out", "--max-steps", "2", *TRAIN, "--skip-sizes")
     lines = done.out.splitlines()
     assert lines[0] in ("cameras found in 1 s", "cameras found in 2 s", "cameras found in 3 s")

@@ -45,7 +45,7 @@ from pop_fast.view.report.source import read_result, running_mean, thin_out
 from tests.app.browser import browser
 from tests.app.conftest import TRAIN, TRAIN_AND_CHECK, Pop
 from tests.app.damage import says
-from tests.app.test_paths import ring
+from tests.app.test_paths import around
 from tests.app.tiny import tiny_capture
 
 
@@ -246,8 +246,8 @@ def test_only_gaussians_nearer_than_half_the_way_to_the_nearest_points_are_near(
     params = {"means": torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [5.0, 0.0, 1.9], [0.0, 0.0, 2.1]])}
     assert nearer_than(params, camera(), 2.0)["means"][:, 2].tolist() == [1.0, pytest.approx(1.9)]
     # neighbours in a ring of twelve are thirty degrees apart
-    assert neighbour_degrees(ring(12, height=0.0)) == pytest.approx(30.0)
-    assert neighbour_degrees(ring(1)) is None
+    assert neighbour_degrees(around(np.arange(0.0, 360.0, 30.0), 0.0)) == pytest.approx(30.0)
+    assert neighbour_degrees(around(np.zeros(1), 0.0)) is None
 
 
 def test_a_photograph_of_twice_the_light_is_one_stop_brighter() -> None:

@@ -216,7 +216,7 @@ EVERYWHERE = [
     *(pytest.param(compiled_losses, name, id=f"compiled {name}", marks=COMPILED) for name in PADDED),
 ]
 # units of rounding that value and gradient of a term may need: twice the worst that 3,000 random cases of the strategy
-# below did, of torch and of the compiled stage alike; one unit is what `loss_magnitudes` bounds
+# below did, of torch and of the compiled stage alike; one unit is what `magnitudes` bounds
 UNITS = {"l1": (2.5, 2.0), "l2": (2.5, 2.5), "d_ssim": (1.0, 0.5)}
 # what an objective is mixed of
 TERMS = {

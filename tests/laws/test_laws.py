@@ -12,7 +12,7 @@ from tests.judged import (  # noqa: E402
     LAW_MODULES,
     judge_own_backends,
     law_classes,
-    poisoned_allocations,  # noqa: E402  asserts must be rewritten first
+    poisoned_allocations,
 )
 
 globals().update(law_classes(LAW_MODULES))

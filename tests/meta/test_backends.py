@@ -401,7 +401,7 @@ def test_what_the_compiled_backend_has_of_its_own_is_judged(name: str) -> None:
     assert all("compiled" in backend._stage(stage).__module__ for stage in own[:-1])
 
 
-@pytest.mark.parametrize("name", ["compiled32", "mirror32"])
+@pytest.mark.parametrize("name", ["compiled32"])
 def test_an_engines_own_adam_moves_what_strategies_edit(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     backend = _here(name)
     law = law_named("test_strategies:a_training_by_gsplat_is_the_oracles_at_every_step")
@@ -441,7 +441,7 @@ def test_a_rasterizer_that_only_draws_is_judged_by_its_images(rasterization: Cal
     assert len(of_gradients) > 15
     assert all(capabilities.GRADIENTS in missing(backend, stated.needs) for stated in of_gradients)
     # the laws of the signature compare its images all the same
-    cameras = law_named("test_signature_cameras:several_cameras_in_one_call_see_what_each_sees_alone")
+    cameras = law_named("test_signature_arguments:several_cameras_in_one_call_see_what_each_sees_alone")
     assert not missing(backend, cameras.needs)
     assert obeys(cameras, backend) is None
 
@@ -519,7 +519,7 @@ DEFECTS: dict[str, Callable[..., Any]] = {
     "an assertion, and a statement with backgrounds": _refuses_packed_by(_asserts, _states),
     "a kernel that fails": _refuses_packed(lambda: _raises(RuntimeError("illegal memory access"))),
 }
-PACKED_LAW = "test_signature_cameras:packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same"
+PACKED_LAW = "test_signature_arguments:packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same"
 
 
 @pytest.mark.parametrize("words", REFUSALS)
@@ -533,7 +533,7 @@ def test_a_rasterizer_with_fewer_arguments_than_gsplats_is_judged_by_those_it_ha
     backend = TorchAdapter("short", without_packed, dtype="float32")
     for path in (
         "test_agreement:the_image_is_one_of_the_oracles_outcomes",
-        "test_signature_cameras:several_cameras_in_one_call_see_what_each_sees_alone",
+        "test_signature_arguments:several_cameras_in_one_call_see_what_each_sees_alone",
     ):
         assert not missing(backend, law_named(path).needs)
         assert obeys(law_named(path), backend, 5) is None

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from pop_ref import INRIA, PAPER, PROFILES, Camera, Gaussians, Profile, margins, render
 from pop_ref.alpha import sigma_at_pixel
 from pop_ref.ambiguities import AMBIGUITIES, Ambiguity
-from pop_ref.conformance import thresholds
+from pop_ref.conformance import thresholds as threshold_strategies
 from pop_ref.conformance.error_bounds import REACH, pixel_error_bounds
 from pop_ref.conformance.scenes import Scene, rounded_to
 from pop_ref.conformance.strategies import scenes
@@ -387,12 +387,12 @@ COUNTED = {"D2": ("D2", "D3", "D5"), "D3": ("D2", "D3", "D5")}
 TRIED = settings(max_examples=25, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
 
 
-@pytest.mark.parametrize("label", sorted(thresholds.AIMS))
+@pytest.mark.parametrize("label", sorted(threshold_strategies.AIMS))
 def test_an_aimed_scene_has_the_doubt_that_it_aims_at(label: str) -> None:
     hits = []
 
     @TRIED
-    @given(scene=thresholds.AIMS[label]())
+    @given(scene=threshold_strategies.AIMS[label]())
     def count(scene: Scene) -> None:
         near_threshold = _margins(rounded_to(scene, np.float32)).near_threshold(1e-4)
         hits.append(any(close.decision in COUNTED.get(label, (label,)) for close in near_threshold))
@@ -426,7 +426,7 @@ def test_error_bounds_and_margins_agree_on_what_is_near_a_threshold_in_plain_sce
 @pytest.mark.parametrize("label", ["D5", "D6", "D7", "D8"])
 def test_error_bounds_mark_all_that_margins_call_close_in_aimed_scenes(label: str) -> None:
     @TRIED
-    @given(scene=thresholds.AIMS[label]().map(lambda s: rounded_to(s, np.float32)))
+    @given(scene=threshold_strategies.AIMS[label]().map(lambda s: rounded_to(s, np.float32)))
     def agree(scene: Scene) -> None:
         error_bounds = pixel_error_bounds(scene, np.float32)
         close = _margins(scene).pixels[label] <= TOLERANCE / 8.0
