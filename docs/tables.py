@@ -304,6 +304,13 @@ def few_photographs() -> str:
     return str(script["table_of"](known, ("--depth-lambda 0.1", "--depth-lambda 0.01", "--method gsplat")))
 
 
+def kinds() -> str:
+    """Make the table of what reports say of captures whose faults are known, as benchmarks/kinds.py does."""
+    known = json.loads((RESULTS / "kinds.json").read_text(encoding="utf-8"))
+    made = str(runpy.run_path(str(ROOT / "benchmarks" / "kinds.py"))["table_of"](known))
+    return f"{made}\n\n{known['machine']['cpu']}, one thread, commit {known['machine']['commit']}."
+
+
 def estimates() -> str:
     """Make the table of what runs without a preset foretold and took, as benchmarks/estimates.py does."""
     known = json.loads((RESULTS / "estimates.json").read_text(encoding="utf-8"))
@@ -499,6 +506,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "differences": _of_runs("differences"),
     "few_photographs": few_photographs,
     "estimates": estimates,
+    "kinds": kinds,
     **{name: _of_runs(name) for name in ("fuzzed", "disturbed", "sanitized", "loads")},
     "blocks": blocks,
     "recipes": recipes,

@@ -374,3 +374,33 @@ def test_what_was_foretold_of_four_captures_came_within_thirty_percent() -> None
         for name, said in row["foretold"].items():
             assert said / 1.3 < row["came"][name] < 1.3 * said, (row, name)
     assert "What was foretold came within 30 % on the four captures" in (ROOT / "docs" / "guide.md").read_text()
+
+
+def test_reports_of_captures_with_known_faults_say_what_is_known_and_the_table_marks_those_that_do_not(
+    script: Any,
+) -> None:
+    kinds = script("kinds")
+    known = json.loads((BENCHMARKS / "results" / "kinds.json").read_text(encoding="utf-8"))
+    rows = {name: known[name] for name in kinds.KINDS if name in known}
+    # what moved in every photograph is shown to that photograph alone, by a floater
+    assert {name for name, row in rows.items() if kinds.wrong(kinds.KINDS[name], row)} == {"moved"}
+    assert kinds.table_of(known).count("not as it is") == 1
+    row = {**rows["room"], "verdict": {**rows["room"]["verdict"], "Exposure": ["look", "It drifts"]}}
+    assert kinds.wrong(kinds.KINDS["room"], row) == ["Exposure: look"]
+    assert kinds.wrong(kinds.KINDS["drift"], rows["room"]) == ["Exposure does not say 'Learned'"]
+    assert kinds.wrong(kinds.KINDS["room"], {"failed": "no cameras"}) == ["no cameras"]
+
+
+def test_a_made_photograph_shows_what_stands_nearest_at_its_brightness(script: Any) -> None:
+    kinds = script("kinds")
+    paints = np.full((12, 2048, 2048, 3), 128, np.uint8)
+    paints[3] = 255
+    view = kinds.look_at((0.0, -4.0, 0.0), (0.0, 0.0, 0.0))
+    far, near = kinds.Box((0, 2, 0), (8, 1, 8), 5), kinds.Box((0, 0, 0), (1, 1, 1), 1)
+    picture = kinds.rendered(kinds.Photograph(view, (far, near)), paints)
+    # the near box shows its side towards -y, number 2, by the paint after the next
+    side = round(255 * 0.7 ** (1 / 2.2))
+    assert picture[180, 240].tolist() == [side] * 3
+    assert picture[180, 60].max() < side
+    darker = kinds.rendered(kinds.Photograph(view, (far, near), stops=-1.0), paints)
+    assert darker[180, 240].tolist() == [round(255 * 0.35 ** (1 / 2.2))] * 3
