@@ -176,12 +176,12 @@ def test_the_signature_is_the_cpus():
 
 def test_the_laws_of_antialiased_mode_judge_every_kind_of_the_cuda_backend():
     backends = cuda_backends("cpu", "cuda")
-    assert {backends.name for backend in backends} == {
+    assert {backend.name for backend in backends} == {
         "cuda32-pixel_parallel",
         "cuda32-gaussian_parallel",
         "cuda32-atomics",
     }
-    assert all(backends.has(need) for backend in backends for need in (ANTIALIASING, PROFILES))
+    assert all(backend.has(need) for backend in backends for need in (ANTIALIASING, PROFILES))
 
 
 def test_spills_and_registers_are_read_from_the_compilers_words():
