@@ -761,6 +761,7 @@ def test_rounds_that_are_added_to_a_workflow_do_its_merge_again_and_divide_and_t
 
 
 @with_snakemake
+@pytest.mark.processes
 def test_the_workflow_reads_the_slurm_profile(begun, tmp_path):
     pytest.importorskip("snakemake_executor_plugin_slurm", reason="snakemake-executor-plugin-slurm is not installed")
     assert counted(workflow(begun, tmp_path, jobs.profile_folder("slurm"))) == {**TRAININGS, "merge": 1}
