@@ -97,6 +97,7 @@ class Capture:
             loaded with `normalize=False`. float64 [4, 4]
         notes: what was skipped, chosen or made up while loading, one line each.
         sfm_seconds: how long its cameras were searched for, where they were not there before; else None.
+        unplaced: how many photographs of its folder have no camera, where a COLMAP model lists the cameras.
     """
 
     name: str
@@ -107,6 +108,7 @@ class Capture:
     world_transform: np.ndarray = field(default_factory=lambda: np.eye(4))
     notes: tuple[str, ...] = ()
     sfm_seconds: float | None = None
+    unplaced: int = 0
 
     def __post_init__(self) -> None:
         if len(self.views) < 2:
@@ -214,6 +216,7 @@ class Listing:
     # the training frame, where that is decided already; None normalizes. float64 [4, 4]
     transform: np.ndarray | None = None
     sfm_seconds: float | None = None  # how long the cameras were searched for, where that was done now
+    unplaced: int = 0  # photographs of the folder that have no camera
 
 
 # of a point from the middle of all, times the median camera distance
@@ -288,11 +291,21 @@ _MOST_CAMERAS: Final = 0.8
 
 
 def look_at_one_point(viewmats: np.ndarray) -> bool:
-    """Tell whether four of five cameras look at `focus_point`, as those do that went round a subject. [V, 4, 4]"""
+    """Tell whether four of five cameras look at `focus_point`, as those do that went round a subject. [V, 4, 4]
+
+    Those that walk towards a point look at it too, and are told apart: they are spread more along their mean direction
+    from it (standard deviation) than across (root of the mean square). Of nine captures round a subject or in a room
+    that quotient is up to 0.37, of a walk down a lane 2.6.
+    """
     rays = focus_point(viewmats) - camera_centers(viewmats)
-    along = np.einsum("mj,mj->m", rays, viewmats[:, 2, :3])
-    cosines = along / np.maximum(np.linalg.norm(rays, axis=1), 1e-12)
-    return bool(np.mean(cosines >= np.cos(_LOOKS_AT)) >= _MOST_CAMERAS)
+    distances = np.maximum(np.linalg.norm(rays, axis=1), 1e-12)
+    cosines = np.einsum("mj,mj->m", rays, viewmats[:, 2, :3]) / distances
+    if np.mean(cosines >= np.cos(_LOOKS_AT)) < _MOST_CAMERAS:
+        return False
+    mean = (rays / distances[:, None]).mean(axis=0)
+    along = rays @ (mean / max(float(np.linalg.norm(mean)), 1e-12))
+    across = np.sqrt(np.maximum(distances**2 - along**2, 0.0).mean())
+    return bool(np.std(along) <= across or len(rays) == 1)
 
 
 # degrees between neighbouring cameras from which what lies between them is guessed

@@ -65,16 +65,16 @@ def about_other_models(root: Path, models: Sequence[tuple[Path, int]]) -> list[s
     ]
 
 
-def about_unplaced(folder: Path, shots: Sequence[PosedImage]) -> list[str]:
-    """Tell which photographs of a folder have no camera among the shots that the model lists."""
+def about_unplaced(folder: Path, shots: Sequence[PosedImage]) -> tuple[int, list[str]]:
+    """Count the photographs of a folder that have no camera among the shots that the model lists, and tell which."""
     # by stem too, because a photograph may have been converted since the model was made
     placed = {name for shot in shots for name in (shot.file, splitext(shot.file)[0])}
     names = [path.relative_to(folder).as_posix() for path in photographs(folder)]
     left = [name for name in names if not placed & {name, splitext(name)[0]}]
     if not left:
-        return []
+        return 0, []
     more = f" and {len(left) - _NAMED} more" if len(left) > _NAMED else ""
-    return [
+    return len(left), [
         f"{len(names) - len(left)} of {len(names)} photographs in {folder} are placed; the model has no camera for "
         f"{', '.join(left[:_NAMED])}{more}"
     ]
@@ -254,8 +254,9 @@ def _of_model(root: Path, models: Sequence[tuple[Path, int]], images: str | None
     if len(listed) < 2:
         return Listing(root, model, listed, cloud, "COLMAP model")
     shots = turned_upright(root, beside_the_model(root, listed, images), model)
-    notes = about_other_models(root, models) + about_unplaced(root / (images or shots[0].folder), shots)
-    return Listing(root, model, shots, cloud, "COLMAP model", notes)
+    unplaced, which = about_unplaced(root / (images or shots[0].folder), shots)
+    notes = about_other_models(root, models) + which
+    return Listing(root, model, shots, cloud, "COLMAP model", notes, unplaced=unplaced)
 
 
 def beside_the_model(root: Path, shots: list[PosedImage], images: str | None) -> list[PosedImage]:
@@ -338,8 +339,8 @@ def _assemble(root: Path, listing: Listing, views: list[View], normalize: bool, 
     except CaptureError as error:
         raise CaptureError(f"{listing.path}: {error}") from error
     name = root.resolve().name
-    points_of = (cloud.xyz, cloud.rgb)
-    return Capture(name, tuple(views), *points_of, source, transform, tuple(notes), listing.sfm_seconds)
+    found = (listing.sfm_seconds, listing.unplaced)
+    return Capture(name, tuple(views), cloud.xyz, cloud.rgb, source, transform, tuple(notes), *found)
 
 
 _ROUNDS = 20

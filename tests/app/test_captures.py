@@ -318,6 +318,7 @@ def test_photographs_without_a_camera_are_told(tmp_path: Path, folder: str) -> N
         shutil.rmtree(root / "images")
     (note,) = load_capture(root).notes
     assert note.startswith(f"3 of 5 photographs in {root / folder} are placed")
+    assert load_capture(root).unplaced == 2
     assert note.endswith("the model has no camera for 9.png, left/0.png")
 
 

@@ -118,6 +118,19 @@ def test_an_orbit_of_a_walk_or_a_room_follows_the_cameras(turn: float) -> None:
     assert gaze.min() > np.cos(np.radians(40.0))
 
 
+def test_an_orbit_of_a_walk_towards_what_it_looks_at_follows_the_cameras() -> None:
+    along = np.linspace(0.0, 6.0, 30)
+    centers = np.stack([0.35 * np.sin(3.0 * along), along, np.zeros(30)], axis=1)
+    towards = np.stack([-0.6 * centers[:, 0], along + 4.0, np.full(30, -0.4)], axis=1)
+    cameras = np.concatenate([look_at(a[None], b, UP) for a, b in zip(centers, towards, strict=True)])
+    assert not look_at_one_point(cameras)
+    np.testing.assert_allclose(orbit(cameras, 60)[[0, -1]], cameras[[0, -1]], atol=1e-9)
+    # a subject from near and from far is still gone round
+    near_and_far = ring(n=24)
+    near_and_far[::2, :3, 3] *= 1.7
+    assert look_at_one_point(near_and_far)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_cameras_that_shake_still_look_at_one_point(seed: int) -> None:
     shaken = ring(n=24)

@@ -87,6 +87,8 @@ class Checks:
     # whether the run learned each training photograph's exposure, with which those views are measured; `stops`
     # are without
     exposures_learned: bool = False
+    given: int | None = None  # photographs that the capture has, with those that have no camera
+    placed: int | None = None  # those that have one; None of both where an older version has measured
 
     @property
     def judged_psnr(self) -> float | None:
@@ -148,6 +150,8 @@ def write_checks(
         misfits={view.name: misfit_share(view, fitted[view.name]) for view in some},
         steps=step + 1,
         exposures_learned=exposures,
+        given=len(capture.views) + capture.unplaced,
+        placed=len(capture.views),
     )
     text = json.dumps(asdict(checks), indent=2) + "\n"
     target = folder / "report_data" / f"checks_step{step}.json"

@@ -34,6 +34,7 @@ _FITS: Final = 22.0
 _FITS_BADLY: Final = 19.0
 _PARTS: Final = 0.006  # of a training view, on average: what does not fit where the rest does
 _EPOCHS: Final = 30  # how often each photograph is to be seen
+_LOST: Final = 0.1  # of the photographs, without a camera
 
 _MORE_STEPS: Final = ("train", "DATA", "--minutes", "240")
 
@@ -209,21 +210,30 @@ def _overfitting(checks: Checks, fewer: float | None) -> Iterator[Finding]:
 
 
 def _photographs(checks: Checks) -> Iterator[Finding]:
-    """Judge count and spacing against the gap that was found: what leaves a wide one is not enough."""
+    """Judge count and spacing against the gap that was found: what leaves a wide one is not enough.
+
+    Photographs without a camera are none, and are said where they are a tenth of those that were given.
+    """
     n, apart, gap = checks.photographs, checks.neighbour_degrees, _gap(checks)
     spacing = "" if apart is None else f", neighbours {apart:.1f} degrees apart as the subject sees them (median)"
     few, far = n < FEW, apart is not None and apart > FAR_APART
     missing = gap >= _OVERFITTED
+    given, placed = checks.given or n, checks.placed or n
+    kind: Kind
+    next_: tuple[str, ...]
+    lost = given - placed >= _LOST * given
+    found = f"Cameras were found for {placed} of {given} photographs. " if lost else ""
     if not few and not far and not missing:
-        yield Finding("good", "Photographs", f"{n} trained on{spacing}: enough.")
+        kind, next_ = ("look", ("data", "check", "DATA")) if lost else ("good", ())
+        yield Finding(kind, "Photographs", f"{found}{n} trained on{spacing}: enough.", next_)
         return
     close = _is_close(checks)
     why = "few" if few else "far apart" if far else ""
     why = why or f"{'not all that' if close else 'not enough for what'} this subject takes, as the {gap:.1f} dB show"
-    kind: Kind = "look"
+    kind = "look"
     if gap >= _SOME_OVERFITTING and not close:
         kind, why = "bad", f"too {why}" if few or far else why
-    text = f"{n} trained on{spacing}: {why}. Photographs between these would help most."
+    text = f"{found}{n} trained on{spacing}: {why}. Photographs between these would help most."
     yield Finding(kind, "Photographs", text, ("data", "check", "DATA"))
 
 
