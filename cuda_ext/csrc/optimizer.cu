@@ -188,8 +188,9 @@ template <int DEGREE, bool VIEWS>
 __device__ __forceinline__ void update_short_rows(const UpdateArrays& a, int first, int rows,
                                                   const Staged<DEGREE>& staged) {
     const int lane = threadIdx.x & (WARP - 1);
-    // the groups' steps differ in their rates alone
+    // the groups' steps differ in their rates alone, but for opacities, which a rule may leave as they are
     AdamStep<float> step = adam_step_of(a, 0);
+    const bool opacities_stay = __ldg(&a.constants->adam[G_OPACITIES].beta1_rest) == 0.0f;
     float rates[G_SHN];
     bool pieces = rows == WARP;
 #pragma unroll
@@ -201,6 +202,7 @@ __device__ __forceinline__ void update_short_rows(const UpdateArrays& a, int fir
 #pragma unroll
         for (int group = 0; group < G_SHN; ++group) {
             step.rate = rates[group];
+            if (group == G_OPACITIES && opacities_stay) continue;
 #pragma unroll 1
             for (int at = lane; at < rows * row_floats(group); at += WARP) {
                 const size_t place = size_t(first) * row_floats(group) + at;
@@ -222,7 +224,7 @@ __device__ __forceinline__ void update_short_rows(const UpdateArrays& a, int fir
 #pragma unroll
     for (int group = 0; group < G_SHN; ++group) {
         step.rate = rates[group];
-        if (lane >= WARP / 4 * row_floats(group)) continue;
+        if (lane >= WARP / 4 * row_floats(group) || (group == G_OPACITIES && opacities_stay)) continue;
         const size_t place = size_t(first) * row_floats(group) + 4 * lane;
         float4 g = reinterpret_cast<const float4*>(staged.rows(group))[lane];
         if constexpr (VIEWS) g = with_views(a, a.groups[group].gradient + place, g);

@@ -36,6 +36,7 @@ from pop_fast.view.report.checks import (
     misfit_share,
     near_limit,
     nearer_than,
+    patch_share,
     read_checks,
     stops_between,
     write_checks,
@@ -274,6 +275,27 @@ def test_what_moved_is_told_where_the_rest_fits(share: float, rest: float, moved
     mask[16 : 16 + side, 64 : 64 + side] = False
     assert misfit_share(replace(view, mask=mask), photo / 255.0 + error) == 0.0
     assert misfit_share(replace(view, mask=np.zeros_like(mask)), photo / 255.0 + error) == 0.0
+
+
+@pytest.mark.parametrize("brighter", [0.0, 0.05, 0.4])
+def test_what_moved_over_detail_that_is_not_learned_is_told_by_its_colour(brighter: float) -> None:
+    generator = np.random.default_rng(4)
+    photo = generator.integers(60, 160, (144, 240, 3), np.uint8)
+    # every pixel is off, one way and the other in turn, and all of it by another exposure; a patch has 10 x 10 pixels
+    board = np.indices((144, 240)).sum(axis=0) % 2
+    error = np.where(board, 0.2, -0.2)[..., None] + np.full(3, brighter)
+    error[20:50, 100:120] += 0.1
+    view = View("v", photo, np.eye(4), np.eye(3))
+    render = photo / 255.0 + error
+    assert misfit_share(view, render) == 0.0
+    assert patch_share(view, render) == pytest.approx(6 / (14 * 24))
+    mask = np.ones((144, 240), bool)
+    mask[20:50, 100:120] = False
+    assert patch_share(replace(view, mask=mask), render) == 0.0
+    assert patch_share(replace(view, mask=np.zeros_like(mask)), render) == 0.0
+    # where every second patch is off by as much, nothing is learned yet
+    error[:, (np.arange(240) // 10) % 2 == 0] += 0.1
+    assert patch_share(view, photo / 255.0 + error) == 0.0
 
 
 def test_a_training_leaves_what_its_report_shows(shared_result: Path, shared_capture: Path) -> None:

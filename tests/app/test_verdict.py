@@ -74,6 +74,8 @@ def orbit(shares: list[float]) -> dict[str, float]:
         ("Floaters", {"floaters": ONE, "without_floaters": 28.0}, "look", "without them held-out views have 28.00"),
         ("Fit", {}, "good", "reach 31.00 dB"),
         ("Fit", {"misfits": {"a": 0.02, "b": 0.05}}, "look", "3.5 % of a photograph is far from its render"),
+        ("Fit", {"patches": {"a": 0.0, "b": 0.007}}, "good", "reach 31.00 dB"),
+        ("Fit", {"patches": {"a": 0.002, "b": 0.01}}, "look", "0.6 % of a photograph has another colour"),
         ("Fit", {"train_psnr": 21.0, "held_out_psnr": 19.0}, "look", "cameras that are wrong"),
         ("Fit", {"train_psnr": 18.09, "held_out_psnr": 17.0}, "bad", "contradict one another"),
         ("Fit", {"train_psnr": 18.09, "held_out_psnr": 17.0, "steps": 90}, "bad", "few steps"),

@@ -33,6 +33,7 @@ _WON: Final = 0.5  # dB, by scaling each render to its photograph's brightness
 _FITS: Final = 22.0
 _FITS_BADLY: Final = 19.0
 _PARTS: Final = 0.006  # of a training view, on average: what does not fit where the rest does
+_PARTS_BY_COLOUR: Final = 0.004  # the same of patches that have another mean colour
 _EPOCHS: Final = 30  # how often each photograph is to be seen
 _LOST: Final = 0.1  # of the photographs, without a camera
 
@@ -153,16 +154,22 @@ def _unfitting(checks: Checks) -> Iterator[Finding]:
 
 def _parts(checks: Checks, text: str) -> Finding:
     """Judge whether parts of the training views do not fit where the rest does."""
-    share = float(np.mean(list(checks.misfits.values()))) if checks.misfits else 0.0
-    if share < _PARTS:
-        return Finding("good", "Fit", f"They fit together: {text}.")
-    worst = max(checks.misfits, key=lambda name: checks.misfits[name])
+    shares, what = checks.misfits, "is far from its render where the rest is near"
+    if _mean(shares) < _PARTS:
+        shares, what = checks.patches, "has another colour than its render where the rest has the same"
+        if _mean(shares) < _PARTS_BY_COLOUR:
+            return Finding("good", "Fit", f"They fit together: {text}.")
+    worst = max(shares, key=lambda name: shares[name])
     why = (
-        f"But for parts they fit: {text}; {100.0 * share:.1f} % of a photograph is far from its render where the rest "
-        f"is near, most in {worst}, {100.0 * checks.misfits[worst]:.1f} %. Something moved, or mirrors what did. "
+        f"But for parts they fit: {text}; {100.0 * _mean(shares):.1f} % of a photograph {what}, most in {worst}, "
+        f"{100.0 * shares[worst]:.1f} %. Something moved, or mirrors what did. "
         "A mask leaves it out: masks/NAME.png for photograph NAME, black where it moved, white elsewhere."
     )
     return Finding("look", "Fit", why, ("data", "check", "DATA"))
+
+
+def _mean(by_view: Mapping[str, float]) -> float:
+    return float(np.mean(list(by_view.values()))) if by_view else 0.0
 
 
 def _too_short(checks: Checks) -> bool:
