@@ -553,12 +553,13 @@ _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("rows_counted_in_a_byte", "rows of a picture from 256 on are those from the first on again",
      _returned(_rows_counted_in_a_byte), "test_whole:tiles_of_a_number_beyond_16_bits_are_drawn"),
     ("too_many_intersections_draw_nothing", "views of more than 65,536 pairs of splat and tile stay empty (brush#192)",
-     _empty_beyond(2**16), "test_whole:tiles_of_a_number_beyond_16_bits_are_drawn"),
+     _empty_beyond(2**16), "test_scale:the_image_of_five_thousand_is_the_oracles"),
     ("pose_kept_with_its_tensor",
      "a camera that has been drawn from is kept with its tensor, and a step of an optimizer does not move it",
-     breaking(_pose_kept_with_its_tensor), "test_autograd:a_backward_pass_follows_its_own_forward_pass"),
+     breaking(_pose_kept_with_its_tensor),
+     "test_autograd:tensors_that_have_been_drawn_before_are_drawn_with_the_numbers_that_they_have_now"),
     ("cotangents_in_half_precision", "the gradient by the picture goes back in 16 bits (mixed precision)",
-     _cotangents_read(lambda v: v.half().to(v.dtype)), "test_agreement:gradients_are_the_oracles"),
+     _cotangents_read(lambda v: v.half().to(v.dtype)), "test_autograd:cotangents_are_read_to_their_last_digit"),
 )  # fmt: skip
 
 

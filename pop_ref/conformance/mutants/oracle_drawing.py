@@ -89,7 +89,7 @@ _LINES: Final[Lines] = {
         ("colour_of_exactly_zero_stays",
          "a colour of exactly 0 passes no gradient, so that black points never become lighter",
          "np.where(unclamped >= 0.0, v_colors[i], 0.0)", "np.where(unclamped > 0.0, v_colors[i], 0.0)",
-         "test_harmonics:a_clamped_colour_passes_no_gradient"),
+         "test_harmonics:a_colour_of_exactly_zero_learns"),
     ),
     "camera.py": (
         ("camera_in_world_axes", "the camera's centre is taken as -t instead of -R^T t",
@@ -138,7 +138,7 @@ _LINES: Final[Lines] = {
         ("centred_half_a_pixel_off",
          "where a profile centres the principal point, it is the last pixel's index halved (ndc2pix: gsplat PR#113)",
          "width / 2.0, height / 2.0", "(width - 1) / 2.0, (height - 1) / 2.0",
-         "test_agreement:project_means_is_the_oracles"),
+         "test_agreement:projection_jacobians_is_the_oracles"),
         ("frustum_margin_is_of_the_whole_width",
          "the frustum's horizontal margin is a share of the whole width, not of its half (limits as in gsplat PR#305)",
          "margin_x = profile.frustum_margin * 0.5 * width / fx", "margin_x = profile.frustum_margin * width / fx",
@@ -348,7 +348,7 @@ _LINES: Final[Lines] = {
         ("fisher_at_the_papers_ceiling", "Fisher blocks have the paper's alpha ceiling, whatever the profile's is",
          "dsigma, _ = alpha_from_sigma_vjp(sigma, rows.opacities[i], 1.0, profile)",
          "dsigma, _ = alpha_from_sigma_vjp(sigma, rows.opacities[i], 1.0)",
-         "test_agreement:screen_moments_is_the_oracles"),
+         "test_contributions:screen_moments_of_inrias_profile_are_the_oracles"),
     ),
     "chord.py": (
         ("near_end_of_the_chord", "a ray's point is where it enters the ellipsoid, not the middle of the chord",
@@ -416,7 +416,7 @@ _LINES: Final[Lines] = {
          "only quaternions longer than 1 are normalised (a place without normalisation: graphdeco#651)",
          "units[i] = quats[i] / math.hypot(*quats[i].tolist())",
          "units[i] = quats[i] / max(1.0, math.hypot(*quats[i].tolist()))",
-         "test_agreement:unit_quats_from_quats_is_the_oracles"),
+         "test_agreement:unit_quats_from_quats_vjp_is_the_transpose"),
     ),
     "render.py": (
         ("loss_of_alpha_lost_beside_expected_depth",
@@ -430,11 +430,11 @@ _LINES: Final[Lines] = {
          "depth that is drawn beside colours has no gradient by the centres' depths",
          'v_depths=None if render_mode == "RGB" else v.v_colors[:, -1]',
          'v_depths=None if render_mode.startswith("RGB") else v.v_colors[:, -1]',
-         "test_agreement:gradients_are_the_oracles"),
+         "test_signature_arguments:the_accumulated_depth_is_the_oracles_alone_and_behind_colours"),
         ("square_culls_by_the_usual_tiles",
          "square extents are culled by the profile's grid where tiles of another size are asked for",
          "return replace(profile, tile_size=size), size", "return profile, size",
-         "test_agreement:the_image_is_one_of_the_oracles_outcomes"),
+         "test_whole:square_extents_are_culled_by_tiles_of_the_size_that_is_asked_for"),
     ),
 }  # fmt: skip
 

@@ -56,7 +56,7 @@ _LINES: Final[Lines] = {
          "test_agreement:ssim_vjp_is_the_oracles"),
         ("nothing_to_compare_is_all_wrong", "where a mask keeps no window the similarity is 0, and the loss 1",
          "if np.any(kept) else 1.0", "if np.any(kept) else 0.0",
-         "test_losses:the_dissimilarity_of_what_a_mask_keeps_is_the_oracles"),
+         "test_losses:the_objectives_with_every_option_are_the_oracles"),
     ),
     "polarization.py": (
         ("prior_over_all", "both sums of the prior are divided by N instead of their own number",
@@ -347,7 +347,7 @@ _LINES: Final[Lines] = {
         ("coincident_points_are_smaller", "the least squared distance of points bounds the distance itself",
          "0.5 * math.log(max(mean, _LEAST_SQUARED_DISTANCE))",
          "math.log(max(math.sqrt(mean), _LEAST_SQUARED_DISTANCE))",
-         "test_agreement:nearest_log_scales_is_the_oracles"),
+         "test_selection:a_point_is_as_large_as_its_three_neighbours_are_far"),
     ),
     "methods.py": (
         ("prior_of_one_weight", "the weight of the prior is a setting that nothing reads",
@@ -581,7 +581,7 @@ _LINES: Final[Lines] = {
          "(a - 2.0 * b) / (2.0 * s)", "(a - b) / (2.0 * s)",
          "test_agreement:refined_viewmat_vjp_is_the_oracles"),
         ("small_turns_cancel",
-         "turns of a thousandth of a degree are reckoned by the formula of wide ones, of which rounding leaves nothing",
+         "turns of a millionth of a radian are reckoned by the formula of wide ones, of which rounding leaves little",
          "_SMALL = 1e-2", "_SMALL = 1e-16",
          "test_agreement:refined_viewmat_vjp_is_the_oracles"),
     ),

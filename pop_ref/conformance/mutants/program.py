@@ -287,7 +287,7 @@ _LINES: Final[Lines] = {
          "the revised opacity is the logit of 1 - sqrt(1 - o), which rounding makes infinite (gsplat's split)",
          'children["opacities"] = torch.log(-torch.expm1(log_left)) - log_left',
          'children["opacities"] = torch.logit(1.0 - torch.sqrt(1.0 - torch.sigmoid(children["opacities"])))',
-         "test_density:a_densification_step_is_the_oracles_under_every_reading"),
+         "test_density:the_revised_opacity_of_children_is_a_number_however_opaque_or_clear_their_parent_is"),
     ),
     "train/model.py": (
         ("adams_usual_eps", "eps is 1e-8, Adam's usual one: gradients under it take small steps",
@@ -371,7 +371,7 @@ _LINES: Final[Lines] = {
          "test_whole_steps:every_step_is_the_oracles_under_every_setting"),
         ("rounds_without_a_start_decay_too", "a method that prunes in no rounds has their decay from the first step on",
          "torch.where((steps >= start) & (start > 0), factor, 1.0)", "torch.where(steps >= start, factor, 1.0)",
-         "test_whole_steps:every_step_is_the_oracles_under_every_setting"),
+         "test_optimizer:every_other_rate_stays_as_it_is"),
     ),
     "stages/tiles.py": (
         ("ellipse_misses_its_tile",
@@ -425,7 +425,7 @@ _LINES: Final[Lines] = {
          "the test that leaves tiles out ends a column early; counting draws without it",
          "right, bottom = left + (tile_size - 1), top + (tile_size - 1)",
          "right, bottom = left + (tile_size - 2), top + (tile_size - 1)",
-         "test_agreement:the_image_is_one_of_the_oracles_outcomes"),
+         "test_agreement:the_image_that_training_draws_is_one_of_the_oracles_outcomes"),
     ),
     "stages/losses.py": (
         ("windows_of_the_corner", "whether a window of SSIM counts is read from its corner, not from its centre",
@@ -473,11 +473,11 @@ _LINES: Final[Lines] = {
          "test_agreement:gradients_under_inrias_ceiling_pass_through_it_as_the_oracles_do"),
         ("ceiling_if_all_are_opaque", "alphas are clamped only where every splat of the view can pass the ceiling",
          "bool((opacities > profile.alpha_ceiling).any())", "bool((opacities > profile.alpha_ceiling).all())",
-         "test_agreement:the_image_is_one_of_the_oracles_outcomes"),
+         "test_thresholds:at_the_alpha_ceiling_nothing_jumps"),
         ("dominant_places_begin_anew",
          "with every step through a list the places of dominant entries are counted from 0 again",
          "code.add_(float((first + start) // EIGHT * 2**EIGHT))", "code.add_(float(start // EIGHT * 2**EIGHT))",
-         "test_agreement:dominant_ids_are_the_oracles"),
+         "test_collected:pixels_that_a_mask_leaves_out_are_not_collected"),
     ),
     "stages/tile_groups.py": (
         ("lists_of_thirty_two", "a tile blends the first 32 entries of its list",
@@ -570,7 +570,7 @@ _LINES: Final[Lines] = {
          "a shorter schedule of Speedy-Splat leaves the steps of hard pruning where they were, after its end",
          'scaled_steps = (*InriaStrategy.scaled_steps, "soft_prune_iters", "hard_prune_iters")',
          'scaled_steps = (*InriaStrategy.scaled_steps, "soft_prune_iters")',
-         "test_strategies:every_methods_settings_are_its_recipes"),
+         "test_collected:a_shorter_schedule_changes_the_gaussians_less_often_and_resets_no_sooner"),
         ("taming_scores_a_clamped_picture",
          "Taming-3DGS compares a picture with its photograph after it has been clamped, as pictures are for a file",
          'photometric = photometric_3dgs(found.image, target, padding="same")',
@@ -643,7 +643,7 @@ _LINES: Final[Lines] = {
         ("common_turn_has_no_lever",
          "of a turn that all cameras share the shift that it causes at a camera's place is not taken out",
          "A[:, 3:, :3] = torch.linalg.cross(t[:, :, None].expand_as(R), R, dim=1)", "A[:, 3:, :3] = 0.0 * R",
-         "test_agreement:without_common_motion_is_the_oracles"),
+         "test_few_photographs:exposures_and_cameras_learn_as_the_oracles_do"),
     ),
     "density/protocol.py": (
         ("seen_along_one_axis", "since extents have two axes, one of them is enough to be seen (gsplat 1.5's radii)",
@@ -651,7 +651,7 @@ _LINES: Final[Lines] = {
          "test_strategies:a_training_by_pop_is_the_oracles_at_every_step"),
         ("visible_to_every_camera", "of several cameras all have to see a Gaussian for the prior over what is visible",
          'return visible_from_radii(info["radii"]).any(0)', 'return visible_from_radii(info["radii"]).all(0)',
-         "test_strategies:a_training_is_the_oracles_under_every_reading"),
+         "test_strategies:of_several_cameras_any_may_show_that_a_gaussian_is_important"),
     ),
     "stages/projection.py": (
         ("depth_clamped_not_slope", "the frustum clamp is of z, not of x / z (GaussianSplattingMlx PR#28)",
@@ -792,7 +792,7 @@ _LINES: Final[Lines] = {
          "a photograph whose mask keeps less than half of every coarse pixel's area is compared as a whole (masks of "
          "another size: LichtFeld-Studio PR#2129)",
          "        return shrunk(view, factor // 2)\n", "        mask = None\n",
-         "test_whole_steps:a_pixel_of_a_coarse_mask_counts_where_half_of_its_area_does"),
+         "test_whole_steps:a_thin_mask_keeps_a_photograph_from_being_so_coarse_that_nothing_counts"),
     ),
     "train/torch_stepper.py": (
         ("all_bands_from_the_first_step", "a step draws with all bands, also with those whose turn has not come",
@@ -835,7 +835,7 @@ _LINES: Final[Lines] = {
         ("depth_of_the_uncorrected_camera",
          "sparse points are seen from where the camera was before its correction, the picture from where it is",
          "samples = self._seen_from(index).depth_samples()", "samples = self._task.views[index].depth_samples()",
-         "test_whole_steps:every_step_is_the_oracles_with_terms_for_few_photographs"),
+         "test_whole_steps:every_step_sees_from_corrected_cameras"),
         ("photograph_over_the_first_background",
          "a photograph with transparency is laid over a background once and kept (an alpha that follows every step's: "
          "gsplat PR#573)",
@@ -895,7 +895,7 @@ _LINES: Final[Lines] = {
          "draws)",
          'return expose(image, self.params["exposures"][self._photo(index)])',
          'return expose(image, self.params["exposures"][self._photo(index)]).clamp(0.0, 1.0)',
-         "test_whole_steps:an_exposure_learns_to_be_that_of_its_photograph"),
+         "test_whole_steps:what_is_brighter_than_white_pulls_an_exposure_down"),
     ),
     "stages/splatting.py": (
         ("extents_of_the_uncompensated",
@@ -968,7 +968,7 @@ _LINES: Final[Lines] = {
          "test_whole_steps:what_a_method_prunes_by_is_of_all_photographs"),
         ("passes_see_uncorrected_cameras", "passes over photographs draw them from their cameras before any correction",
          "views = self.appearance.seen(self._train)", "views = self._train",
-         "test_whole_steps:what_a_method_prunes_by_is_of_all_photographs"),
+         "test_whole_steps:every_step_sees_from_corrected_cameras"),
     ),
     "train/presets.py": (
         ("always_valid_windows",
