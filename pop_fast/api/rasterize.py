@@ -134,6 +134,9 @@ def rasterization(
     # what gsplat's main branch means by None
     tile_size = 16 if tile_size is None else tile_size
     check_sizes(width, height, tile_size)
+    if chosen.extent == "square":
+        # its cull reads the grid from the profile (D3)
+        chosen = replace(chosen, tile_size=tile_size)
     checks = Checks(drawing, means.dtype)
     batch = checks.gaussians(means, quats, scales, opacities, covars)
     n_cameras = checks.cameras(viewmats, Ks, width, height, tile_size, batch)

@@ -33,7 +33,7 @@ class Ask:
         before: what else is done: "nothing", "no_grad" and "inference_mode" draw under torch's mode of that name first,
             "another" draws another scene between the forward and the backward pass, "twice" goes back twice, "present"
             leaves ones as gradients from before, "edited" changes the arguments in place between the passes,
-            "written" the outputs.
+            "written" the outputs, and "moved" draws the same tensors with other numbers first.
     """
 
     wanted: tuple[str, ...] = NAMES
@@ -178,6 +178,8 @@ def _differentiate(
             still = drawn()[0]
             # what is drawn after it is no matter of its
             other()
+    if ask.before == "moved":
+        _moved(laid, values, drawn)
     outputs: dict[str, Any] = dict(zip(("image", "alpha"), drawn(), strict=True))
     image = outputs["image"].detach().clone()
     if ask.before == "another":
@@ -195,6 +197,21 @@ def _differentiate(
         follows=(bool(outputs["image"].requires_grad), still is not None and bool(still.requires_grad)),
         image=(image, still),
     )
+
+
+def _moved(laid: dict[str, Laid], values: dict[str, Any], draw: Callable[[], Any]) -> None:
+    """Draw with other numbers in the same tensors, as they are between two steps of an optimizer, and put them back."""
+    with importlib.import_module("torch").no_grad():
+        for name, each in laid.items():
+            if name == "viewmat":
+                # a rotation stays one
+                each.view[..., :3, 3].add_(0.25)
+            else:
+                each.view.mul_(0.75)
+    draw()
+    with importlib.import_module("torch").no_grad():
+        for name, each in laid.items():
+            each.view.copy_(values[name])
 
 
 def _settings_of_torch() -> dict[str, Any]:

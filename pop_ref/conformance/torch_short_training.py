@@ -65,27 +65,49 @@ class Trainee:
             found.append(_array(run.appearance.params["exposures"]))
         return found
 
+    def corrected_steps(self, short: ShortTraining, corrections: np.ndarray) -> tuple[list[dict[str, Any]], np.ndarray]:
+        """Take steps with cameras that are corrected and stay so; return them, and the cameras from which they saw.
+
+        Args:
+            short: what is trained, from cameras that are not corrected.
+            corrections: of every camera, without a motion that all share. [V, 6]
+        """
+        run = self._run(short, refine_cameras=True, appearance_lr=AppearanceRates(cameras=0.0))
+        with self._torch.no_grad():
+            run.appearance.params["cameras"].copy_(self._torch.as_tensor(corrections))
+        taken = [self._taken(run, step) for step in range(short.steps)]
+        seen = run.appearance.seen(self._views_of(run))
+        return taken, np.stack([_array(view.viewmat[0]) for view in seen])
+
     def coarse_losses(self, short: ShortTraining, stops: tuple[int, ...]) -> list[float]:
         """Return the loss of every step where the first ones see their photographs shrunk: `coarse_stop_iters`."""
         run = self._run(short, coarse_stop_iters=stops)
         return [self._taken(run, step)["loss"] for step in range(short.steps)]
 
     def coarse_view(self, photo: np.ndarray, mask: np.ndarray | None, K: np.ndarray, factor: int) -> dict[str, Any]:
-        """Return photograph, mask and intrinsics of a view that is shrunk by a power of 2, as far as it is."""
+        """Return photograph, mask, intrinsics and opacity of a view that is shrunk by a power of 2, as far as it is.
+
+        Its opacity is the photograph's first channel.
+        """
         tensor, of = self._torch.as_tensor, importlib.import_module(f"{self._package}.train.views")
         view = importlib.import_module(f"{self._package}.train.views").ViewTensors(
             name="0", photo=tensor(photo), mask=None if mask is None else tensor(mask),
+            alpha=tensor(photo)[..., 0].contiguous(),
             viewmat=self._torch.eye(4, dtype=self._float)[None], K=tensor(K).to(self._float)[None],
         )  # fmt: skip
         small = of.shrunk(view, factor)
         kept = None if small.mask is None else _array(small.mask)
-        return {"photo": _array(small.photo), "mask": kept, "K": _array(small.K[0])}
+        return {"photo": _array(small.photo), "mask": kept, "K": _array(small.K[0]), "alpha": _array(small.alpha)}
 
     def whole_run(self, short: ShortTraining, folder: str) -> list[np.ndarray]:
         """Run to the end, with all that a run writes, and return the parameters."""
         run = self._run(short, folder)
         run.run()
         return [_array(run.params[key]) for key in KEYS]
+
+    def _views_of(self, run: Any) -> list[Any]:
+        of = self._module("train.views").ViewTensors.of
+        return [of(view, self._float) for view in run._capture.train_views(run.config.test_every)]
 
     def _step(self, run: Any, step: int) -> Any:
         # with the threads that a run has, on whose number the order of sums may depend
@@ -238,8 +260,7 @@ class Trainee:
 
     def scaled_settings(self, method: str, factor: float) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return a method's settings by name, and those of a schedule so many times as long."""
-        strategy = {"pop": "POPStrategy", "3dgs": "InriaStrategy"}[method]
-        made = getattr(self._module("density"), strategy)()
+        made = self._module("train.presets").METHODS[method].strategy()
         own, scaled = ({f.name: getattr(each, f.name) for f in fields(each)} for each in (made, made.scaled(factor)))
         return own, scaled
 

@@ -32,9 +32,10 @@ def _scene(backend):
     return seen, bounds, v_image * sure[..., None], v_T_final * sure
 
 
-def _assert_gradients(backend, ask, weight=1.0, plus=0.0):
-    """Hold the gradients of an ask to the oracle's; return what came of it."""
+def _assert_gradients(backend, ask, weight=1.0, plus=0.0, digits=1.0):
+    """Hold the gradients of an ask, of cotangents times `digits`, to the oracle's; return what came of it."""
     seen, bounds, v_image, v_T_final = _scene(backend)
+    v_image, v_T_final = digits * v_image, digits * v_T_final
     if ask.cotangent == "channels":
         v_image = np.repeat(v_image[..., :1], 3, axis=2)
     if ask.cotangent == "expanded":
@@ -84,6 +85,12 @@ def test_how_cotangents_lie_in_memory_changes_no_gradient(backend):
 
 
 @law("autograd", GRADIENTS, "differentiate")
+def test_cotangents_are_read_to_their_last_digit(backend):
+    # those of the other laws have so few digits that half precision holds them
+    _assert_gradients(backend, Ask(), digits=0.7)
+
+
+@law("autograd", GRADIENTS, "differentiate")
 def test_an_output_that_no_loss_reads_adds_nothing(backend):
     for output in ("image", "alpha"):
         _assert_gradients(backend, Ask(outputs=(output,), wanted=PARAMETERS))
@@ -112,6 +119,13 @@ def test_nothing_follows_where_no_argument_requires_a_gradient(backend):
 @law("autograd", GRADIENTS, "differentiate")
 def test_a_second_forward_pass_does_not_change_the_first_ones_gradients(backend):
     _assert_gradients(backend, Ask(before="another"))
+
+
+@law("autograd", GRADIENTS, "differentiate")
+def test_tensors_that_have_been_drawn_before_are_drawn_with_the_numbers_that_they_have_now(backend):
+    # an optimizer writes its steps into the tensors that it was given
+    plain, moved = (_assert_gradients(backend, Ask(before=before)).image[0] for before in ("nothing", "moved"))
+    assert_close("autograd.image", moved, plain, np.abs(plain) + 1.0, backend.dtype)
 
 
 @law("autograd", GRADIENTS, "differentiate")

@@ -16,6 +16,7 @@ from pop_ref.conformance.error_bounds import pixel_error_bounds
 from pop_ref.conformance.gradient_error_bounds import screened, sensitivity_error_bounds, weight_error_bounds
 from pop_ref.conformance.law import law
 from pop_ref.conformance.short_training import VIEWS, clear_watch, collected
+from pop_ref.conformance.strategy_script import METHODS
 from pop_ref.contributions import contributions
 from pop_ref.fisher import fisher_blocks, screen_moments
 from pop_ref.records import Camera
@@ -195,14 +196,24 @@ def test_every_epoch_shows_every_view_once_in_an_order_of_its_own(backend):
     assert backend.stage("view_order")(n, 4, n * epochs) != drawn
 
 
+def _scaled(steps, factor):
+    if isinstance(steps, tuple):
+        return tuple(_scaled(step, factor) for step in steps)
+    # neither -1, which is never, nor 0, the beginning, is a share of a schedule
+    return max(round(steps * factor), 1) if steps > 0 else steps
+
+
 @law("training", "scaled_settings")
 def test_a_shorter_schedule_changes_the_gaussians_less_often_and_resets_no_sooner(backend):
     recovery = ("reset_every", "pause_refine_after_reset", "prune_too_big_after")
-    for method in ("pop", "3dgs"):
+    for method in METHODS:
         for factor in (0.125, 0.5, 2.0):
             own, scaled = backend.stage("scaled_settings")(method, factor)
-            for name in ("refine_start_iter", "refine_stop_iter"):
-                assert scaled[name] == round(own[name] * factor), name
+            # whatever is the number of a step, or several of them
+            steps = {name for name in own if name.endswith(("_iter", "_iters"))}
+            assert steps >= {"refine_start_iter", "refine_stop_iter"}
+            for name in steps | {"round_steps", "round_decay_every", "means_rewind_to"}:
+                assert scaled[name] == _scaled(own[name], factor), f"{name} of {method} is {scaled[name]}"
             assert scaled["refine_every"] == max(round(own["refine_every"] * factor), min(100, own["refine_every"]))
             for name in recovery:
                 assert scaled[name] == max(round(own[name] * factor), own[name]), name

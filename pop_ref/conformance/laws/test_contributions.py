@@ -252,7 +252,20 @@ def test_screen_moments_are_the_oracles(backend, scene):
     _agree_on_moments(backend, screened(backend, scene))
 
 
-@law("fisher", "screen_moments", scene=scenes(profile=INRIA, size=plain_sizes(), max_gaussians=4, max_side=16))
+def _opaque():
+    """Return a scene whose front Gaussian is opaque over many pixels: its alpha is over every profile's ceiling."""
+    camera = Camera(np.eye(4), np.array([[4.0, 0, 2.5], [0, 8.0, 2.0], [0, 0, 1]]), 5, 4)
+    columns = [[[0.25, 0.0, 4.0], [0.0, 0.0, 5.0]], [[1.0, 0.0, 0.0, 0.0]] * 2, [[64.0] * 3, [1.0] * 3], [1.0, 0.5]]
+    return Scene(Gaussians(*map(np.array, columns), np.array([[[1.0, 0.5, 0.25]], [[-1.0, 0.5, 1.0]]])), camera,
+                 np.array([0.125, 0.25, 0.75]), INRIA)  # fmt: skip
+
+
+@law(
+    "fisher",
+    "screen_moments",
+    first=[{"scene": _opaque()}],
+    scene=scenes(profile=INRIA, size=plain_sizes(), max_gaussians=4, max_side=16),
+)
 def test_screen_moments_of_inrias_profile_are_the_oracles(backend, scene):
     _agree_on_moments(backend, screened(backend, scene))
 

@@ -92,6 +92,17 @@ def test_a_split_replaces_each_parent_by_two_smaller_children_drawn_from_it(back
             assert_same_bits(f"moments of {name}", moments[name][n_kept:], np.zeros((2 * n_split, *array.shape[1:])))
 
 
+@law("density", "split_rows")
+def test_the_revised_opacity_of_children_is_a_number_however_opaque_or_clear_their_parent_is(backend):
+    # 1 - sqrt(1 - o) is rounded to 0 or to 1 long before its logit is out of range
+    rows = tagged_rows(6)
+    rows.params["opacities"][:] = [-60.0, -40.0, -20.0, 20.0, 40.0, 60.0]
+    after = backend.stage("split_rows")(rows, np.ones(6, dtype=bool), np.zeros((2, 6, 3)), True)
+    log_left = -0.5 * np.logaddexp(0.0, rows.params["opacities"])
+    expected = np.tile(np.log(-np.expm1(log_left)) - log_left, 2)
+    assert_close("density.split", after.params["opacities"], expected, np.abs(expected) + 4.0, backend.dtype)
+
+
 @law("density", "reset_opacities", opacity=st.lists(opacities(), min_size=1, max_size=6))
 def test_a_reset_lowers_opacities_to_the_ceiling_and_forgets_their_moments_only(backend, opacity):
     rows = tagged_rows(len(opacity))
@@ -122,6 +133,8 @@ def test_new_gaussians_have_zero_moments(backend, n):
 @law(
     "density",
     "blur_set",
+    # a share of one and a half pixels: two are more
+    first=[{"counts": [1, 2, 3], "theta": 1 / 64, "min_pixels": 0.0, "kept": 96}],
     counts=counts,
     theta=st.sampled_from([1 / 64, 1 / 128, 1 / 32, 0.0]),
     min_pixels=st.sampled_from([0.0, 1.0, 2.5, 3.0, 8.0]),
@@ -217,12 +230,17 @@ def test_the_faint_are_pruned_and_later_the_far_too_large(backend, opacity, scen
     assert_same_bits("pruned at the threshold", pruned, [False, True, False])
 
 
+# every how many steps opacities are reset, whether at step 0, too, and how long nothing changes then; also from step 0
+# on, whether that is a reset or not
+_RESETS = ((0, False, 0), (0, True, 0), (3000, False, 0), (3000, True, 300), (3000, False, 900))
+
+
 @law("density", "densifies_at", "resets_at", step=st.integers(0, 170).map(lambda k: 100 * k), later=st.integers(-1, 1))
 def test_the_gaussians_change_every_hundred_steps_and_opacities_are_reset_where_that_is_asked_for(backend, step, later):
     # with what is drawn, both ends, which hardly anything drawn hits
     for at in (max(step + later, 0), 0, 500, 600, 14_900, 15_000):
         due = at % 100 == 0 and 500 < at < 15_000
-        for reset_every, at_zero, pause in ((0, False, 0), (0, True, 0), (3000, False, 0), (3000, True, 300)):
+        for reset_every, at_zero, pause in _RESETS:
             config = DensityConfig(reset_every=reset_every, reset_at_zero=at_zero, pause_refine_after_reset=pause)
             resets = reset_every > 0 and at % 3000 == 0 and at < 15_000 and (at > 0 or at_zero)
             assert backend.stage("densifies_at")(at, config) == (due and at % 3000 >= pause)

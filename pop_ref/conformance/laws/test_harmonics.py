@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 from hypothesis import strategies as st
 
@@ -126,6 +128,33 @@ def test_a_clamped_colour_passes_no_gradient(backend, sh, direction):
     v_sh, v_dirs = backend.stage("colors_from_sh_vjp")(sh, _row(backend, direction), 3, np.ones((1, 3)))
     assert_same_bits("v_sh", v_sh, np.zeros_like(v_sh))
     assert_same_bits("v_dirs", v_dirs, np.zeros_like(v_dirs))
+
+
+@law("harmonics", "colors_from_sh_vjp", "sh_basis")
+def test_a_colour_of_exactly_zero_learns(backend):
+    # as black points have it when a training begins: the derivative from above, or they would stay black
+    found = 0
+    for axis in np.eye(3):
+        basis = backend.stage("sh_basis")(axis[None], 3)[0]
+        for band in np.flatnonzero(basis):
+            for coefficient in _black(backend.dtype(basis[band])):
+                sh = np.zeros((1, 16, 3))
+                sh[0, band] = coefficient
+                v_sh, _ = backend.stage("colors_from_sh_vjp")(sh, axis[None], 3, np.ones((1, 3)))
+                assert_close("harmonics.values", v_sh[0], np.tile(basis[:, None], 3), 1.0, backend.dtype)
+                found += 1
+    # in single precision no coefficient does so along an axis
+    assert found or backend.dtype == np.float32, "no coefficient gives exactly 0"
+
+
+def _black(basis):
+    """Yield coefficients that give 0 with the offset, and nothing under it if the product is not rounded before."""
+    near = basis.dtype.type(-0.5) / basis
+    for _ in range(4):
+        exact = Fraction(float(basis)) * Fraction(float(near)) + Fraction(1, 2)
+        if basis * near + basis.dtype.type(0.5) == 0.0 and exact >= 0:
+            yield float(near)
+        near = np.nextafter(near, basis.dtype.type(0.0))
 
 
 @law("harmonics", "colors_from_sh_vjp", sh=arrays_of((1, 16, 3)), direction=directions)

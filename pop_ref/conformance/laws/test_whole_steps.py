@@ -8,7 +8,7 @@ first: a coarse pixel is the mean of the area that it covers, also where sizes d
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from tempfile import TemporaryDirectory
 
 import numpy as np
@@ -18,6 +18,7 @@ from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.law import law
 from pop_ref.conformance.short_training import ShortTraining, assert_steps
 from pop_ref.methods import KEYS, RECIPE_OF
+from pop_ref.refinement import without_common_motion
 from pop_ref.settings import LearningRates
 from pop_ref.short_training import Trained
 
@@ -57,7 +58,9 @@ def _assert_steps(backend, short):
 def test_every_step_is_the_oracles_under_every_setting(backend):
     # another Gaussian is important in either view
     window = replace(PRIOR, order=(0, 1), seed=1216, count=9)
-    for short in (PRIOR, window, ENTROPY, MASKED):
+    # visible Gaussians dominate no pixel
+    hidden = replace(MASKED, order=(0,), seed=40)
+    for short in (PRIOR, window, ENTROPY, MASKED, hidden):
         _assert_steps(backend, short)
 
 
@@ -120,6 +123,32 @@ def test_every_step_is_the_oracles_with_terms_for_few_photographs(backend):
             "pop", STILL, {**SHORT, **weights}, ORDER[:2], 34, sparse=18, masked=masked, scene_scale=scale
         )
         _assert_steps(backend, short)
+
+
+@law("training", "corrected_steps")
+def test_every_step_sees_from_corrected_cameras(backend):
+    # pictures, the depth of sparse points, and passes that prune
+    deep = ShortTraining("pop", STILL, {**SHORT, "depth_lambda": 0.5}, ORDER[:2], 40, sparse=18)
+    speedy = {**STILL, "hard_prune_iters": (0, 1), "hard_prune_share": 0.4, "soft_prune_iters": ()}
+    pruned = ShortTraining("speedy-splat", speedy, SHORT, (0, 1), 8, count=9, views=3)
+    for short in (deep, pruned):
+        viewmats = np.stack([camera.viewmat for camera in short.cameras])
+        corrections = without_common_motion(np.random.default_rng(5).normal(0.0, 0.03, (short.views, 6)), viewmats)
+        found, seen = backend.stage("corrected_steps")(short, corrections)
+        assert_steps(
+            backend, _From(**{f.name: getattr(short, f.name) for f in fields(short)}, corrected=seen), found, least=0.0
+        )
+
+
+@dataclass(frozen=True)
+class _From(ShortTraining):
+    """A short training whose cameras are elsewhere."""
+
+    corrected: np.ndarray | None = None
+
+    @functools.cached_property
+    def cameras(self):
+        return [replace(c, viewmat=v.astype(np.float64)) for c, v in zip(super().cameras, self.corrected, strict=True)]
 
 
 # scores of who goes and who stays are apart, and others would go by those of other photographs, bands or renders
@@ -188,6 +217,30 @@ def test_a_shrunk_photograph_has_the_exposure_of_its_photograph(backend):
     assert seen[0] == seen[1], f"photograph {seen[0]} was seen shrunk, and photograph {seen[1]} learned"
     # with as many places further on for each size, the last would be right by chance
     assert seen[0] < short.views - 1
+
+
+@law("training", "learned_exposures")
+def test_what_is_brighter_than_white_pulls_an_exposure_down(backend):
+    # a render is compared as it is, not as it would be written to a file
+    kinds = (_Bright, _Glaring)
+    learn = [backend.stage("learned_exposures")(kind("pop", STILL, SHORT, (0,), seed=22), 2.0**-6)[0] for kind in kinds]
+    up, down = int(learn[0][1, 0, 3] > learn[0][0, 0, 3]), int(learn[1][1, 0, 3] < learn[1][0, 0, 3])
+    # the order of the views is the same, so that the one that rose before grey ones falls
+    assert up == down, f"photograph {up} was seen, and its exposure rose"
+    fallen = learn[1][down, :, 3] - learn[1][1 - down, :, 3]
+    assert_close("steps.still", fallen, np.full(3, -(2.0**-6)), 1.0, backend.dtype)
+
+
+class _Glaring(ShortTraining):
+    """A short training of grey photographs, of which large Gaussians are much brighter and what is behind is darker."""
+
+    def photo(self, index):
+        return np.full_like(super().photo(index), 128)
+
+    @functools.cached_property
+    def params(self):
+        p = super().params
+        return {**p, "sh0": 0.0 * p["sh0"] + 8.0, "shN": 0.0 * p["shN"], "opacities": 0.0 * p["opacities"] + 2.0}
 
 
 class _Bright(ShortTraining):
@@ -315,11 +368,14 @@ def test_a_coarse_photograph_is_the_mean_over_areas_of_the_whole_one(backend, si
     photo, factor = _photo(size, seed), _factor(size, factor)
     found = backend.stage("coarse_view")(photo, None, _K(size), factor)
     rows, columns = _areas(size, factor)
-    expected = np.einsum("yh,xw,hwc->yxc", rows, columns, photo.astype(np.float64))
+    expected = np.einsum("yh,xw,hwc->yxc", rows, columns, photo.astype(np.float64), optimize=True)
     assert found["photo"].shape == expected.shape
     # as whole numbers
     off = np.max(np.abs(found["photo"] - expected))
     assert off <= 0.501, f"a pixel is off by {off} of 255"
+    # the opacity of a photograph with transparency is its mean, too
+    off = np.max(np.abs(found["alpha"].astype(np.float64) - expected[..., 0]))
+    assert off <= 0.501, f"an opacity is off by {off} of 255"
 
 
 @law("training", "coarse_view", first=first, size=sizes, factor=factors, seed=st.integers(0, 99))
@@ -346,6 +402,22 @@ def test_a_pixel_of_a_coarse_mask_counts_where_half_of_its_area_does(backend, si
     if all(side % factor == 0 for side in size):
         # here shares are exact
         assert np.array_equal(found, share >= 0.5)
+
+
+@law("training", "coarse_view", width=st.integers(1, 2), start=st.integers(8, 100))
+def test_a_thin_mask_keeps_a_photograph_from_being_so_coarse_that_nothing_counts(backend, width, start):
+    # a line of one pixel, or of two, is half of a coarse one only where that is no wider than two or four
+    size = (128, 128)
+    mask = np.zeros(size, dtype=bool)
+    mask[:, start : start + width] = True
+    found = backend.stage("coarse_view")(_photo(size, 0), mask, _K(size), 4)
+    for factor in (4, 2, 1):
+        rows, columns = _areas(size, factor)
+        kept = rows @ mask.astype(np.float64) @ columns.T >= 0.5
+        if np.any(kept):
+            break
+    assert found["photo"].shape[:2] == kept.shape, f"{found['photo'].shape[:2]} px, expected {kept.shape}"
+    assert np.array_equal(found["mask"], kept)
 
 
 class _Stripes(ShortTraining):

@@ -472,6 +472,43 @@ def _packed_backgrounds_stay(given: Given) -> Given:
     return {"backgrounds": backwards(behind, lambda gradient: gradient * 0.0)}
 
 
+def _without_backgrounds_for_harmonics(given: Given) -> Given:
+    return {} if plain(given) else {"backgrounds": None}
+
+
+def _backgrounds_stay_beside_depth(given: Given) -> Given:
+    behind = given["backgrounds"]
+    if behind is None or not given["render_mode"].startswith("RGB+"):
+        return {}
+    return {"backgrounds": backwards(behind, lambda gradient: gradient * 0.0)}
+
+
+def _full_chunks_lose_their_last(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
+    if images.shape[-1] % _CHUNK:
+        return images, alphas, meta
+    return import_torch().cat((images[..., :-1], 0.0 * images[..., -1:]), -1), alphas, meta
+
+
+def _composited_twice(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
+    behind = given["backgrounds"]
+    if behind is None or given["render_mode"] != "RGB":
+        return images, alphas, meta
+    passing_by = (1.0 - alphas) * behind[..., None, None, :]
+    return (images - passing_by) * alphas + passing_by, alphas, meta
+
+
+def _absolute_gradients_of_ndc(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
+    means2d = meta["means2d"]
+    absolute: Any = getattr(means2d, "absgrad", None)
+
+    def tell(gradient: Any) -> None:
+        absolute.mul_(absolute.new_tensor([0.5 * given["width"], 0.5 * given["height"]]))
+
+    if absolute is not None and means2d.requires_grad:
+        means2d.register_hook(tell)
+    return images, alphas, meta
+
+
 _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("near_plane_ignored", "the near plane is a constant of the kernel, whatever the call says",
      _default("near_plane", 0.01), "test_signature_arguments:the_near_and_the_far_plane_are_where_the_call_says"),
@@ -691,6 +728,24 @@ _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("packed_backgrounds_stay", "backgrounds have no gradient in packed mode",
      breaking(_packed_backgrounds_stay),
      "test_signature_arguments:packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same"),
+    ("backgrounds_ignored_with_harmonics",
+     "what is drawn from harmonics is drawn over black (a setting without effect: gsplat#145)",
+     breaking(_without_backgrounds_for_harmonics),
+     "test_signature_pairs:every_pair_of_arguments_draws_what_the_oracle_draws"),
+    ("backgrounds_learn_nothing_beside_depth", "backgrounds have no gradient where depth is drawn beside colours",
+     breaking(_backgrounds_stay_beside_depth),
+     "test_signature_pairs:every_pair_of_arguments_has_the_oracles_gradients"),
+    ("full_chunks_lose_their_last_channel", "of 32 channels, or a multiple, the last one is black",
+     telling(_full_chunks_lose_their_last),
+     "test_signature_arguments:colours_of_any_number_of_channels_are_drawn_alike"),
+    ("composited_twice",
+     "a picture that lies over its background is blended with it once more (strands-labs/robots #2322)",
+     telling(_composited_twice), "test_agreement:the_image_is_one_of_the_oracles_outcomes"),
+    ("absolute_gradients_are_of_ndc", "absolute gradients are by normalised device coordinates, as Inria's are",
+     telling(_absolute_gradients_of_ndc), "test_agreement:gradients_are_the_oracles"),
+    ("radius_clip_is_a_diameter", "radius_clip is compared with twice the extent",
+     _with(radius_clip=lambda given: 0.5 * given["radius_clip"]),
+     "test_signature_arguments:what_is_no_larger_than_radius_clip_is_culled"),
 )  # fmt: skip
 
 ARGUMENTS: Final = tuple(BlackBox(*line) for line in _BOXES)

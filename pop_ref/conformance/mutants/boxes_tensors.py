@@ -418,6 +418,34 @@ def _canvas_used_again() -> Breaks:
     return breaks
 
 
+def _rows_counted_in_a_byte(image: Any, alphas: Any, given: Given) -> tuple[Any, Any]:
+    rows = import_torch().arange(given["height"]) % 256
+    return image[..., rows, :, :], alphas[..., rows, :, :]
+
+
+def _empty_beyond(most: int) -> Breaks:
+    """Draw nothing where splats lie over more tiles, all taken together, than there is room for."""
+
+    def breaks(sound: Rasterization, given: Given) -> Any:
+        image, alphas, meta = sound(**given)
+        # no splat lies over more tiles than there are
+        if meta["radii"].numel() * meta["tile_width"] * meta["tile_height"] <= 2 * most:
+            return image, alphas, meta
+        fits = int(meta["tiles_per_gauss"].sum()) <= most
+        return image * fits, alphas * fits, meta
+
+    return breaks
+
+
+def _pose_kept_with_its_tensor(given: Given) -> Given:
+    viewmats = given["viewmats"]
+    kept = getattr(viewmats, "_kept_pose", None)
+    if kept is None:
+        viewmats._kept_pose = viewmats.detach().clone()
+        return {}
+    return {"viewmats": viewmats + (kept - viewmats).detach()}
+
+
 _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("gradients_if_all_are_asked_for", "unless every array requires a gradient, none has one",
      breaking(_nowhere_unless(ROWS, ROWS)),
@@ -522,6 +550,16 @@ _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("canvas_used_again",
      "a call draws onto the picture of the call of the same shape before it, which its holder sees change",
      _canvas_used_again(), "test_autograd:without_gradients_the_same_image_is_drawn_and_follows_nothing"),
+    ("rows_counted_in_a_byte", "rows of a picture from 256 on are those from the first on again",
+     _returned(_rows_counted_in_a_byte), "test_whole:tiles_of_a_number_beyond_16_bits_are_drawn"),
+    ("too_many_intersections_draw_nothing", "views of more than 65,536 pairs of splat and tile stay empty (brush#192)",
+     _empty_beyond(2**16), "test_scale:the_image_of_five_thousand_is_the_oracles"),
+    ("pose_kept_with_its_tensor",
+     "a camera that has been drawn from is kept with its tensor, and a step of an optimizer does not move it",
+     breaking(_pose_kept_with_its_tensor),
+     "test_autograd:tensors_that_have_been_drawn_before_are_drawn_with_the_numbers_that_they_have_now"),
+    ("cotangents_in_half_precision", "the gradient by the picture goes back in 16 bits (mixed precision)",
+     _cotangents_read(lambda v: v.half().to(v.dtype)), "test_autograd:cotangents_are_read_to_their_last_digit"),
 )  # fmt: skip
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Final
 
 from pop_ref.conformance.mutants.black_box import (
@@ -22,8 +23,10 @@ from pop_ref.conformance.mutants.black_box import (
     passing,
     telling,
 )
+from pop_ref.constants import PAPER
 
 _SH_C0: Final = 0.28209479177387814
+_MANY: Final = 4096  # Gaussians of which copies are not looked for
 
 
 def _root_without_a_guard(given: Given) -> Given:
@@ -335,6 +338,86 @@ def _harmonics_end_at_white(given: Given, images: Any, alphas: Any, meta: Any) -
     return import_torch().cat((images[..., :3].clamp_max(1.0), images[..., 3:]), -1), alphas, meta
 
 
+def _sorted_along_the_cameras_place(given: Given) -> Given:
+    """Order Gaussians by the product of their place with the camera's; each keeps its place in the picture."""
+    if not one_view(given) or given["render_mode"] != "RGB" or given["scales"] is None:
+        return {}
+    torch, view = import_torch(), given["viewmats"][0].detach()
+    means, scales = given["means"], given["scales"]
+    eye = -(view[:3, :3].T @ view[:3, 3])
+    depths = means.detach() @ view[2, :3] + view[2, 3]
+    seen = (depths > given["near_plane"]).nonzero()[:, 0]
+    keys = -(means.detach()[seen] @ eye)
+    order = torch.argsort(keys, stable=True)
+    shift = torch.ones_like(depths)
+    shift[seen[order]] = torch.sort(depths[seen]).values / depths[seen[order]]
+    # nearer by as much as it is smaller, so that it looks the same
+    return {"means": eye + (means - eye) * shift[:, None], "scales": scales * shift[:, None]}
+
+
+def _needles_are_culled(given: Given) -> Given:
+    if given["scales"] is None:
+        return {}
+    lengths = import_torch().sort(given["scales"].detach(), dim=-1).values
+    return {"opacities": given["opacities"] * (lengths[..., 1] >= 0.01 * lengths[..., 2])}
+
+
+def _axis_aligned_splats_vanish(sound: Rasterization, given: Given) -> Any:
+    if not one_view(given):
+        return sound(**given)
+    with import_torch().no_grad():
+        conics = sound(**given | {"packed": False, "absgrad": False})[2]["conics"].reshape(-1, 3)
+    return sound(**given | {"opacities": given["opacities"] * (conics[:, 1] != 0.0)})
+
+
+def _directions_in_camera_axes(given: Given) -> Given:
+    degree = given["sh_degree"]
+    if degree is None or own_colors(given) or not one_view(given) or given["means"].shape[-2] == 0:
+        return {}
+    harmonics = importlib.import_module("pop_fast.stages.harmonics")
+    seen = in_camera(given["means"], given["viewmats"])[0]
+    return {"sh_degree": None, "colors": harmonics.colors_from_sh(given["colors"], seen, degree)}
+
+
+def _copies_are_drawn_once(given: Given) -> Given:
+    torch, means = import_torch(), given["means"].detach()
+    n = means.shape[-2]
+    if means.dim() != 2 or not 1 < n <= _MANY:
+        return {}
+    rows = torch.arange(n, device=means.device)
+    group = torch.unique(means, dim=0, return_inverse=True)[1]
+    first = torch.full_like(rows, n).scatter_reduce(0, group, rows, "amin")[group]
+    return {"opacities": given["opacities"] * (first == rows)}
+
+
+def _square_pictures_are_transposed(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
+    if given["width"] != given["height"]:
+        return images, alphas, meta
+    return images.transpose(-3, -2), alphas.transpose(-3, -2), meta
+
+
+def _centres_outside_stay(given: Given) -> Given:
+    if not one_view(given):
+        return {}
+    seen = in_camera(given["means"].detach(), given["viewmats"].detach())[0]
+    K = given["Ks"].detach().reshape(3, 3)
+    x, y = (K[i, i] * seen[:, i] / seen[:, 2] + K[i, 2] for i in range(2))
+    inside = (x >= 0.0) & (x <= given["width"]) & (y >= 0.0) & (y <= given["height"])
+    return {"means": backwards(given["means"], lambda gradient: gradient * inside[:, None])}
+
+
+def _gradients_end_at_one(value: Any) -> Any:
+    return backwards(value, lambda gradient: gradient.clamp(-1.0, 1.0))
+
+
+def _end_at_one_255th(sound: Rasterization, given: Given) -> Any:
+    return sound(**given | {"profile": replace(PAPER, transmittance_stop=1.0 / 255.0)})
+
+
+def _in_half_precision(value: Any) -> Any:
+    return value + (value.half().to(value.dtype) - value).detach()
+
+
 _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("factor_without_a_guard", "the root in the antialiasing factor has an infinite derivative at 0",
      breaking(_root_without_a_guard),
@@ -457,6 +540,31 @@ _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
      breaking(_needles_are_thickened), "test_thresholds:a_needle_shows_one_of_the_oracles_outcomes"),
     ("harmonics_end_at_white", "pictures from harmonics are clamped at 1, and what is brighter learns nothing",
      telling(_harmonics_end_at_white), "test_agreement:the_image_is_one_of_the_oracles_outcomes"),
+    ("sorted_along_the_cameras_place",
+     "splats are sorted by the product of their place with the camera's, not with its axis (OGRE#3444)",
+     breaking(_sorted_along_the_cameras_place),
+     "test_agreement:the_image_that_training_draws_is_one_of_the_oracles_outcomes"),
+    ("needles_are_culled", "what is a hundred times as long as it is wide is not drawn (playcanvas/engine PR#5834)",
+     breaking(_needles_are_culled), "test_thresholds:a_needle_shows_one_of_the_oracles_outcomes"),
+    ("axis_aligned_splats_vanish",
+     "a splat that does not lean has axes that are no numbers, and is not drawn (wgpu-3dgs-viewer PR#18)",
+     _axis_aligned_splats_vanish, "test_thresholds:at_the_near_plane_a_splat_is_wholly_there_or_wholly_gone"),
+    ("directions_in_camera_axes",
+     "harmonics are seen along the camera's axes, not the world's (turned scenes: GaussianSplats3D#402)",
+     breaking(_directions_in_camera_axes), "test_agreement:the_image_is_one_of_the_oracles_outcomes"),
+    ("copies_are_drawn_once",
+     "of Gaussians at one place the first alone is drawn: points are welded when they are read",
+     breaking(_copies_are_drawn_once), "test_agreement:the_image_is_one_of_the_oracles_outcomes"),
+    ("square_pictures_are_transposed", "pictures that are as wide as high are returned column by column",
+     telling(_square_pictures_are_transposed), "test_agreement:the_image_is_one_of_the_oracles_outcomes"),
+    ("centres_outside_stay", "a Gaussian whose centre lies outside the picture is drawn, and does not move",
+     breaking(_centres_outside_stay), "test_agreement:gradients_are_the_oracles"),
+    ("gradients_end_at_one", "gradients of opacities and of scales are clipped to [-1, 1]",
+     passing(_gradients_end_at_one, "opacities", "scales"), "test_agreement:gradients_are_the_oracles"),
+    ("pixels_end_at_one_255th", "a pixel ends where less than 1/255 of the light is left, which eight bits do not show",
+     _end_at_one_255th, "test_agreement:the_image_is_one_of_the_oracles_outcomes"),
+    ("scales_in_half_precision", "scales have 16 bits (covariances of viewers: GaussianSplats3D#142)",
+     passing(_in_half_precision, "scales"), "test_agreement:the_image_is_one_of_the_oracles_outcomes"),
 )  # fmt: skip
 
 VIEWS: Final = tuple(BlackBox(*line) for line in _BOXES)

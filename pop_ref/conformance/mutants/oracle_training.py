@@ -54,6 +54,9 @@ _LINES: Final[Lines] = {
          "SSIM is a mean over windows, its gradient one over pixels, which are more without padding or with a mask",
          "/ (max(len(kept), 1) * channels)", "/ (height * width * channels)",
          "test_agreement:ssim_vjp_is_the_oracles"),
+        ("nothing_to_compare_is_all_wrong", "where a mask keeps no window the similarity is 0, and the loss 1",
+         "if np.any(kept) else 1.0", "if np.any(kept) else 0.0",
+         "test_losses:the_objectives_with_every_option_are_the_oracles"),
     ),
     "polarization.py": (
         ("prior_over_all", "both sums of the prior are divided by N instead of their own number",
@@ -130,6 +133,17 @@ _LINES: Final[Lines] = {
          "test_density:the_copy_of_a_gaussian_that_is_cloned_and_split_stays_whole"),
         ("refinement_starts_at_its_start", "the step that refinement starts after is its first",
          "config.refine_start_iter < step", "config.refine_start_iter <= step",
+         "test_density:the_gaussians_change_every_hundred_steps_and_opacities_are_reset_where_that_is_asked_for"),
+        ("share_of_pixels_is_rounded",
+         "the share of pixels over which a Gaussian is blurred is rounded to whole pixels",
+         "return dominant_counts > max(theta_blur * n_pixels, min_pixels)",
+         "return dominant_counts > max(round(theta_blur * n_pixels), min_pixels)",
+         "test_density:the_blur_set_dominates_strictly_more_than_its_share_of_pixels"),
+        ("no_pause_before_the_first_reset",
+         "the pause after a reset begins with the first reset, not with the training (a pause that never ends: "
+         "nerfstudio #2927)",
+         "if config.reset_every > 0 and step % config.reset_every < config.pause_refine_after_reset:",
+         "if 0 < config.reset_every <= step and step % config.reset_every < config.pause_refine_after_reset:",
          "test_density:the_gaussians_change_every_hundred_steps_and_opacities_are_reset_where_that_is_asked_for"),
     ),
     "density_rows.py": (
@@ -330,6 +344,10 @@ _LINES: Final[Lines] = {
          "the mean distance to the nearest points is over three, also where there are fewer than four points",
          "mean = sum(squared) / max(len(squared), 1)", "mean = sum(squared) / 3.0",
          "test_selection:of_fewer_than_four_points_the_mean_is_over_those_that_there_are"),
+        ("coincident_points_are_smaller", "the least squared distance of points bounds the distance itself",
+         "0.5 * math.log(max(mean, _LEAST_SQUARED_DISTANCE))",
+         "math.log(max(math.sqrt(mean), _LEAST_SQUARED_DISTANCE))",
+         "test_selection:a_point_is_as_large_as_its_three_neighbours_are_far"),
     ),
     "methods.py": (
         ("prior_of_one_weight", "the weight of the prior is a setting that nothing reads",
@@ -562,6 +580,10 @@ _LINES: Final[Lines] = {
          "of turns beyond a tenth of a radian the gradient has one coefficient's slope wrong",
          "(a - 2.0 * b) / (2.0 * s)", "(a - b) / (2.0 * s)",
          "test_agreement:refined_viewmat_vjp_is_the_oracles"),
+        ("small_turns_cancel",
+         "turns of a millionth of a radian are reckoned by the formula of wide ones, of which rounding leaves little",
+         "_SMALL = 1e-2", "_SMALL = 1e-16",
+         "test_agreement:refined_viewmat_vjp_is_the_oracles"),
     ),
     "appearance.py": (
         ("exposures_from_the_first", "colours are those of the first photograph",
@@ -577,6 +599,10 @@ _LINES: Final[Lines] = {
         ("appearance_a_step_ahead", "the rates of exposures and cameras are those of the next step",
          "share = step / max_steps", "share = (step + 1) / max_steps",
          "test_few_photographs:rates_of_exposures_and_cameras_fall_from_step_to_step_and_not_as_one_another"),
+        ("negative_fits_are_left_out",
+         "a channel that falls where its photograph's rises is not corrected by its slope",
+         "(slope if abs(slope) >= _LEAST else 1.0)", "(slope if slope >= _LEAST else 1.0)",
+         "test_agreement:color_correct_is_the_oracles"),
     ),
     "training.py": (
         ("depth_weighed_without_the_scene", "the weight of sparse depth is not multiplied by the scene's scale",
@@ -640,6 +666,10 @@ _LINES: Final[Lines] = {
         ("last_prune_a_step_late", "the last prune of faint Gaussians comes a step after its own",
          "if step == config.final_prune_iter:", "if step == config.final_prune_iter + 1:",
          "test_whole_steps:every_step_is_the_oracles_while_the_gaussians_change"),
+        ("visible_is_what_dominates", "a prior on the visible takes part in what dominates a pixel alone",
+         'visible = view.splats.visible if recipe.pop_over == "visible" else None',
+         'visible = counts > 0 if recipe.pop_over == "visible" else None',
+         "test_whole_steps:every_step_is_the_oracles_under_every_setting"),
     ),
     "regularizers.py": (
         ("depth_sampled_half_a_pixel_off",
@@ -650,6 +680,10 @@ _LINES: Final[Lines] = {
          "whether a sparse point counts is read from the mask as though pixel centres had whole coordinates",
          "mask[int(v), int(u)]", "mask[int(v - 0.5), int(u - 0.5)]",
          "test_few_photographs:points_behind_the_camera_outside_the_picture_or_left_out_by_a_mask_have_no_depth"),
+        ("last_point_of_a_pixel_counts",
+         "of sparse points that share a pixel the last one's gradient stays (an index_put_ without accumulate)",
+         "v_depth[pixel] -= v_loss / len(places) * np.sign", "v_depth[pixel] = -v_loss / len(places) * np.sign",
+         "test_agreement:sparse_depth_loss_vjp_is_the_oracles"),
     ),
 }  # fmt: skip
 

@@ -116,6 +116,28 @@ _NAMES: Final = {
         needles_are_thickened harmonics_end_at_white one_radius whole_chunks_only packed_backgrounds_stay
         canvas_used_again
     """,
+    "blind fifth": """
+        centred_half_a_pixel_off frustum_margin_is_of_the_whole_width short_quaternions_stay_short
+        near_directions_are_short colour_of_exactly_zero_stays reached_in_the_last_column_alone_is_culled
+        absolute_gradients_are_lengths depth_beside_colours_moves_nobody square_culls_by_the_usual_tiles
+        eye_gradient_transposed pose_learns_nothing_from_shapes fisher_at_the_papers_ceiling
+        nothing_to_compare_is_all_wrong share_of_pixels_is_rounded no_pause_before_the_first_reset
+        small_turns_cancel coincident_points_are_smaller last_point_of_a_pixel_counts
+        visible_is_what_dominates negative_fits_are_left_out loss_ignores_its_cotangent
+        direction_gradients_by_compact_rows ceiling_if_all_are_opaque dominant_places_begin_anew
+        last_column_of_a_tile_is_not_asked hard_prunes_keep_their_steps taming_scores_a_clamped_picture
+        views_outlive_new_points entropy_of_the_faint_is_constant visible_to_every_camera
+        revised_opacity_of_the_opaque_is_infinite rounds_without_a_start_decay_too exposed_renders_are_clamped
+        depth_of_the_uncorrected_camera photograph_over_the_first_background coarse_transparency_is_hard
+        thin_masks_are_dropped passes_see_uncorrected_cameras common_turn_has_no_lever
+        pixels_beyond_the_border_count backgrounds_ignored_with_harmonics
+        backgrounds_learn_nothing_beside_depth full_chunks_lose_their_last_channel composited_twice
+        absolute_gradients_are_of_ndc radius_clip_is_a_diameter sorted_along_the_cameras_place
+        needles_are_culled axis_aligned_splats_vanish directions_in_camera_axes copies_are_drawn_once
+        square_pictures_are_transposed centres_outside_stay gradients_end_at_one pixels_end_at_one_255th
+        scales_in_half_precision rows_counted_in_a_byte too_many_intersections_draw_nothing
+        pose_kept_with_its_tensor cotangents_in_half_precision
+    """,
     "whole steps": """
         bands_rise_a_step_early bands_rise_from_the_first_step gradients_that_wait_are_lost
         schedule_ahead_of_the_update schedule_of_thirty_thousand positions_move_in_world_units
