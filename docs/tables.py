@@ -328,7 +328,7 @@ def speed() -> str:
     """Make the tables of CPU times, those of a row taken in turns in one process: training steps, renders, blends."""
     timed = json.loads(CPU_TIMES.read_text(encoding="utf-8"))
     machine = timed["machine"]
-    make = runpy.run_path(str(ROOT / "benchmarks" / "step_tables.py"))["steps"]
+    make = runpy.run_path(str(ROOT / "benchmarks" / "results_table.py"))["steps"]
     made, rows = [str(make(timed))], []
     for case in timed["raster"]:
         rows.append(_speed_row(f"render, {_size(case)}", case["forward_ms"]))
