@@ -35,7 +35,6 @@ from pop_ref.density import (
     zero_statistics,
 )
 from pop_ref.optimizer import (
-    LEARNING_RATES,
     adam_step,
     is_updated,
     learning_rates,
@@ -252,7 +251,7 @@ def test_an_opacity_that_only_pop_touches_falls_under_the_pruning_threshold_in_s
     while opacities_from_logits(logit["o"])[0] >= 0.005:
         taken += 1
         gradient = {"o": opacities_from_logits_vjp(logit["o"], np.array([1e-3 / 40_000]))}
-        logit, m, v = adam_step(logit, gradient, m, v, taken, {"o": LEARNING_RATES["opacities"]})
+        logit, m, v = adam_step(logit, gradient, m, v, taken, {"o": LearningRates().opacities})
     assert taken == pytest.approx(steps, abs=5)
 
 
