@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from paper_repro.claims_page import outcome as outcome_of
 from paper_repro.methods import load_pinned
 from paper_repro.status import everything, status_table
+from paper_repro.status import outcome as outcome_of
 from pop_fast.train.presets import METHODS, options_for
 from pop_ref.conformance.capabilities import STAGES as KIT_STAGES
 from pop_ref.conformance.law_coverage import LIMITS, reason
