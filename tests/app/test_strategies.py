@@ -194,21 +194,6 @@ def test_a_parameter_dict_with_a_frozen_extra_is_edited_too():
     assert not params["tags"].requires_grad
 
 
-def test_a_gradient_at_the_threshold_and_growth_by_gradient_are_switches():
-    at_threshold = {"grow_grad2d": 2.0**-10 * WIDTH / 2}
-    for strategy, step, n in (
-        (GsplatStrategy(inclusive=False, **at_threshold), 600, 1),
-        (GsplatStrategy(inclusive=True, **at_threshold), 600, 2),
-        (POPStrategy(grow_on_gradient=False), 600, 1),
-        (POPStrategy(grow_on_gradient_in_blur_window=False), 600, 2),
-        (POPStrategy(grow_on_gradient_in_blur_window=False), 3000, 1),
-    ):
-        params, optimizers = make(1)
-        grads = torch.tensor([[2.0**-10, 0.0]]) if isinstance(strategy, GsplatStrategy) else torch.ones(1, 2)
-        densified_at(strategy, params, optimizers, make_info(1, grads), step)
-        assert len(params["means"]) == n
-
-
 def test_the_same_seed_splits_to_the_same_bits_and_another_does_not():
     means = []
     for seed in (1, 1, 2):

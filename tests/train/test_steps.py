@@ -36,17 +36,9 @@ from pop_ref.activations import opacities_from_logits
 from pop_ref.conformance.error_bounds import REACH, pixel_error_bounds
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.scenes import Scene
-from pop_ref.density import (
-    Rows,
-    Statistics,
-    densifies_at,
-    grow_masks,
-    prune_mask,
-    resets_at,
-    zero_statistics,
-)
+from pop_ref.density import Rows, Statistics, densifies_at, grow_masks, prune_mask, resets_at, zero_statistics
 from pop_ref.margins import margins
-from pop_ref.optimizer import is_updated, learning_rates, sh_degree_at
+from pop_ref.optimizer import learning_rates, sh_degree_at
 from pop_ref.records import Camera
 from pop_ref.settings import BETAS, EPS, DensityConfig, LearningRates, PopTerm, Recipe, UpdateRules
 from pop_ref.training import Training, control, gaussians_from_params, objective, params_vjp, train_step
@@ -501,93 +493,8 @@ def test_a_run_with_another_setting_is_found_out(what: str, tmp_path: Path) -> N
     assert any(step.differences and not step.doubtful for step in each_judged(run, SHORT, 10))
 
 
-# What methods change of an update and of density control: against the oracle in float64, and on every engine.
-
-RULES = UpdateRules(
-    edits_replace_update=True,
-    sh_start_iter=2,
-    sh_rest_every=3,
-    opacities_stop_iter=7,
-    means_rewind_iter=5,
-    means_rewind_to=1,
-)
-UPDATES = replace(SHORT, updates=RULES, sh_interval=1)
-ENTROPY = replace(SHORT, lambda_pop=0.0, lambda_entropy=0.3)
-BOTH_PRIORS = replace(SHORT, lambda_entropy=0.3)
-FEW = replace(SHORT, depth_lambda=0.05, opacity_reg=0.2, scale_reg=0.3)
-PRUNED = replace(SHORT, density=replace(SHORT.density, final_prune_iter=9, final_prune_opa=0.4))
-
-
-def normals(n: int) -> np.ndarray:
-    return np.random.default_rng(n).standard_normal((2, n, 3))
-
-
-def rules_run_of(recipe: Recipe, folder: Path, engine: Any, dtype: torch.dtype) -> TrainingRun:
-    initial = initialize_params(capture(), 7, 0.4, 0.6, dtype)
-    # of a sphere the rotation has no gradient but rounding, along which Adam takes whole steps
-    initial["scales"] += torch.linspace(-0.5, 0.5, initial["scales"].numel(), dtype=dtype).reshape(-1, 3).sin()
-    run = TrainingRun(config_of(recipe, folder, seed=7), capture(), engine=engine, initial=initial)
-    run.draws = Draws(lambda n: torch.tensor(normals(n)), lambda n: torch.rand(n, dtype=torch.float64))
-    return run
-
-
-@pytest.mark.parametrize(
-    "recipe",
-    [UPDATES, ENTROPY, BOTH_PRIORS, PRUNED, replace(FEW, depth_lambda=0.0), FEW],
-    ids=["updates", "entropy", "both", "pruned", "regularized", "few photographs"],
-)
-def test_ten_steps_in_double_precision_are_the_oracles(recipe: Recipe, tmp_path: Path) -> None:
-    run = rules_run_of(recipe, tmp_path, torch_engine("fast"), torch.float64)
-    state = state_of(run)
-    for step in range(10):
-        segment = run.take_steps(step + 1)
-        view = next(view for view in run._train if view.name == segment.views[0])
-        camera = Camera(view.viewmat[0].numpy(), view.K[0].numpy(), view.width, view.height)
-        scene_scale, photo = capture().scene_scale(), view.photo.double().numpy() / 255.0
-        seen = None if view.points is None else view.points.numpy()
-        assert (seen is None) == (recipe.depth_lambda == 0.0)
-        state, loss = train_step(state, camera, photo, scene_scale, normals, recipe, seen)
-        assert segment.stats[0].objective + segment.stats[0].pop == pytest.approx(loss, rel=1e-10)
-        for key in KEYS:
-            np.testing.assert_allclose(run.params[key].detach().numpy(), state.rows.params[key], rtol=1e-7, atol=1e-9)
-
-
-def test_each_engine_moves_whom_the_rules_move_and_nobody_else(engine: Any, tmp_path: Path) -> None:
-    run = rules_run_of(UPDATES, tmp_path, engine, torch.float32)
-    idle = 0
-    for step in range(10):
-        before = {key: run.params[key].detach().cpu().clone() for key in KEYS}
-        densification = run.take_steps(step + 1).densification
-        if densification is not None:
-            continue
-        for key in KEYS:
-            # an engine on a card takes parameters there with its first step
-            moved = not torch.equal(before[key], run.params[key].detach().cpu())
-            # bands beyond the first have no gradient before they are drawn
-            wanted = is_updated(key, step, UPDATES) and (key != "shN" or step > RULES.sh_start_iter)
-            assert moved == wanted, f"{key} at step {step}"
-            idle += not moved
-    assert idle > 5
-
-
-def test_gradients_that_wait_are_summed_alike_by_every_engine(engine: Any, tmp_path: Path) -> None:
-    still = replace(UPDATES, density=replace(UPDATES.density, refine_start_iter=10**6))
-    runs = [
-        rules_run_of(still, tmp_path / name, of, torch.float32)
-        for name, of in (("a", engine), ("b", torch_engine("fast")))
-    ]
-    for step in range(10):
-        for run in runs:
-            run.take_steps(step + 1)
-    bands = [run.optimizers["shN"].state[run.params["shN"]]["exp_avg"].cpu() for run in runs]
-    largest = float(bands[1].abs().max())
-    assert largest > 0.0
-    # a moment is linear in the sums; gradients themselves differ by rounding
-    torch.testing.assert_close(bands[0], bands[1], rtol=1e-3, atol=1e-3 * largest)
-
-
 def test_an_opacity_next_to_one_can_leave_again_by_every_engine(engine: Any, tmp_path: Path) -> None:
-    run = rules_run_of(UPDATES, tmp_path, engine, torch.float32)
+    run = run_of(SHORT, tmp_path, engine)
     # o (1 - o) is 2e-9 there, and 1 - o is 0 in float32
     run.params["opacities"].data.fill_(20.0)
     run.take_steps(1)
