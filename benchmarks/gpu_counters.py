@@ -25,9 +25,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
-from gpu_kernels import photograph_of
+from gpu_kernels import POP, make_trainer, photograph_of
 from gpu_scenes import CASES, TINY, scenes
-from gpu_steps import POP, make_trainer
 
 from cuda_ext.gpu_check.shared import ROOT, python_path
 from pop_fast.children import python_command

@@ -14,9 +14,21 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from gpu_kernels import STEPS, Record, arguments, draw, forward_backward, over_scenes, photograph_of, timed
+from gpu_kernels import (
+    STEPS,
+    Record,
+    arguments,
+    draw,
+    forward_backward,
+    kernel_sums,
+    over_scenes,
+    photograph_of,
+    raw_params,
+    step_kernels,
+    timed,
+    whole_step,
+)
 from gpu_scenes import GpuCase
-from gpu_steps import kernel_sums, raw_params, step_kernels, whole_step
 from torch import Tensor
 
 import cuda_ext

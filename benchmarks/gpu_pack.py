@@ -24,7 +24,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from cuda_ext.gpu_check.command import commit_of
+from cuda_ext.gpu_check.__main__ import commit_of
 from cuda_ext.gpu_check.shared import ROOT, write_json
 from paper_repro import prepared
 from paper_repro.jobs import Job, load_row

@@ -10,8 +10,8 @@ comparisons and selections on vectors of sixteen floats; moves, broadcasts and l
 is the arithmetic in the machine code of the CUDA kernels (`results/sass.json`), whose functions the step calls.
 
 A machine of more cores is simulated. A step is a row of works, each cut into parts that no thread changes
-(`pop_fast/compiled/pool.h`). One thread takes steps of which every part is timed, cut as for the threads of the machine
-in question. Then, work by work:
+(`pop_fast/compiled/threads.h`). One thread takes steps of which every part is timed, cut as for the threads of the
+machine in question. Then, work by work:
 
     time of a work = what one thread has for itself before it + HANDOVER
                      + the larger of: when the last thread is done, each taking the next part that nobody has taken;
@@ -75,7 +75,7 @@ SMALLEST, LARGEST, MOVED = 1 << 17, 1 << 28, 1 << 28
 # cores, and the bytes a second that such a machine moves: two channels of DDR5-5600, a desktop's; eight of DDR5-4800, a
 # server's. None where the memory is not looked at: one core does not fill it.
 MACHINES: Final = {1: None, 2: None, 16: 70e9, 64: 250e9}
-# seconds from a work's last part to the first of the next: a thread looks for more for some microseconds, see `pool.h`
+# seconds from a work's last part to the first of the next: a thread looks for more for some microseconds (`threads.h`)
 HANDOVER: Final = 5e-6
 # of which part of a step each work is
 PART_OF: Final = ("project", *["list"] * 6, "blend", "loss", "image_gradient", "transpose", "update", "update")

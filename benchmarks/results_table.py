@@ -1,24 +1,30 @@
-"""The tables of training results, from the statistics of training runs, and those of docs/reliability.md.
+"""Tables of what was measured: training runs, docs/reliability.md, and the training steps of NOTES.md.
 
 benchmarks/results/training.jsonl has one line a run: what the run wrote into stats/val_step*.json, after its name here.
 
     python benchmarks/results_table.py --add FILE NAME      add a run's statistics under a name
-    python benchmarks/results_table.py                      print the tables
-    python benchmarks/results_table.py --check PAGE...      exit with 1 when these pages hold others
+    python benchmarks/results_table.py                      print the tables of runs and of steps
+    python benchmarks/results_table.py --write              put those of steps into NOTES.md, between their marks
+    python benchmarks/results_table.py --check [PAGE...]    exit with 1 when NOTES.md or these pages hold others
 
-`python docs/tables.py --write` puts them into README.md and docs/results.md. Runs of one capture, method and weight of
-the POP term that differ in their seed share a row: means, and in brackets the smallest and largest PSNR and SSIM.
-What `benchmarks.faults` and `benchmarks.load` have written makes the tables of docs/reliability.md.
+`python docs/tables.py --write` puts those of runs into README.md and docs/results.md, and the first of a step into
+README.md. Runs of one capture, method and weight of the POP term that differ in their seed share a row: means, and in
+brackets the smallest and largest PSNR and SSIM. What `benchmarks.faults` and `benchmarks.load` have written makes the
+tables of docs/reliability.md, and `results/cpu.json` those of a training step.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+if __package__ in (None, ""):
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.record import with_table
 from paper_repro.paper import paper
 from pop_fast.view.report.source import COLUMNS, markdown, row
 
@@ -28,6 +34,10 @@ RUNS = RESULTS / "training.jsonl"
 ANY_VIEW = "any_view/"
 Stats = dict[str, Any]
 _KINDS = ("read", "refused", "told", "escaped", "crashed", "hung")
+NOTES = Path(__file__).resolve().parent / "NOTES.md"
+NOT_YET = "Not measured yet: run `python benchmarks/run.py`."
+BOUNDS = {"operations": "o", "bytes": "b"}
+ENGINES = {"fast": "`fast`", "compiled": "`compiled`, autograd", "native": "`compiled`, native"}
 
 
 def table(runs: Path = RUNS) -> str:
@@ -127,7 +137,7 @@ def fuzzed() -> str:
     total = {kind: sum(row[kind] for row in found.values()) for kind in _KINDS}
     rows = [[name, *_outcomes(row)] for name, row in found.items()] + [["**all**", *_outcomes(total)]]
     head = ["reader", "inputs", "read", "refused in a line", "system", "failures", "crash", "hang"]
-    return _table(head, ["---", *["---:"] * 7], rows)
+    return _table(head, rows, ["---", *["---:"] * 7])
 
 
 def _outcomes(row: dict[str, int]) -> list[str]:
@@ -152,7 +162,7 @@ def disturbed() -> str:
     for flips in found["flips"].values():
         came = f"{flips['refused']:,} refused, {flips['the same']:,} read as before"
         rows.append(["a flipped bit of a checkpoint", f"{flips['flips']:,}", came, _failed(flips)])
-    return _table(["what happens", "tried", "what came", "failures"], ["---", "---", "---", "---:"], rows)
+    return _table(["what happens", "tried", "what came", "failures"], rows, ["---", "---", "---", "---:"])
 
 
 def sanitized() -> str:
@@ -163,7 +173,7 @@ def sanitized() -> str:
         for name, of in found["checks"].items()
     ]
     rows += [[f"`{unit}`", "", f"{run} of {of} lines ran", ""] for unit, (run, of) in found["lines"].items()]
-    return _table(["what", "under", "tried", "failures"], ["---", "---", "---", "---:"], rows)
+    return _table(["what", "under", "tried", "failures"], rows, ["---", "---", "---", "---:"])
 
 
 def _failed(result: dict[str, Any]) -> str:
@@ -176,15 +186,164 @@ def loads() -> str:
     for name, found in _read("load.json")["cases"].items():
         size = f"{found['width']} x {found['height']}"
         rows.append([name, size, f"{found['peak_gib']:.2f} GiB", f"{found['bound_gib']:.2f} GiB", found["backend"]])
-    return _table(["load", "photograph or render, px", "peak", "bound", "backend"], ["---"] * 5, rows)
+    return _table(["load", "photograph or render, px", "peak", "bound", "backend"], rows)
+
+
+def title(case: Mapping[str, Any]) -> str:
+    """Say what is trained."""
+    real = "" if case["name"][0].isdigit() else f"{case['name']}, bands to {case['degree']}, "
+    return f"{real}{case['width']}x{case['height']}, {case['num_gaussians']:,} Gaussians"
+
+
+def steps(timed: Mapping[str, Any]) -> str:
+    """Make the table of times of a step by every engine."""
+    head = ["training step of POP", "`fast`", "`compiled`, autograd", "`compiled`, native", "native / autograd"]
+    rows = []
+    for case in timed["steps"]["cases"]:
+        ms, ratios = case["ms"], case["ratios"]
+        least = [f"{ms[name]['median']:.0f} ms" for name in ("fast", "compiled")]
+        native = f"{ms['native']['median']:.1f} ms ({ms['native']['minimum']:.1f})"
+        rows.append([title(case), *least, native, f"{ratios['native / compiled']:.2f}"])
+    return f"{_table(head, rows)}\n\nMedians of turns; of the native step the least turn in brackets."
+
+
+def native(timed: Mapping[str, Any]) -> str:
+    """Make the table of targets, threads and memory of the native step."""
+    head = ["case", "target", "native", "one thread", "efficiency of threads", "works in"]
+    rows = []
+    for case in timed["steps"]["cases"]:
+        ms, lone = case["ms"], case["ms"].get("native, 1 thread")
+        rows.append(
+            [
+                title(case),
+                "" if case["target_ms"] is None else f"{case['target_ms']:.0f} ms",
+                f"{ms['native']['median']:.1f} ms",
+                "" if lone is None else f"{lone['median']:.1f} ms",
+                "" if lone is None else f"{case['ratios']['efficiency']:.2f}",
+                f"{case['working_mib']:.0f} MiB",
+            ]
+        )
+    return _table(head, rows)
+
+
+def parts(timed: Mapping[str, Any]) -> str:
+    """Make the table of where the native step goes: of each part its time, its floor, what bounds that, their ratio."""
+    cases, peak = timed["steps"]["cases"], timed["steps"]["peak"]
+    rows = []
+    for part in cases[0]["parts"]:
+        found = [case["parts"][part] for case in cases]
+        rows.append([part, *(_cell(one["ms"], one["floor_ms"], BOUNDS[one["bound"]]) for one in found)])
+    sums = [[sum(one[key] for one in case["parts"].values()) for key in ("ms", "floor_ms")] for case in cases]
+    rows.append(["all", *(_cell(ms, floor, "") for ms, floor in sums)])
+    table = _table(["part", *map(title, cases)], rows)
+    rates = f"{peak['vector_ops_per_s'] / 1e9:.1f} G vector operations/s and {peak['bytes_per_s'] / 1e9:.0f} GB/s"
+    legend = "ms (floor ms by operations o or bytes b, ratio)"
+    return f"{table}\n\n{legend}; {peak['threads']} threads were seen to do {rates} from memory."
+
+
+def _cell(ms: float, floor: float, bound: str) -> str:
+    return f"{ms:.2f} ({floor:.2f}{bound}, {ms / floor:.1f})"
+
+
+def counts(timed: Mapping[str, Any]) -> str:
+    """Make the table of what a step had to do, and what a pair costs by that."""
+    cases = timed["steps"]["cases"]
+    lines: list[tuple[str, Callable[[Mapping[str, Any], Mapping[str, int]], str]]] = [
+        ("visible", lambda _, did: f"{did['visible']:,}"),
+        ("entries of lists, until pixels stop", lambda _, did: f"{did['entries']:,}, {did['walked']:,}"),
+        ("pairs a pixel", lambda case, did: f"{did['pairs'] / (case['width'] * case['height']):.1f}"),
+        ("of these in strips that are blended, that change", lambda _, did: _shares(did)),
+        ("blend, ns a pair", lambda case, did: f"{1e6 * case['parts_ms']['blend'] / did['pairs']:.2f}"),
+        ("transpose, ns a pair", lambda case, did: f"{1e6 * case['parts_ms']['transpose'] / did['pairs']:.2f}"),
+    ]
+    rows = [[what, *(show(case, case["counts"]) for case in cases)] for what, show in lines]
+    return _table(["", *map(title, cases)], rows)
+
+
+def cores(timed: Mapping[str, Any]) -> str:
+    """Make the table of simulated steps on machines of more cores."""
+    rows = []
+    for case in timed["cores"]:
+        one = sum(case["machines"]["1"].values())
+        for threads, shares in case["machines"].items():
+            ms = sum(shares.values())
+            name = f"{case['width']}x{case['height']}, {case['num_gaussians']:,} Gaussians"
+            rows.append([name, threads, f"{ms:.2f}", f"{one / ms:.1f}", *(f"{part:.2f}" for part in shares.values())])
+    head = ["case", "cores", "ms", "times one core", *timed["cores"][0]["machines"]["1"]]
+    return _table(head, rows)
+
+
+def _shares(did: Mapping[str, int]) -> str:
+    return ", ".join(f"{16 * did[name] / did['pairs']:.0%}" for name in ("marked", "reached"))
+
+
+def busy(timed: Mapping[str, Any]) -> str:
+    """Make the table of steps among busy processes."""
+    rows = []
+    for case in timed["busy"]:
+        for engine, found in case["engines"].items():
+            times = [f"{found[name]:.1f} ms" for name in ("alone_ms", "beside_ms")]
+            rows.append([case["name"], ENGINES[engine], *times, f"{found['of_fair_share']:.2f}"])
+    first = timed["busy"][0]
+    head = ["case", "engine", "alone", f"among {first['processes']} busy processes", "times the fair share"]
+    share = f"({first['processes']} + {first['threads']}) / {first['cores']} = {first['fair_factor']:g}"
+    return f"{_table(head, rows)}\n\nThe fair share is {share} times the time alone; means over all steps."
+
+
+def startup(timed: Mapping[str, Any]) -> str:
+    """Make the table of how long commands take until they do something."""
+    found = timed["first-step"]
+    rows = [[f"`{name}`", _s(one["wall_s"]), _s(one["cpu_s"])] for name, one in found["commands"].items()]
+    if "first_step" in found:
+        first = found["first_step"]
+        command = f"`pop train {first['capture']} --factor {first['factor']} --preset quick`, to its first step"
+        rows.append([command, _s(first["wall_s"]), ""])
+    table = _table(["command", "seconds", "processor seconds"], rows)
+    return f"{table}\n\nThe least of {found['repeats']}."
+
+
+def _s(seconds: float) -> str:
+    return f"{seconds:.2f}"
+
+
+def memory(timed: Mapping[str, Any]) -> str:
+    """Make the table of peaks of memory."""
+    head = ["what", "by", "before", "at the peak", "of it the step's own"]
+    what = {"render": "render and backward", "step": "two training steps"}
+    rows = []
+    for one in timed["memory"]:
+        own = f"{one['working_gib']:.2f} GiB" if "working_gib" in one else ""
+        size = f"{what[one['what']]}, {one['width']}x{one['height']}, {one['n']:,} Gaussians"
+        rows.append([size, ENGINES[one["by"]], f"{one['before_gib']:.2f} GiB", f"{one['peak_gib']:.2f} GiB", own])
+    return _table(head, rows)
+
+
+# the part of the results that each table is made of, by its marks in NOTES.md
+TABLES: dict[str, tuple[str, Callable[[Mapping[str, Any]], str]]] = {
+    "steps": ("steps", steps),
+    "native step": ("steps", native),
+    "where a step goes": ("steps", parts),
+    "what a step has to do": ("steps", counts),
+    "cores": ("cores", cores),
+    "busy machine": ("busy", busy),
+    "first step": ("first-step", startup),
+    "memory": ("memory", memory),
+}
+
+
+def with_tables(text: str, timed: Mapping[str, Any]) -> str:
+    """Put every table between its marks."""
+    for name, (part, make) in TABLES.items():
+        text = with_table(text, name, make(timed) if part in timed else NOT_YET)
+    return text
 
 
 def _read(name: str) -> dict[str, Any]:
     return dict(json.loads((RESULTS / name).read_text(encoding="utf-8")))
 
 
-def _table(head: Sequence[str], rule: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, rule, *rows))
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]], rule: Sequence[str] | None = None) -> str:
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, rule or ["---"] * len(head), *rows))
 
 
 def main(words: list[str]) -> int:
@@ -192,13 +351,20 @@ def main(words: list[str]) -> int:
     if words[:1] == ["--add"]:
         add(Path(words[1]), words[2])
         return 0
-    tables = (table(), differences(), summary())
+    tables, timed, notes = (table(), differences(), summary()), _read("cpu.json"), NOTES.read_text(encoding="utf-8")
+    if words == ["--write"]:
+        NOTES.write_text(with_tables(notes, timed), encoding="utf-8")
+        return 0
     if words[:1] != ["--check"]:
-        print("\n\n".join(tables))
+        of_steps = (make(timed) if part in timed else NOT_YET for part, make in TABLES.values())
+        print("\n\n".join((*tables, *(f"{name}\n\n{made}" for name, made in zip(TABLES, of_steps, strict=True)))))
         return 0
     text = "\n".join(Path(word).read_text(encoding="utf-8") for word in words[1:])
-    if any(f"\n{made}\n" not in text for made in tables):
+    if words[1:] and any(f"\n{made}\n" not in text for made in tables):
         print(f"{' '.join(words[1:])}: a results table is not what the runs say; run 'python docs/tables.py --write'")
+        return 1
+    if with_tables(notes, timed) != notes:
+        print("NOTES.md: a table of the training step is not what was measured; run results_table.py --write")
         return 1
     return 0
 

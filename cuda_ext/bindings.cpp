@@ -1,12 +1,72 @@
 // The kernels' host functions for Python: structs of pointers and numbers, no mathematics, no torch.
 //
 // Pointers cross as integers (tensor.data_ptr()); cuda_ext.arrays checks device, type, shape and contiguity before it takes one.
+// Every class takes attributes of its own, so that Python can keep the tensors alive whose addresses it holds.
 
-#include "bindings.h"
+#include <nanobind/nanobind.h>
+#include <nanobind/stl/string.h>
 
-#include "csrc/cuda_check.h"
+#include <type_traits>
+
+#include "csrc/train.h"
+
+namespace nb = nanobind;
+using namespace pop;
 
 namespace {
+
+cudaStream_t as_stream(uintptr_t stream) { return reinterpret_cast<cudaStream_t>(stream); }
+
+DeviceState* as_state(uintptr_t state) { return reinterpret_cast<DeviceState*>(state); }
+
+// torch's name for what a field points to, so that Python can refuse a tensor of another type
+template <class T>
+constexpr const char* dtype_of() {
+    using Value = std::remove_cv_t<T>;
+    constexpr bool ints = std::is_same_v<Value, int> || std::is_same_v<Value, unsigned> ||
+                          std::is_same_v<Value, DeviceState>;
+    constexpr bool floats = std::is_same_v<Value, float> || std::is_same_v<Value, StepConstants>;
+    constexpr bool doubles = std::is_same_v<Value, double>;
+    constexpr bool bytes = std::is_same_v<Value, uint8_t>;
+    // a pointer to pointers is a table of addresses; void is for tile keys, of which there are two kinds
+    constexpr bool addresses = std::is_pointer_v<Value>, keys = std::is_void_v<Value>;
+    static_assert(ints || floats || doubles || bytes || addresses || keys, "give this field's type its torch dtype");
+    if (doubles) return "float64";
+    return ints ? "int32" : floats ? "float32" : bytes ? "uint8" : addresses ? "int64" : "int16 int32";
+}
+
+// the class keeps the type of each of its pointers in `dtypes`
+template <class Struct, class Pointer>
+void note_dtype(nb::class_<Struct>& type, const char* name, Pointer) {
+    if (!nb::hasattr(type, "dtypes")) type.attr("dtypes") = nb::dict();
+    nb::cast<nb::dict>(type.attr("dtypes"))[name] = dtype_of<std::remove_pointer_t<Pointer>>();
+}
+
+// a pointer as a property that reads and writes integers
+template <class Struct, class Pointer>
+void pointer(nb::class_<Struct>& type, const char* name, Pointer Struct::* member) {
+    note_dtype(type, name, Pointer());
+    type.def_prop_rw(
+        name, [member](const Struct& s) { return reinterpret_cast<uintptr_t>(s.*member); },
+        [member](Struct& s, uintptr_t value) { s.*member = reinterpret_cast<Pointer>(value); });
+}
+
+// one of the two buffers of a sort
+template <class Struct, class Pointer>
+void pointer_pair(nb::class_<Struct>& type, const char* first, const char* second, Pointer (Struct::*member)[2]) {
+    const char* names[2] = {first, second};
+    for (int k = 0; k < 2; ++k) {
+        note_dtype(type, names[k], Pointer());
+        type.def_prop_rw(
+            names[k], [member, k](const Struct& s) { return reinterpret_cast<uintptr_t>((s.*member)[k]); },
+            [member, k](Struct& s, uintptr_t value) { (s.*member)[k] = reinterpret_cast<Pointer>(value); });
+    }
+}
+
+#define POINTER(type, Struct, name) pointer(type, #name, &Struct::name)
+#define VALUE(type, Struct, name) type.def_rw(#name, &Struct::name)
+
+// ---- csrc/launch.h
 
 void bind_view(nb::module_& m) {
     nb::class_<Profile<float>> profile(m, "Profile", nb::dynamic_attr());
@@ -168,6 +228,111 @@ void bind_blend(nb::module_& m) {
     POINTER(scores, ScoreArrays, totals);
     POINTER(scores, ScoreArrays, ids);
 }
+
+// ---- csrc/train.h: the fused training step
+
+// the weights of a struct's own Regularizers, as fields of the struct
+template <class Struct>
+void regularizers(nb::class_<Struct>& type) {
+    const auto field = [&type](const char* name, float Regularizers::*weight) {
+        type.def_prop_rw(
+            name, [weight](const Struct& s) { return s.own.*weight; },
+            [weight](Struct& s, float value) { s.own.*weight = value; });
+    };
+    field("entropy", &Regularizers::entropy);
+    field("opacity", &Regularizers::opacity);
+    field("scale", &Regularizers::scale);
+}
+
+void bind_training(nb::module_& m) {
+    nb::class_<LossSettings> settings(m, "LossSettings", nb::dynamic_attr());
+    settings.def(nb::init<>());
+    settings.def("set_pixelwise", [](LossSettings& s, bool l1) { s.pixelwise = l1 ? Pixelwise::l1 : Pixelwise::l2; });
+    VALUE(settings, LossSettings, pixelwise_weight);
+    VALUE(settings, LossSettings, ssim_weight);
+    VALUE(settings, LossSettings, margin);
+
+    nb::class_<Photographs> photographs(m, "Photographs", nb::dynamic_attr());
+    photographs.def(nb::init<>());
+    POINTER(photographs, Photographs, images);
+    POINTER(photographs, Photographs, masks);
+    POINTER(photographs, Photographs, shares);
+    POINTER(photographs, Photographs, moments);
+
+    nb::class_<LossArrays> loss(m, "LossArrays", nb::dynamic_attr());
+    loss.def(nb::init<>());
+    POINTER(loss, LossArrays, image);
+    POINTER(loss, LossArrays, windows);
+    POINTER(loss, LossArrays, partials);
+    POINTER(loss, LossArrays, values);
+    POINTER(loss, LossArrays, v_image);
+    VALUE(loss, LossArrays, width);
+    VALUE(loss, LossArrays, height);
+
+    nb::class_<Schedule> schedule(m, "Schedule", nb::dynamic_attr());
+    schedule.def(nb::init<>());
+    POINTER(schedule, Schedule, views);
+    POINTER(schedule, Schedule, viewmats);
+    POINTER(schedule, Schedule, Ks);
+    POINTER(schedule, Schedule, viewmat);
+    POINTER(schedule, Schedule, K);
+    POINTER(schedule, Schedule, rates);
+    POINTER(schedule, Schedule, numbers);
+    VALUE(schedule, Schedule, n_views);
+    VALUE(schedule, Schedule, place);
+    VALUE(schedule, Schedule, beta1);
+    VALUE(schedule, Schedule, beta2);
+    VALUE(schedule, Schedule, eps);
+
+    nb::class_<StepRecord> record(m, "StepRecord", nb::dynamic_attr());
+    record.def(nb::init<>());
+    POINTER(record, StepRecord, values);
+    POINTER(record, StepRecord, history);
+    POINTER(record, StepRecord, pop_sums);
+    VALUE(record, StepRecord, n);
+    VALUE(record, StepRecord, lambda_pop);
+
+    nb::class_<PopTerm> term(m, "PopTerm", nb::dynamic_attr());
+    term.def(nb::init<>());
+    VALUE(term, PopTerm, n);
+    POINTER(term, PopTerm, dominant_counts);
+    POINTER(term, PopTerm, window_counts);
+    POINTER(term, PopTerm, radii);
+    POINTER(term, PopTerm, logits);
+    POINTER(term, PopTerm, log_scales);
+    regularizers(term);
+    POINTER(term, PopTerm, sides);
+    POINTER(term, PopTerm, sums);
+
+    nb::class_<UpdateArrays> update(m, "UpdateArrays", nb::dynamic_attr());
+    update.def(nb::init<>());
+    VALUE(update, UpdateArrays, n);
+    VALUE(update, UpdateArrays, n_rest);
+    VALUE(update, UpdateArrays, n_views);
+    VALUE(update, UpdateArrays, place);
+    VALUE(update, UpdateArrays, lambda_pop);
+    regularizers(update);
+    VALUE(update, UpdateArrays, blur_own_view);
+    POINTER(update, UpdateArrays, constants);
+    POINTER(update, UpdateArrays, sh_rest_sum);
+    POINTER(update, UpdateArrays, sums);
+    POINTER(update, UpdateArrays, dominant_counts);
+    POINTER(update, UpdateArrays, pop_sides);
+    POINTER(update, UpdateArrays, grad_sum);
+    POINTER(update, UpdateArrays, n_visible);
+    POINTER(update, UpdateArrays, dominant_sum);
+    POINTER(update, UpdateArrays, blur_pixels);
+    POINTER(update, UpdateArrays, blurred);
+    update.def(
+        "set_group",
+        [](UpdateArrays& s, int group, uintptr_t param, uintptr_t m, uintptr_t v, uintptr_t gradient) {
+            s.groups[group] = {reinterpret_cast<float*>(param), reinterpret_cast<float*>(m),
+                               reinterpret_cast<float*>(v), reinterpret_cast<float*>(gradient)};
+        },
+        nb::arg("group"), nb::arg("param"), nb::arg("m"), nb::arg("v"), nb::arg("gradient") = 0);
+}
+
+// ---- functions
 
 void bind_functions(nb::module_& m) {
     using P = uintptr_t;

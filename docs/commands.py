@@ -3,6 +3,7 @@
 python docs/commands.py --write     run all of them (about ten minutes on two cores) and write the page and its pictures
 python docs/commands.py --only learn vectors    run these alone, which need no files of others, and write their sections
 python docs/commands.py --check     exit with 1 where the page does not have every command, each with its summary
+python docs/commands.py --demo out/demo    draw docs/demo.png from what `make demo` has trained
 
 Nothing is typed by hand: the outputs are those of a run, each no longer than a screen.
 """
@@ -10,6 +11,7 @@ Nothing is typed by hand: the outputs are those of a run, each no longer than a 
 from __future__ import annotations
 
 import base64
+import io
 import json
 import os
 import re
@@ -25,16 +27,26 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
+import numpy as np
+import torch
+from matplotlib import pyplot as plt
 from PIL import Image
 from websockets.sync.client import connect
 
 from paper_repro.cli import COMMANDS as REPRO_COMMANDS
+from pop_fast.api.backend import get_backend
 from pop_fast.children import module_command
 from pop_fast.cli import COMMANDS as OF_POP
+from pop_fast.data.gaussians import initialize_params
+from pop_fast.data.load import load_capture
+from pop_fast.io.images import id_colors
+from pop_fast.train.config import TrainConfig
+from pop_fast.train.views import ViewTensors, render_view
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 PAGE, PICTURES = DOCS / "commands.md", DOCS / "commands"
+DEMO, OF_CHAPTER = DOCS / "demo.png", ROOT / "pop_ref" / "walkthrough" / "trained.png"
 OF_REPRO = {name: about for name, (_, about) in REPRO_COMMANDS.items()}
 # what a command prints, in its folder
 PRINTED = ".printed"
@@ -221,8 +233,8 @@ def drawn(run: Run, folder: Path) -> Path | None:
         png.parent.mkdir(exist_ok=True)
         run.picture(folder, png)
         with Image.open(png) as taken:
-            # 256 colours are a third of the bytes
-            taken.convert("RGB").quantize(256, dither=Image.Dither.FLOYDSTEINBERG).save(png, "PNG", optimize=True)
+            small = _png(_in_256_colours(taken))
+        png.write_bytes(small)
     return png
 
 
@@ -314,12 +326,82 @@ def lacking(text: str) -> list[str]:
     ]
 
 
+# The picture of a demo run: one held-out view before training, after it, and as it was photographed. The same render
+# and photograph, without a word, are kept for chapter 0 of the walk-through.
+
+
+def before(result: Path, view: int) -> np.ndarray:
+    """Render a held-out view of the Gaussians that training began with. [H, W, 3] in [0, 1]"""
+    config = TrainConfig.from_json((result / "cfg.json").read_text(encoding="utf-8"))
+    capture = load_capture(config.data, factor=config.factor, normalize=config.normalize)
+    params = initialize_params(capture, config.seed, config.init_opacity, config.init_scale)
+    with torch.no_grad():
+        made = render_view(
+            get_backend("fast"), params, ViewTensors.of(capture.test_views(config.test_every)[view]), config, 0
+        )
+    return made.image.clamp(0.0, 1.0).numpy()
+
+
+def data_of(result: Path, view: int) -> Path:
+    """Find the maps of a held-out view after the last step."""
+    return sorted((result / "report_data").glob(f"val_step*_{view:04d}.npz"))[-1]
+
+
+def side_by_side(result: Path, view: int = 0) -> bytes:
+    """Put the render of a held-out view to the left of its photograph; PNG."""
+    with np.load(data_of(result, view)) as kept:
+        both = np.hstack([kept["render"], kept["photo"]])
+    return _png(Image.fromarray(both))
+
+
+def draw(result: Path, view: int = 0) -> bytes:
+    """Compose the picture of one held-out view of a result folder; PNG with 256 colours."""
+    with np.load(data_of(result, view)) as kept:
+        photo, render, ids = kept["photo"], kept["render"], kept["dominant_ids"]
+        psnr = float(kept["psnr"])
+    parts = (
+        ("before training: one Gaussian a point", before(result, view)),
+        (f"after a minute on two cores: {psnr:.1f} dB", render),
+        ("the photograph, never seen in training", photo),
+        ("the dominant Gaussian of each pixel", id_colors(ids)),
+    )
+    height, width = photo.shape[:2]
+    figure, axes = plt.subplots(1, 4, figsize=(4 * width / 100, (height + 24) / 100), dpi=100)
+    for axis, (title, picture) in zip(axes, parts, strict=True):
+        axis.imshow(picture, interpolation="nearest")
+        axis.set_axis_off()
+        axis.text(0.5, -0.03, title, transform=axis.transAxes, ha="center", va="top", fontsize=9, color="#666666")
+    figure.subplots_adjust(left=0, right=1, top=1, bottom=24 / (height + 24), wspace=0.02)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", transparent=False)
+    plt.close(figure)
+    return _png(_in_256_colours(Image.open(buffer)))
+
+
+def _in_256_colours(picture: Image.Image) -> Image.Image:
+    # a third of the bytes
+    return picture.convert("RGB").quantize(256, dither=Image.Dither.FLOYDSTEINBERG)
+
+
+def _png(picture: Image.Image) -> bytes:
+    buffer = io.BytesIO()
+    picture.save(buffer, "PNG", optimize=True)
+    return buffer.getvalue()
+
+
 def main() -> int:
-    """Print, write or check the page."""
+    """Print, write or check the page, or draw the demo's picture."""
     if "--check" in sys.argv:
         missing = lacking(PAGE.read_text(encoding="utf-8"))
         print("\n".join(missing) or f"{PAGE.name} has every command")
         return int(bool(missing))
+    if "--demo" in sys.argv:
+        result, *view = sys.argv[sys.argv.index("--demo") + 1 :]
+        plt.switch_backend("Agg")
+        for target, made in ((DEMO, draw), (OF_CHAPTER, side_by_side)):
+            target.write_bytes(made(Path(result), *map(int, view)))
+            print(f"{target}: {target.stat().st_size / 1000:.0f} kB")
+        return 0
     if "--only" in sys.argv:
         names = sys.argv[sys.argv.index("--only") + 1 :]
         PAGE.write_text(with_sections_of(names, PAGE.read_text(encoding="utf-8")), encoding="utf-8")

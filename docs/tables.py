@@ -17,9 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from paper_repro.claims_page import outcome as outcome_of
 from paper_repro.methods import load_pinned
 from paper_repro.status import everything, status_table
+from paper_repro.status import outcome as outcome_of
 from pop_fast.train.presets import METHODS, options_for
 from pop_ref.conformance.capabilities import STAGES as KIT_STAGES
 from pop_ref.conformance.law_coverage import LIMITS, reason
@@ -328,7 +328,7 @@ def speed() -> str:
     """Make the tables of CPU times, those of a row taken in turns in one process: training steps, renders, blends."""
     timed = json.loads(CPU_TIMES.read_text(encoding="utf-8"))
     machine = timed["machine"]
-    make = runpy.run_path(str(ROOT / "benchmarks" / "step_tables.py"))["steps"]
+    make = runpy.run_path(str(ROOT / "benchmarks" / "results_table.py"))["steps"]
     made, rows = [str(make(timed))], []
     for case in timed["raster"]:
         rows.append(_speed_row(f"render, {_size(case)}", case["forward_ms"]))

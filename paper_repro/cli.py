@@ -373,7 +373,7 @@ def claims(words: Sequence[str]) -> int:
     _add_results(parser)
     parser.add_argument("--out", type=Path, metavar="DIR", help="write claims.md there instead of printing")
     args = parser.parse_args(words)
-    from paper_repro.claims_page import markdown
+    from paper_repro.status import markdown
 
     text = markdown(args.scale, read_all(args.scale, existing_folder(args.results)))
     if args.out is None:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from paper_repro.jobs import Job
-from paper_repro.record import BINS, LPIPS_VARIANTS, UNTIMED, Result, run_id, settings_hash
+from paper_repro.results import BINS, LPIPS_VARIANTS, UNTIMED, Result, run_id, settings_hash
 from pop_fast.errors import PopError
 from pop_fast.io.read_back import read_arrays, read_json
 from pop_fast.machine import processor_kind

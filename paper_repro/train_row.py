@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from paper_repro import prepared, results
 from paper_repro.jobs import WORK, Job
-from paper_repro.record import COMMIT
-from paper_repro.results import Result
+from paper_repro.results import COMMIT, Result
 from paper_repro.scenes import MADE, PaperScene, find_folder
 from pop_fast.errors import PopError
 

@@ -23,7 +23,7 @@ from typing import Final
 
 from paper_repro.collect import curve_of, digits, file_hash, final_stats, ply_of
 from paper_repro.jobs import Job
-from paper_repro.record import Result
+from paper_repro.results import Result
 from paper_repro.train_row import Options
 from pop_fast.api.backend import backend_names, get_backend
 from pop_fast.children import python_command

@@ -22,7 +22,6 @@ import numpy as np
 from pop_ref.density import densifies_at
 from pop_ref.settings import BETAS, EPS, MAX_SH_DEGREE, LearningRates, Recipe, UpdateRules
 
-LEARNING_RATES: Final = LearningRates().by_parameter()
 MAX_STEPS: Final = Recipe.max_steps
 SH_DEGREE_INTERVAL: Final = Recipe.sh_interval
 

@@ -70,11 +70,6 @@ class Registry(Mapping[str, T], Generic[T]):
             self._check(name, value, f"the value registered as {self.kind} {name!r}")
         self._given[name] = value
 
-    def unregister(self, name: str) -> None:
-        """Forget a value that `register` has added."""
-        self._given.pop(name, None)
-        self._loaded.pop(name, None)
-
     def named(self, name: str) -> T:
         """Return the value of a name.
 

@@ -1,4 +1,6 @@
-"""python -m benchmarks.faults [--minutes M] [--only PART] [--quick] [--seed N] [--save] [--out FILE]
+"""What the program does when its input is damaged, its disk fails, or it is killed.
+
+python -m benchmarks.faults [--minutes M] [--only PART] [--quick] [--seed N] [--save] [--out FILE]
 
 Runs the parts below, prints what failed, and writes benchmarks/results/faults.json, of which docs/reliability.md has
 the tables; a part that is run alone replaces its own results, and so does a --reader or a --kind. With --minutes the

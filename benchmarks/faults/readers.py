@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from cuda_ext.gpu_check.command import begun_report
+from cuda_ext.gpu_check.__main__ import begun_report
 from cuda_ext.gpu_check.outcomes import outcomes
 from paper_repro import jobs, paper, prepared, results, scenes
 from paper_repro.collect import collect

@@ -74,7 +74,7 @@ CHECKS: Final[Mapping[str, Check]] = {
 }
 EMULATION: Final = "kernels under the emulator"
 # these are compiled by the emulator's own build, with the flags that POP_EMULATED_FLAGS adds
-EMULATED: Final = (emulate.HERE / "emulator.cpp", CUDA_EXT / "bindings.cpp", CUDA_EXT / "bindings_training.cpp")
+EMULATED: Final = (emulate.HERE / "emulator.cpp", CUDA_EXT / "bindings.cpp")
 # its fibers switch stacks, which AddressSanitizer must not follow
 _EMULATED_FLAGS: Final = "-fsanitize=address --param asan-stack=0"
 _EMULATED_TESTS: Final = tuple(f"tests/cuda/gpu/test_{name}.py" for name in ("smoke", "ten_steps"))

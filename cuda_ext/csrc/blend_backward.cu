@@ -12,7 +12,6 @@
 // lanes; splats by what a pair costs and by the steps that fill and drain a warp. sum_slots is bounded by the latency of
 // memory, a few rows a splat. Counts: benchmarks/NOTES.md, `make sass`.
 
-#include "cuda_check.h"
 #include "warp_sums.cuh"
 
 namespace pop {

@@ -5,7 +5,6 @@
 // arithmetic on registers, half of it multiplications and additions. Next to it stands the special function unit, which
 // takes eight cycles for the exponentials of a warp. Counts: benchmarks/NOTES.md, `make sass`.
 
-#include "cuda_check.h"
 #include "quarters.cuh"
 
 namespace pop {

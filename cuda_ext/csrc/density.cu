@@ -1,6 +1,5 @@
 // Row operations of density control, between replays of the training graph.
 
-#include "cuda_check.h"
 #include "density.cuh"
 #include "kernel_tools.cuh"
 #include "train.h"

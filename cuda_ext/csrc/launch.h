@@ -6,11 +6,24 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <stdexcept>
+#include <string>
 
 #include "profile.cuh"
 #include "splatting.cuh"
 
+// Every CUDA call and launch goes through here: a failure throws, with the call, the place and CUDA's own words.
+#define POP_CUDA(call) ::pop::check_cuda((call), #call, __FILE__, __LINE__)
+// a launch reports its own errors at once; what happens inside the kernel surfaces at the next synchronisation
+#define POP_LAUNCHED(kernel) ::pop::check_cuda(cudaGetLastError(), "launch of " kernel, __FILE__, __LINE__)
+
 namespace pop {
+
+inline void check_cuda(cudaError_t error, const char* what, const char* file, int line) {
+    if (error == cudaSuccess) return;
+    throw std::runtime_error(std::string("CUDA: ") + what + " failed with " + cudaGetErrorName(error) + " (" +
+                             cudaGetErrorString(error) + ") at " + file + ":" + std::to_string(line));
+}
 
 constexpr int RECORD = 12;                // floats of a packed splat, and of a row of gradient sums
 constexpr int WARP_TILE_W = 16, WARP_TILE_H = 8, TILE_PIXELS = WARP_TILE_W * WARP_TILE_H;

@@ -12,7 +12,6 @@
 // each, 128 bytes in one piece; a pitch of 44 floats keeps the pieces of every row at multiples of 16 bytes. Down, and
 // where the tile is filled, the 32 threads of a warp are at 32 neighbouring floats.
 
-#include "cuda_check.h"
 #include "kernel_tools.cuh"
 #include "ssim.cuh"
 #include "train.h"

@@ -7,7 +7,6 @@
 // times a third of the harmonics, and in each no load waits for another. That is 5 to 11 KB on their way for a warp; 16
 // warps fit a multiprocessor by the registers that gradients take, and about 25 KB keep its share of the memory busy.
 
-#include "cuda_check.h"
 #include "density.cuh"
 #include "gaussian_rows.cuh"
 #include "polarization.cuh"

@@ -5,7 +5,6 @@
 // camera's matrices with the geometry, then the rows of harmonics that are wanted, in two parts of six pieces of 16
 // bytes a lane.
 
-#include "cuda_check.h"
 #include "gaussian_rows.cuh"
 
 namespace pop {

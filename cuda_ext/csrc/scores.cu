@@ -4,7 +4,6 @@
 // A row of sums goes to its instance's slot, by exactly one warp, and a warp a splat adds its rows up in double in the
 // order of the slots, so nothing is added in an order that varies.
 
-#include "cuda_check.h"
 #include "kernel_tools.cuh"
 #include "scores.cuh"
 

@@ -3,7 +3,6 @@
 //
 // Bounded by latency: one block begins a step and one ends it; the sums read a few floats a Gaussian.
 
-#include "cuda_check.h"
 #include "gaussian_rows.cuh"
 #include "polarization.cuh"
 #include "train.h"

@@ -2,6 +2,10 @@
 
 `kernel<<<grid, block, 0, stream>>>(arguments)` is turned into a call of the emulator; everything else is compiled as it
 is, bindings included, against headers that stand in for CUDA's. Device pointers are then addresses of CPU tensors.
+
+What is loaded from a library runs as whoever loads it. In a folder for everybody, such as that for temporary files,
+whoever knows the name can put a library of their own there first: `library_folder` is beside the code, or in a cache
+that is this user's alone.
 """
 
 from __future__ import annotations
@@ -13,6 +17,7 @@ import importlib.util
 import os
 import re
 import shutil
+import stat
 import subprocess
 import sys
 import sysconfig
@@ -27,7 +32,7 @@ from cuda_ext.toolkit import find_compiler
 if TYPE_CHECKING:
     import pytest
 
-HERE, CUDA_EXT = Path(__file__).parent, Path(cuda_ext.__file__).parent
+HERE, CUDA_EXT = Path(__file__).parent, Path(cuda_ext.__file__).resolve().parent
 # _setjmp and _longjmp switch fibers, which a fortified longjmp takes for an accident
 FLAGS = ("-std=c++17", "-O1", "-fPIC", "-shared", "-ffp-contract=off", "-fno-strict-aliasing", "-U_FORTIFY_SOURCE")
 # more flags: POP_EMULATED_FLAGS="-fsanitize=address --param asan-stack=0", with libasan preloaded, watches every access
@@ -122,8 +127,7 @@ def _compile(compiler: list[str], library: Path) -> None:
         (work / "csrc" / file.with_suffix(".cpp" if file.suffix == ".cu" else file.suffix).name).write_text(
             translated(file.read_text(encoding="utf-8")), encoding="utf-8"
         )
-    for name in ("bindings.cpp", "bindings_training.cpp", "bindings.h"):
-        (work / name).write_text((CUDA_EXT / name).read_text(encoding="utf-8"), encoding="utf-8")
+    shutil.copy(CUDA_EXT / "bindings.cpp", work)
     include = Path(nanobind.include_dir())
     folders = (HERE / "include", work, include, include.parent / "ext" / "robin_map" / "include")
     sources = (*work.rglob("*.cpp"), HERE / "emulator.cpp", Path(nanobind.source_dir()) / "nb_combined.cpp")
@@ -235,3 +239,39 @@ def install(patch: pytest.MonkeyPatch, library: Path) -> None:
     patch.setattr(torch, "empty_like", _rubbish(torch.empty_like))
     patch.setattr(train_step, "Watch", NoWaiting)
     patch.setattr(train_step, "captured", captured)
+
+
+def library_folder(package: Path = CUDA_EXT) -> Path:
+    """Return the folder to compile into and to load from: `build` in the package's own, where that can be written to.
+
+    Args:
+        package: a folder with code of this project; whoever may write to it can change the code as well.
+
+    Raises:
+        RuntimeError: the cache that stands in for it is, or was, open to others; names it and what to do.
+    """
+    folder = package / "build"
+    if os.access(folder if folder.exists() else package, os.W_OK):
+        return folder
+    given = os.environ.get("XDG_CACHE_HOME", "")
+    cache = (Path(given) if os.path.isabs(given) else Path.home() / ".cache") / "pop-splatting"
+    # made for this user alone from the first moment
+    cache.parent.mkdir(parents=True, exist_ok=True)
+    cache.mkdir(mode=0o700, exist_ok=True)
+    _require_own(cache, others=0o077)
+    for file in cache.iterdir():
+        _require_own(file, others=0o022)
+    return cache
+
+
+def _require_own(path: Path, others: int) -> None:
+    found = path.lstat()
+    if stat.S_ISLNK(found.st_mode):
+        problem = "is a link"
+    elif found.st_uid != os.geteuid():
+        problem = f"belongs to user {found.st_uid}, not to you"
+    elif found.st_mode & others:
+        problem = f"is open to others (mode {stat.S_IMODE(found.st_mode):03o})"
+    else:
+        return
+    raise RuntimeError(f"{path}: {problem}, so nothing is loaded from it; remove it, or set XDG_CACHE_HOME elsewhere")

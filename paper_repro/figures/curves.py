@@ -28,7 +28,7 @@ from paper_repro.results import Result
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 from paper_repro.figures.style import GREY, darker
-from paper_repro.record import BINS
+from paper_repro.results import BINS
 
 _METHODS: Final = ("3dgs", "gsplat", "pup", "mini_splatting", "taming", "speedy_splat", "pop")
 _LOSSES: Final = ("l1_div_1", "l2_without_ssim", "l2")

@@ -158,7 +158,7 @@ class CudaBackend(BaseBackend):
 
 
 def _make_fused(task: Task) -> MakeFused:
-    from pop_fast.cuda.training import make_fused
+    from pop_fast.cuda.stages import make_fused
 
     return make_fused(task)
 

@@ -7,7 +7,6 @@
 #include "c_api.h"
 #include "forward.h"
 #include "lists.h"
-#include "moments.h"
 #include "projection.h"
 #include "ssim.h"
 #include "threads.h"

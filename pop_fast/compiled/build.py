@@ -30,8 +30,8 @@ UNITS: Final = tuple(
     f"{name}.cpp" for name in ("blend", "scores", "step", "step_lists", "step_pixels", "step_update", "counts")
 )
 SOURCES: Final = (
-    *("projection.h", "colors.h", "lists.h", "tile.h", "forward.h", "backward.h", "ssim.h", "moments.h"),
-    *("scores.h", "c_api.h", "lanes.h", "threads.h", "pool.h", "step.h", "step_rows.h", "row_block.h"),
+    *("projection.h", "colors.h", "lists.h", "tile.h", "forward.h", "backward.h", "ssim.h"),
+    *("scores.h", "c_api.h", "lanes.h", "threads.h", "step.h", "row_block.h"),
     *UNITS,
 )
 # one Gaussian's arithmetic is that of the CUDA kernels

@@ -119,7 +119,7 @@ class Ssim(ctypes.Structure):
 
 
 class Moments(ctypes.Structure):
-    """`pop::Moments` of moments.h, where every field is explained, in its order."""
+    """`pop::Moments` of ssim.h, where every field is explained, in its order."""
 
     _fields_ = (
         *fields_of(POINTER, "photograph"),

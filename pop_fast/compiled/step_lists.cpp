@@ -7,7 +7,7 @@
 #include <utility>
 
 #include "lists.h"
-#include "step_rows.h"
+#include "step.h"
 
 namespace pop {
 

@@ -3,7 +3,7 @@
 #include <algorithm>
 #include <cmath>
 
-#include "step_rows.h"
+#include "step.h"
 
 namespace pop {
 

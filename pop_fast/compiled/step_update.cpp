@@ -4,7 +4,7 @@
 
 #include "cuda_ext/csrc/density.cuh"
 #include "cuda_ext/csrc/polarization.cuh"
-#include "step_rows.h"
+#include "step.h"
 
 namespace pop {
 

@@ -1,10 +1,11 @@
-"""The stages of a view by the CUDA kernels, and a pass over it."""
+"""What this program asks of the kernels of `cuda_ext`: the stages of a view, a pass over it, whole training steps."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -13,6 +14,9 @@ from cuda_ext.arrays import Settings, new_state
 from cuda_ext.render.autograd import Blend, Project, RenderStats
 from cuda_ext.render.lists import WARP_TILE, list_tile, make_lists, splat_struct
 from cuda_ext.render.scores import ScoredView
+from cuda_ext.training.batch_step import BatchTrainer
+from cuda_ext.training.step_buffers import ResidentViews
+from cuda_ext.training.train_step import FusedTrainer
 from pop_fast.stages.compositing import Composite
 from pop_fast.stages.contributions import Contributions, DominantPoints, fisher_blocks, points_on_rays, towards_camera
 from pop_fast.stages.projection import intrinsics
@@ -21,6 +25,9 @@ from pop_fast.stages.stage_set import PassInput, Seen
 from pop_fast.stages.tiles import TileLists
 from pop_fast.stages.types import Camera, Gaussians
 from pop_fast.train.engines import translate_oom
+from pop_fast.train.stepper import Fused, MakeFused, Rows, Task
+from pop_fast.train.steps import StepSettings
+from pop_fast.train.views import ViewTensors
 
 WIDEST = 4  # channels that one launch blends
 
@@ -210,3 +217,38 @@ class CudaView:
         ids = self._view.dominant_of(towards_camera(pass_input.gaussians, c).float(), rays)
         points = points_on_rays(ids, pass_input.gaussians, c, pass_input.profile)
         return DominantPoints(points.float(), ids, self._view.T_final)
+
+
+# of the card's free memory, what photographs may take, and their blurred values; the rest is for Gaussians and lists
+PHOTOGRAPHS_SHARE = 0.25
+MOMENTS_SHARE = 0.25
+_BYTES_OF_MOMENTS = 24  # a pixel
+
+
+def make_fused(task: Task) -> MakeFused:
+    """Return what makes the fused step, with the photographs on the GPU."""
+    return partial(_fused, task)
+
+
+def _fused(
+    task: Task,
+    params: Rows,
+    m: Rows,
+    v: Rows,
+    views: Sequence[ViewTensors],
+    order: Sequence[int],
+    settings: StepSettings,
+    step: int,
+) -> Fused:
+    given = (params, m, v, _resident(views, settings, params["means"].device), order, settings, step)
+    size = task.config.batch_size
+    return FusedTrainer(*given) if size == 1 else BatchTrainer(*given, size, task.ranks)
+
+
+def _resident(views: Sequence[ViewTensors], settings: StepSettings, device: torch.device) -> ResidentViews:
+    pixels = sum(view.height * view.width for view in views)
+    free, _ = torch.cuda.mem_get_info(device)
+    cameras = (torch.cat([view.viewmat for view in views]), torch.cat([view.K for view in views]))
+    given = ([view.photo for view in views], *cameras, [view.mask for view in views], settings.padding, device)
+    keeps = _BYTES_OF_MOMENTS * pixels <= MOMENTS_SHARE * free
+    return ResidentViews(*given, cache_moments=keeps, room=int(PHOTOGRAPHS_SHARE * free))

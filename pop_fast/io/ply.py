@@ -165,11 +165,6 @@ def _params(rows: np.ndarray, path: Path) -> dict[str, torch.Tensor]:
     return {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()}
 
 
-def is_antialiased(path: str | os.PathLike[str]) -> bool:
-    """Tell whether a PLY file asks to be drawn with antialiasing: its comment `SplatRenderMode: mip`."""
-    return asks_for_antialiasing(read_header(Path(path)))
-
-
 def asks_for_antialiasing(header: Header) -> bool:
     """Tell whether a header has the comment `SplatRenderMode: mip`."""
     return any(comment.startswith(MODE) and comment.split()[-1] == "mip" for comment in header.comments)

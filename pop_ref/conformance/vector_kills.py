@@ -31,11 +31,10 @@ from pop_ref.conformance.calls import Call, Frame, unpacked
 from pop_ref.conformance.mutants import FAMILIES
 from pop_ref.conformance.mutants.trial import alive
 from pop_ref.conformance.scenes import Scene, scene_from
-from pop_ref.conformance.vector_calls import FORMS, KINDS
 from pop_ref.conformance.vector_check import read_index, verdicts_of
 from pop_ref.conformance.vector_stages import made, outputs
 from pop_ref.conformance.vector_training import Replay, step_sums
-from pop_ref.conformance.vectors import export
+from pop_ref.conformance.vectors import FORMS, KINDS, export
 from pop_ref.constants import PAPER, Profile
 from pop_ref.covariance import covars_from_quats_scales_vjp
 from pop_ref.density import DensityConfig, rows_from_params

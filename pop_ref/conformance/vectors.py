@@ -1,23 +1,27 @@
 """Portable vectors: what an exact renderer makes of fixed inputs, so that ports are judged without Python.
 
 `export` writes one npz a vector and an `index.json` that explains every array and how it is compared: single images
-with every stage on the way, few scenes, one for each thing that goes wrong in a port; calls of several cameras
-(`vector_calls`); the corpus at scale, whose images and gradients are kept as weighted sums; losses and training steps
-(`vector_training`); single stages (`vector_stages`). `vector_check` judges a port's results by that index alone. Needs
-numpy only.
+with every stage on the way, few scenes, one for each thing that goes wrong in a port; calls of several cameras,
+with batches, depth modes and plain colours; the corpus at scale, whose images and gradients are kept as weighted sums;
+losses and training steps (`vector_training`); single stages (`vector_stages`). `vector_check` judges a port's results
+by that index alone. Needs numpy only.
+
+What a call is packed as, and in what form covariances come, is told by options: images are the same.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from pop_ref.conformance import vector_training as training
-from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.adapter import Adapter, OracleAdapter
+from pop_ref.conformance.calls import Call, Frame
 from pop_ref.conformance.corpus import GRADIENTS as IN_RUNS
 from pop_ref.conformance.corpus import MAPS, PLANS, answers, corpus_scene, unambiguous_cotangents
 from pop_ref.conformance.error_bounds import PixelErrorBounds, pixel_error_bounds
@@ -32,7 +36,7 @@ from pop_ref.conformance.scenes import (
     scene_arrays,
     scene_options,
 )
-from pop_ref.conformance.vector_calls import FORMS, KINDS, call_arrays, call_kind, calls, kind_of
+from pop_ref.conformance.signature import Expected, expectations
 from pop_ref.conformance.vector_check import (
     GRADIENTS,
     IMAGES,
@@ -42,14 +46,269 @@ from pop_ref.conformance.vector_check import (
     entry,
     equal,
     gradient,
+    output,
     render_kind,
     schema,
 )
 from pop_ref.conformance.vector_stages import stage_kinds, stage_vectors
 from pop_ref.conformance.vector_training import training_kind, training_vectors
+from pop_ref.conformance.views import call_for, clear_call
 from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER, Profile
+from pop_ref.depth import RenderMode
 from pop_ref.margins import margins
 from pop_ref.records import Camera
+from pop_ref.splatting import project
+
+# options that change the form of what is given, and no image
+FORMS: Final = ("packed", "covars", "no_background")
+_GAUSSIANS = ("means", "quats", "scales", "opacities")
+_ABOUT = "cameras that look at the same Gaussians, each with its background; 'render_mode' says what an image is"
+MODES = {
+    "RGB": "colours",
+    "D": "depth: the sum of weights times camera z, nothing behind",
+    "ED": "expected depth: D over max(1 - T_final, 1e-10)",
+    "RGB+D": "colours, then D",
+    "RGB+ED": "colours, then ED",
+}
+
+
+def calls() -> dict[str, Call]:
+    """Return the calls by name."""
+    reader = Adapter()  # float32 and the paper's constants
+
+    def seen(seed: int, count: int, mode: RenderMode = "RGB", **asks: Any) -> Call:
+        return clear_call(reader, 16 * seed, count=count, render_mode=mode, **asks)
+
+    found = {"three_cameras": seen(0, 3), "three_cameras_of_degree_three": seen(1, 3, degree=3)}
+    for k, mode in enumerate(("D", "ED", "RGB+D", "RGB+ED")):
+        found[f"mode_{mode.lower().replace('+', '_and_')}"] = seen(2 + k, 2, mode)
+    return found | {
+        "five_channels": seen(6, 2, channels=5),
+        "one_channel_and_depth": seen(7, 2, "RGB+ED", channels=1),
+        "thirty_three_channels": seen(8, 2, channels=33),
+        "antialiased_cameras": seen(9, 2, antialiased=True),
+        "antialiased_depth_under_a_wide_low_pass": seen(10, 2, "RGB+ED", antialiased=True, eps2d=1.25),
+        "a_near_plane": seen(11, 2, "RGB+D", near_plane=2.0),
+        "a_far_plane": seen(12, 2, far_plane=4.5),
+        "small_splats_left_out": seen(13, 2, "ED", radius_clip=5.5),
+        "first_band_of_three": seen(14, 2, degree=3, sh_degree=1),
+        "harmonics_of_each_camera": seen(15, 3, degree=3, camera_colors=True),
+        "colors_of_each_camera": seen(16, 3, "RGB+D", channels=4, camera_colors=True),
+        "a_camera_that_sees_nothing": seen(17, 2, blind=1),
+        "hundreds_of_tiles": seen(18, 2, size=(35, 33), tile_size=2),
+        "batches": seen(19, 2, "RGB+ED", batch=(2,)),
+        "batches_of_two_dimensions": seen(20, 2, batch=(2, 2), antialiased=True, eps2d=1.25),
+        "packed": seen(21, 3, packed=True),
+        "packed_depth_and_a_blind_camera": seen(22, 3, "RGB+ED", packed=True, blind=0),
+        "packed_antialiased": seen(23, 2, packed=True, antialiased=True, eps2d=1.25),
+        "packed_between_planes": seen(24, 2, packed=True, near_plane=2.0, far_plane=4.5),
+        "packed_small_splats_left_out": seen(25, 2, packed=True, radius_clip=5.5, sh_degree=1, degree=3),
+        "packed_colors_of_each_camera": seen(26, 3, packed=True, channels=4, camera_colors=True),
+        "packed_plain_colors": seen(27, 2, packed=True, channels=3),
+        "packed_batches": seen(28, 2, batch=(2,), packed=True),
+        "packed_batches_of_two_dimensions": seen(29, 2, batch=(2, 2), packed=True),
+        "packed_covariances": seen(30, 2, packed=True, covars=True),
+        "covariances": seen(31, 2, covars=True, antialiased=True),
+        "covariances_of_batches": seen(32, 2, covars=True, batch=(2,)),
+        "covariances_between_planes": seen(33, 2, covars=True, near_plane=2.0, radius_clip=5.5),
+        "small_splats_of_one_axis_stay": seen(34, 2, radius_clip=4.5),
+        "without_backgrounds": seen(35, 2, no_background=True),
+        "plain_batches": seen(36, 2, batch=(2,), channels=3),
+        "small_splats_of_one_camera": seen(37, 1, radius_clip=4.5),
+        "packed_and_the_last_camera_is_blind": seen(38, 3, packed=True, blind=2),
+        "a_tile_for_every_pixel": seen(39, 2, size=(35, 33), tile_size=1),
+        "a_centre_on_the_far_plane": _on_the_far_plane(reader),
+    }
+
+
+def _on_the_far_plane(reader: Adapter) -> Call:
+    """Return a call of a camera that does not turn, with a centre on its far plane and one beyond."""
+    frame = call_for(reader, 600).first
+    placed = {"means": np.array([[0.0, 0.0, 3.0], [0.25, 0.0, 5.0]]), "viewmat": np.eye(4)}
+    return Call(((Frame(frame.scene.rows([0, 1]).with_overrides(**placed)),),), planes={"far_plane": 3.0})
+
+
+def _clear_of_the_far_plane(call: Call) -> Call:
+    """Return a call with the plane a little beyond a centre that lies on it: it draws the same, and clearly so."""
+    far = call.planes.get("far_plane")
+    depths = [project(f.scene.gaussians, f.scene.camera, f.scene.sh_degree, f.scene.profile).depths
+              for _, _, f in call.each]  # fmt: skip
+    if far is None or not np.any(np.array(depths) == far):
+        return call
+    return replace(call, planes={**call.planes, "far_plane": far * (1.0 + 2.0**-8)})
+
+
+def kind_of(call: Call) -> str:
+    """Return the kind of a call's vector: its colours' names and shapes, and whether it has batches."""
+    form = {"_plain": call.sh_degree is None, "_of_each_camera": call.camera_colors, "_of_batches": bool(call.batch)}
+    return "call" + "".join(word for word, holds in form.items() if holds)
+
+
+KINDS: Final = ("call", "call_plain", "call_of_each_camera", "call_plain_of_each_camera", "call_of_batches",
+                "call_plain_of_batches")  # fmt: skip
+_OF_ROWS: Final = {
+    "means2d": ("[C, N, 2]", "screen centres, px"),
+    "depths": ("[C, N]", "camera z"),
+    "conics": ("[C, N, 3]", "inverse of the blurred screen covariance: xx, xy, yy, px^-2"),
+}
+# what gsplat's meta tells of a call besides
+_TOLD: Final = {"n_cameras": "cameras", "n_batches": "batch entries", "tile_size": "px, as the option"}
+_MASKS: Final = {
+    "unambiguous": ("[C, H, W]", "every decision of the pixel is clear of rounding"),
+    "decided": ("[C, H, W]", "unambiguous, and the dominant Gaussian is clear too"),
+    "counted_rows": ("[C, N]", "at no pixel that is undecided the Gaussian is blended, or could be"),
+    "clear_rows": ("[C, N]", "no cull and no extent of the Gaussian is within rounding"),
+    "visible_rows": ("[C, N]", "clear_rows, and the Gaussian is not culled"),
+    "smooth_rows": ("[N]", "no kink of this Gaussian is within rounding for any camera"),
+    "smooth_rows_of_each": ("[C, N]", "smooth_rows, once more for each camera"),
+    "all_smooth": ("[]", "smooth_rows holds everywhere"),
+    "all_clear": ("[]", "clear_rows holds everywhere"),
+}
+# gsplat's lists of intersections; of an entry of a batch they are left out
+_LISTS: Final = {
+    "tiles_per_gauss": ("[C, N]", "tiles that each Gaussian's extent overlaps, 'tiles_per_gauss' of meta"),
+    "list_rows": ("[I]", "which Gaussians lie in each tile of each camera, front to back: row c N + i, or where rows "
+                  "are packed the place among visible ones; 'flatten_ids' of meta"),
+    "list_keys": ("[I]", "camera and tile of each: c 2^b + tile, b the bits of the number of tiles; the upper 32 bits "
+                  "of 'isect_ids' of meta"),
+}  # fmt: skip
+_WHOLE_LISTS: Final = "; leave it out where your lists are tighter than whole extents"
+
+
+def call_kind(kind: str) -> dict[str, Any]:
+    """Return what the index says of calls of one of KINDS."""
+    plain, own, batches = (word in kind for word in ("_plain", "_of_each_camera", "_of_batches"))
+    colors, shape = ("colors", "[N, D]") if plain else ("sh", INPUTS["sh"][0])
+    shape = shape.replace("[N", "[C, N") if own else shape
+    given = {name: INPUTS[name] for name in _GAUSSIANS}
+    given |= {
+        colors: (shape, "colours as they are drawn" if plain else INPUTS["sh"][1]),
+        "viewmats": ("[C, 4, 4]", "world -> camera, of each camera"),
+        "Ks": ("[C, 3, 3]", "intrinsics, px, of each camera"),
+        "backgrounds": ("[C, B]", "colours behind everything, of each camera"),
+        "v_images": ("[C, H, W, X]", "cotangents of images; zero near thresholds"),
+        "v_alphas": ("[C, H, W]", "cotangents of alphas; zero near thresholds"),
+    }
+    arrays = {name: entry("input", *about) for name, about in given.items()}
+    arrays |= output("images", "[C, H, W, X]", "what every camera sees", "agreement.image", "unambiguous")
+    arrays |= output("alphas", "[C, H, W]", "1 - T_final", "agreement.T_final", "unambiguous")
+    arrays |= output("T_final", "[C, H, W]", "transmittance that is left", "agreement.T_final", "unambiguous")
+    for name, said in _TOLD.items():
+        arrays[name] = entry("output", "[]", said, "int64", [equal()])
+    for name, where in (("dominant_ids", "decided"), ("n_blended", "unambiguous")):
+        arrays[name] = entry("output", "[C, H, W]", IMAGES[name][1], "int64", [equal(where)])
+    counted = "pixels that each Gaussian dominates"
+    arrays["dominant_counts"] = entry("output", "[C, N]", counted, "int64", [equal("counted_rows")])
+    extents = "extents along x and y, px, 0 where culled"
+    arrays["radii"] = entry("output", "[C, N, 2]", extents, "int64", [equal("clear_rows")])
+    for name, (shape, said) in () if batches else _LISTS.items():
+        where = "clear_rows" if shape == "[C, N]" else "all_clear"
+        arrays[name] = entry("output", shape, said + _WHOLE_LISTS, "int64", [equal(where)])
+    for name, about in _OF_ROWS.items():
+        arrays |= output(name, *about, "meta.rows", "visible_rows")
+    for name in (*_GAUSSIANS, colors):
+        whose = "" if own and name == colors else ", summed over cameras"
+        where = "smooth_rows_of_each" if own and name == colors else "smooth_rows"
+        meaning = f"derivative of sum(v_images images) + sum(v_alphas alphas) to {name}{whose}"
+        arrays |= output(f"v_{name}", given[name][0], meaning, f"agreement.v_{name}", where)
+    for name, key in (("viewmats", "viewmat"), ("backgrounds", "background")):
+        where = "all_smooth" if name == "viewmats" else None
+        arrays |= output(f"v_{name}", given[name][0], f"derivative to {name}", f"agreement.v_{key}", where)
+    arrays |= {name: entry("mask", *about, "bool") for name, about in _MASKS.items()}
+    if batches:
+        for about in arrays.values():
+            about["shape"] = f"[E, {about['shape'][1:]}".replace("[E, ]", "[E]")
+    return {"about": _ABOUT, "modes": MODES, "arrays": arrays}
+
+
+def call_arrays(call: Call) -> dict[str, np.ndarray]:
+    """Return a call's arrays; of batches the entries lie along one axis."""
+    entries = expectations(Adapter(), _clear_of_the_far_plane(call))
+    rows = [_entry(call, b, row) for b, row in enumerate(entries)]
+    return {name: np.stack([row[name] for row in rows]) for name in rows[0]} if call.batch else rows[0]
+
+
+def _entry(call: Call, b: int, row: list[Expected]) -> dict[str, np.ndarray]:
+    colors = "sh" if call.sh_degree is not None else "colors"
+    # quaternions and scales are the input also where a rasterizer is given covariances
+    tensors = replace(call, covars=False, no_background=False).tensors()
+    given = {colors if name == "colors" else name: call.by_entry(value)[b] for name, value in tensors.items()}
+    arrays = {**given, "Ks": call.by_entry(call.intrinsics())[b]}
+    arrays["v_images"] = np.stack([e.v_image for e in row])
+    arrays["v_alphas"] = -np.stack([e.v_T_final for e in row])
+    arrays["images"] = np.stack([e.render.image for e in row])
+    arrays["error_bound_images"] = np.stack([e.image_error_bounds for e in row])
+    arrays["alphas"] = 1.0 - np.stack([e.render.T_final for e in row])
+    arrays["error_bound_alphas"] = np.stack([e.error_bounds.T_final + 1.0 for e in row])
+    arrays |= {"T_final": 1.0 - arrays["alphas"], "error_bound_T_final": arrays["error_bound_alphas"]}
+    told = (len(row), len(call.frames), call.tile_size)
+    arrays |= {name: np.array(value) for name, value in zip(_TOLD, told, strict=True)}
+    for name in ("dominant_ids", "n_blended"):
+        arrays[name] = np.stack([getattr(e.render, name) for e in row])
+    n = len(given["means"])
+    counts = [np.bincount(ids[ids >= 0], minlength=n) for ids in arrays["dominant_ids"]]
+    arrays["dominant_counts"] = np.stack(counts).astype(np.int64)
+    arrays["unambiguous"] = np.stack([e.error_bounds.unambiguous for e in row])
+    arrays["decided"] = np.stack([e.error_bounds.decided for e in row])
+    arrays["counted_rows"] = np.stack([_counted(e, n) for e in row])
+    smooth = ~np.any([e.error_bounds.screen.kinked for e in row], axis=0)
+    arrays |= {"smooth_rows": smooth, "smooth_rows_of_each": np.tile(smooth, (len(row), 1))}
+    arrays |= {} if call.batch else _lists(call, row)
+    arrays |= _splats(row) | _gradients(row, colors, call.camera_colors)
+    return arrays | {"all_smooth": np.array(np.all(smooth)), "all_clear": np.array(np.all(arrays["clear_rows"]))}
+
+
+def _lists(call: Call, row: list[Expected]) -> dict[str, np.ndarray]:
+    """Return the lists of intersections of all cameras, one after the other."""
+    n, rows, keys = len(row[0].render.splats.visible), list[int](), list[int]()
+    before, counts = 0, np.zeros((len(row), n), dtype=np.int64)
+    for c, e in enumerate(row):
+        visible = e.render.splats.visible
+        place = before + (np.cumsum(visible) - 1 if call.packed else np.arange(n))
+        before += int(np.sum(visible)) if call.packed else n
+        bits = len(e.render.tile_lists).bit_length()
+        for tile, listed in enumerate(e.render.tile_lists):
+            rows += [int(place[i]) for i in listed]
+            keys += [(c << bits) | tile] * len(listed)
+            counts[c, listed] += 1
+    return {"tiles_per_gauss": counts, "list_rows": np.array(rows), "list_keys": np.array(keys)}
+
+
+def _counted(e: Expected, n: int) -> np.ndarray:
+    found = np.ones(n, dtype=bool)
+    for layer in e.error_bounds.layers:
+        found[layer.id] = not np.any((layer.blended | layer.near_threshold) & ~e.error_bounds.decided)
+    return found
+
+
+def _splats(row: list[Expected]) -> dict[str, np.ndarray]:
+    clear = np.stack([e.clear for e in row])
+    visible = clear & np.stack([e.render.splats.visible for e in row])
+    found = {"radii": np.stack([e.render.splats.radii for e in row]), "clear_rows": clear, "visible_rows": visible}
+    for name in _OF_ROWS:
+        # what is culled holds no number
+        values = np.stack([getattr(e.render.splats, name) for e in row])
+        bounds = np.stack([getattr(e.error_bounds.screen, f"e_{name}") for e in row]) + np.abs(values)
+        finite = np.isfinite(values) & np.isfinite(bounds)
+        found |= {name: np.where(finite, values, 0.0), f"error_bound_{name}": np.where(finite, bounds, 0.0)}
+    return found
+
+
+def _gradients(row: list[Expected], colors: str, own_colors: bool) -> dict[str, np.ndarray]:
+    pulled = [e.gradients for e in row]
+    names = {name: name for name in (*_GAUSSIANS, "viewmats", "backgrounds")} | {"colors": colors}
+    found: dict[str, np.ndarray] = {}
+    for name, own in names.items():
+        of_each = name in ("viewmats", "backgrounds") or (name == "colors" and own_colors)
+        gathered = np.stack if of_each else _added
+        found[f"v_{own}"] = gathered([value[name] for value, _ in pulled])
+        found[f"error_bound_v_{own}"] = gathered([bound[name] for _, bound in pulled])
+    return found
+
+
+def _added(values: list[np.ndarray]) -> np.ndarray:
+    return np.sum(values, axis=0)
+
 
 _TRAINING = {
     "loss": training.loss_vectors,

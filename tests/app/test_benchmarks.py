@@ -81,12 +81,12 @@ def results() -> dict[str, Any]:
 
 
 def test_notes_hold_the_tables_of_the_results_and_the_curves_of_preset_quick(script: Any) -> None:
-    assert script("step_tables").main(["--check"]) == 0, "run 'python benchmarks/step_tables.py --write'"
+    assert script("results_table").main(["--check"]) == 0, "run 'python benchmarks/results_table.py --write'"
     assert script("quick_curve").main(["--json", str(BENCHMARKS / "results" / "quick.json"), "--check"]) == 0
 
 
 def test_every_table_says_what_was_measured_and_what_was_not(script: Any) -> None:
-    tables, text = script("step_tables"), (BENCHMARKS / "NOTES.md").read_text()
+    tables, text = script("results_table"), (BENCHMARKS / "NOTES.md").read_text()
     assert tables.with_tables(text, {}).count(tables.NOT_YET) == len(tables.TABLES)
     notes = tables.with_tables(text, results())
     assert tables.NOT_YET not in notes

@@ -18,11 +18,9 @@ from pop_fast.density import shrink
 from pop_fast.density.passes import Passes
 from pop_fast.errors import PopError
 from pop_fast.io.formats import FORMATS, encoded, format_names, levels, load_splat_file
-from pop_fast.stages.harmonics import lower_degree
 from pop_fast.train import compact
 from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
 from pop_fast.train.views import ViewTensors
-from pop_ref import harmonics
 from tests.app.clouds import many
 from tests.app.conftest import ROOT, TRAIN, Pop
 from tests.app.damage import contents
@@ -111,16 +109,6 @@ def tuner_of(result: Path, steps: int, degree: int = 3, bands: float = 0.3, own:
     if own:
         capture, config = compact.with_pictures(capture, params, config, degree)
     return compact.Tuner(params, degree, config, capture, {}, steps, lambda *_: None)
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_the_fast_fit_of_a_lower_degree_is_the_oracles(degree: int) -> None:
-    rng = np.random.default_rng(3)
-    sh, dirs, weights = rng.normal(size=(9, 16, 3)), rng.normal(size=(7, 9, 3)), rng.uniform(0.0, 50.0, size=(7, 9))
-    weights[:, 2] = 0.0
-    found = lower_degree(*map(torch.from_numpy, (sh, dirs, weights)), degree, uniform=1.5)
-    want = harmonics.lower_degree(sh, dirs, weights, degree, uniform=1.5)
-    np.testing.assert_allclose(found.numpy(), want, rtol=1e-10, atol=1e-12)
 
 
 def test_colours_of_a_lower_degree_are_fitted_to_what_the_training_views_show(shared_result: Path) -> None:

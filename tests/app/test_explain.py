@@ -30,10 +30,10 @@ from pop_fast.view.explain.pixel import WIDTH, candidates, oracle_splats, table,
 from pop_fast.view.explain.scene import settings_of, termination_depths, with_objective
 from pop_ref.constants import PAPER, PROFILES, Profile
 from pop_ref.records import Splats
-from tests.app.browser import browser
 from tests.app.conftest import Outcome, Pop
 from tests.app.damage import says
 from tests.app.tiny import tiny_capture
+from tests.browser import browser
 
 VIEW = tiny_capture().views[1]
 PIXELS = [(x, y) for y in range(0, VIEW.height, 6) for x in range(0, VIEW.width, 4)]

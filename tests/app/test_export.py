@@ -18,7 +18,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from benchmarks.faults.ksplat import ksplat_of
+from benchmarks.faults.corpus import ksplat_of
 from pop_fast.cli import main
 from pop_fast.cli.options import FormatName
 from pop_fast.data import load_capture

@@ -27,7 +27,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from benchmarks.faults.ksplat import ksplat_of
+from benchmarks.faults.corpus import ksplat_of
 from pop_fast.data.unpack import take_frames
 from pop_fast.errors import PopError
 from pop_fast.io import read_back

@@ -16,7 +16,6 @@ from torch import Tensor
 
 import pop_fast.compiled
 from cuda_ext.arrays import CudaMemoryError
-from pop_fast.api.backend import require_backend
 from pop_fast.api.backends import CUDA
 from pop_fast.blocks.rounds import hold_last, shown_in
 from pop_fast.data.gaussians import initialize_params
@@ -28,9 +27,9 @@ from pop_fast.train.engines import engine_of, torch_engine
 from pop_fast.train.model import KEYS
 from pop_fast.train.presets import METHODS
 from pop_fast.train.schedule import at_rest, phase_at, refining, segment_end, updates_of
-from pop_fast.train.stepper import FusedStepper, Task, step_settings
+from pop_fast.train.stepper import FusedStepper, step_settings
 from pop_fast.train.steps import why_not_trained
-from pop_fast.train.torch_stepper import BatchStepper, TorchStepper
+from pop_fast.train.torch_stepper import BatchStepper
 from pop_ref.settings import PARAMETERS
 from tests.app.drift import MOST, Drift, drift_engine
 from tests.app.tiny import (
@@ -301,77 +300,7 @@ def test_a_training_goes_on_as_another_has_ended(method, scaler):
     np.testing.assert_allclose(rates, 10.0 * final * 0.1 ** (np.arange(40) / 40), rtol=1e-12)
 
 
-# A step of several views: the mean of their losses, and to density control the views one after the other.
-
-# bands of colour, growth by blur and the prior are all on at this step
-STEP = 12
-VIEWS = [2, 0, 3]
-
-
-def one_step(views: list[int], mask: Any = None, **plan: Any) -> tuple[Any, Any]:
-    """Take one step at STEP of these views, without density control; return the run and its measurements."""
-    config = tiny_config("unused", batch_size=len(views), strategy=strategy(**plan), log_every=1)
-    start = TrainingRun(config, tiny_capture(mask=mask))
-    initial = {key: value.detach().double() for key, value in start.params.items()}
-    initial["shN"] += 0.05
-    run: Any = TrainingRun(config, tiny_capture(mask=mask), initial=initial)
-    order = [0] * len(views) * STEP + views
-    task = Task(config, run.strategy, run._train, order, run.updates, STEP, run.appearance)
-    kind = TorchStepper if len(views) == 1 else BatchStepper
-    stepper = kind(task, require_backend("fast"))
-    stepper.rebind(run.params, run.optimizers, run.state)
-    (stats,) = stepper.steps(STEP, STEP + 1, phase_at(config, run.strategy, STEP))
-    return run, stats
-
-
-def strategy(**plan: Any) -> POPStrategy:
-    return POPStrategy(
-        refine_start_iter=3, refine_stop_iter=24, blur_start_iter=8, blur_stop_iter=16, theta_blur=0.02, **plan
-    )
-
-
-def moment(run: Any, key: str) -> torch.Tensor:
-    return run.optimizers[key].state[run.params[key]]["exp_avg"]
-
-
-def test_the_gradient_of_a_batch_is_the_mean_of_its_views_gradients() -> None:
-    batch, stats = one_step(VIEWS)
-    alone = [one_step([view]) for view in VIEWS]
-    for key in batch.params:
-        # Adam's first moment, from zero, is a tenth of the gradient
-        expected = torch.stack([moment(run, key) for run, _ in alone]).mean(0)
-        assert expected.abs().max() > 0
-        assert torch.allclose(moment(batch, key), expected, rtol=1e-12, atol=1e-18), key
-    for name in ("objective", "pop", "square", "pixelwise", "ssim", "n_blended"):
-        values = [getattr(found, name) for _, found in alone]
-        assert getattr(stats, name) == pytest.approx(sum(values) / len(VIEWS), rel=1e-12)
-        assert len(set(values)) > 1 or name == "pop"
-    assert stats.pop > 0.0
-
-
-@pytest.mark.parametrize("window", ["any_view", "last_view", "sum"])
-@pytest.mark.parametrize("masked", [False, True])
-def test_density_control_sees_the_views_one_after_the_other(window: str, masked: bool) -> None:
-    mask = (torch.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) % 3 > 0).numpy() if masked else None
-    plan = {"blur_window": window, "refine_scale2d_stop_iter": 20}
-    batch, _ = one_step(VIEWS, mask, **plan)
-    alone = [one_step([view], mask, **plan)[0].state for view in VIEWS]
-    state = batch.state
-    for key in ("grad2d", "count"):
-        assert torch.allclose(state[key], torch.stack([one[key] for one in alone]).sum(0), rtol=1e-12), key
-    assert state["count"].max() == len(VIEWS)
-    assert state["views"] == len(VIEWS)
-    assert torch.equal(state["radii"], torch.stack([one["radii"] for one in alone]).amax(0))
-    blurred = torch.stack([one["blurred"] for one in alone])
-    if window == "sum":
-        total = torch.stack([one["dominant_sum"] for one in alone]).sum(0)
-        assert torch.equal(state["dominant_sum"], total)
-        kept = HEIGHT * WIDTH if mask is None else int(mask.sum())
-        assert torch.equal(state["blurred"], total > batch.config.strategy.theta_blur * kept)
-    else:
-        assert torch.equal(state["blurred"], blurred.any(0) if window == "any_view" else blurred[-1])
-    assert blurred.any()
-    assert len({tuple(row.tolist()) for row in blurred}) > 1
+# A step of several views; what it is the laws of training say.
 
 
 def test_a_run_of_batches_draws_as_many_views_a_step_and_continues_to_the_same_bits(tmp_path: Path) -> None:

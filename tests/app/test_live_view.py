@@ -37,11 +37,11 @@ from pop_fast.view.live.draw import (
 )
 from pop_fast.view.live.server import Pace
 from pop_fast.view.paths import frames_in
-from tests.app.browser import browser
 from tests.app.conftest import Pop
 from tests.app.damage import says
 from tests.app.test_paths import ring
 from tests.app.tiny import assert_same_run, tiny_capture, tiny_config
+from tests.browser import browser
 
 WORLD = np.array([[0.0, -2.0, 0.0, 3.0], [2.0, 0.0, 0.0, -1.0], [0.0, 0.0, 2.0, 0.5], [0.0, 0.0, 0.0, 1.0]])
 

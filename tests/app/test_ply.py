@@ -16,7 +16,7 @@ from hypothesis.extra import numpy as hnp
 from plyfile import PlyData, PlyElement
 
 from pop_fast.io.formats import save_as
-from pop_fast.io.ply import is_antialiased, load_ply, read_points, save_ply
+from pop_fast.io.ply import asks_for_antialiasing, load_ply, read_header, read_points, save_ply
 from tests.app.captures import assert_one_line
 from tests.app.clouds import many
 from tests.app.conftest import pop_in_a_child
@@ -75,9 +75,9 @@ def test_the_file_is_laid_out_as_the_reference_code_lays_it_out(tmp_path: Path) 
     assert np.array_equal(rows[:, 9:24], params["shN"][:, :, 0].numpy())
     assert np.array_equal(rows[:, 24:39], params["shN"][:, :, 1].numpy())
     assert np.array_equal(rows[:, 54], params["opacities"].numpy())
-    assert not is_antialiased(tmp_path / "x.ply")
+    assert not asks_for_antialiasing(read_header(tmp_path / "x.ply"))
     save_ply(tmp_path / "mip.ply", params, antialiased=True)
-    assert is_antialiased(tmp_path / "mip.ply")
+    assert asks_for_antialiasing(read_header(tmp_path / "mip.ply"))
 
 
 @pytest.mark.parametrize("text", [False, True])
@@ -276,7 +276,7 @@ def test_lines_may_end_in_any_way(end: str, order: str, tmp_path: Path) -> None:
     rows = struct.pack("<3f" if order == "little" else ">3f", 1.0, 2.0, 13.0)
     (tmp_path / "x.ply").write_bytes(header.replace("\n", end).encode() + rows)
     assert read_points(tmp_path / "x.ply")[0].tolist() == [[1.0, 2.0, 13.0]]
-    assert is_antialiased(tmp_path / "x.ply")
+    assert asks_for_antialiasing(read_header(tmp_path / "x.ply"))
 
 
 def test_faces_before_and_behind_the_vertices_do_no_harm(tmp_path: Path) -> None:

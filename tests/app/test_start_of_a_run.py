@@ -27,12 +27,12 @@ from pop_fast.io.formats import format_names, load_splat_file
 from pop_fast.io.ply import load_ply
 from pop_fast.train import TrainingRun
 from pop_fast.train.results import ResultFolder
-from tests.app.browser import browser
 from tests.app.captures import photograph, write_photograph
 from tests.app.conftest import TRAIN, Outcome, Pop, done
 from tests.app.damage import contents, says
 from tests.app.test_resume import run_to
 from tests.app.tiny import Killed, assert_same_run, interrupt, killed_after, tiny_capture, tiny_config
+from tests.browser import browser
 
 # in a folder of results: small files and folders, under names that a run writes and one that it does not
 OLD = {

@@ -168,23 +168,6 @@ def test_skipping_the_idle_colour_bands_is_bit_identical_to_dense_adam():
         assert torch.equal(torch.signbit(dense), torch.signbit(skipped))
 
 
-def test_masked_pixels_have_no_say(tmp_path):
-    mask = np.ones((HEIGHT, WIDTH), dtype=bool)
-    mask[:, WIDTH // 2 :] = False
-    runs = []
-    for seed in (0, 1):
-        capture = tiny_capture(mask=mask)
-        rng = np.random.default_rng(seed)
-        for view in capture.views:
-            view.image[:, WIDTH // 2 :] = rng.integers(0, 255, (HEIGHT, WIDTH // 2, 3))
-        # without SSIM, whose windows reach over the mask's edge
-        trainer = TrainingRun(tiny_config(tmp_path / str(seed), max_steps=12, lambda_ssim=0.0), capture)
-        stats = trainer.run()
-        runs.append((trainer.params, stats["psnr"]))
-    assert all(torch.equal(runs[0][0][key], runs[1][0][key]) for key in KEYS)
-    assert runs[0][1] == runs[1][1]
-
-
 def test_the_target_cache_changes_no_bit(tmp_path):
     views = [ViewTensors.of(view) for view in tiny_capture().views]
     image = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(0))

@@ -16,7 +16,7 @@ pytest.register_assert_rewrite("pop_ref.conformance.laws")
 
 import cuda_ext  # noqa: E402  asserts must be rewritten first
 from cuda_ext.host import emulate  # noqa: E402
-from cuda_ext.host.library_folder import library_folder  # noqa: E402
+from cuda_ext.host.emulate import library_folder  # noqa: E402
 
 # where the emulated module is built
 FOLDER = library_folder(Path(__file__).parent / "emulated")

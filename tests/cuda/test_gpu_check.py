@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cuda_ext.gpu_check import command as gpu_check
+from cuda_ext.gpu_check import __main__ as gpu_check
 from cuda_ext.gpu_check import shared as gpu_check_tools
 from cuda_ext.gpu_check import stages as gpu_check_stages
-from cuda_ext.gpu_check.command import commit_of, main
+from cuda_ext.gpu_check.__main__ import commit_of, main
 from cuda_ext.gpu_check.outcomes import outcomes
 from cuda_ext.gpu_check.shared import MARGIN, Budget, Command, Share, StageContext, first_line, run, write_json
 from cuda_ext.gpu_check.stages import JOBS, SHARES, STAGES, train_one, wheels_stage
-from paper_repro.record import from_line
+from paper_repro.results import from_line
 from pop_fast.cli import main as pop
 from pop_fast.data import load_capture
 from tests.app.captures import colmap_capture

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from cuda_ext.host import emulate
-from cuda_ext.host import library_folder as place
 from cuda_ext.toolkit import find_compiler
 
 ROOT = Path(__file__).parents[2]
@@ -24,12 +23,13 @@ LOAD = """
 import os
 from types import SimpleNamespace
 from unittest import mock
-from cuda_ext.host import emulate, library_folder
+from cuda_ext.host import emulate
+from cuda_ext.host import emulate
 if {read_only}:
-    library_folder.os = SimpleNamespace(**{{**vars(os), "access": lambda *_: False}})
+    emulate.os = SimpleNamespace(**{{**vars(os), "access": lambda *_: False}})
 # compiling takes long, and which library is loaded is known before
 emulate._compile = mock.Mock(side_effect=RuntimeError("compiling"))
-emulate.loaded(emulate.build(library_folder.library_folder()))
+emulate.loaded(emulate.build(emulate.library_folder()))
 """
 needs_compiler = pytest.mark.skipif(emulate.why_not() is not None, reason=str(emulate.why_not()))
 
@@ -37,25 +37,25 @@ needs_compiler = pytest.mark.skipif(emulate.why_not() is not None, reason=str(em
 @pytest.fixture
 def read_only(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """A package that cannot be written to, and the cache that stands in for it."""
-    monkeypatch.setattr(place.os, "access", lambda *_: False)
+    monkeypatch.setattr(emulate.os, "access", lambda *_: False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return tmp_path / "cache" / "pop-splatting"
 
 
 def test_what_can_be_written_to_is_compiled_into() -> None:
-    assert place.library_folder(ROOT / "tests") == ROOT / "tests" / "build"
+    assert emulate.library_folder(ROOT / "tests") == ROOT / "tests" / "build"
     assert not (ROOT / "tests" / "build").exists()
 
 
 def test_the_cache_is_made_for_this_user_alone(read_only: Path) -> None:
     before = os.umask(0)
     try:
-        assert place.library_folder() == read_only
+        assert emulate.library_folder() == read_only
     finally:
         os.umask(before)
     assert stat.S_IMODE(read_only.stat().st_mode) == 0o700
     (read_only / "ours.so").write_bytes(b"")
-    assert place.library_folder() == read_only
+    assert emulate.library_folder() == read_only
 
 
 def test_a_cache_that_is_not_absolute_is_not_taken(
@@ -64,7 +64,7 @@ def test_a_cache_that_is_not_absolute_is_not_taken(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", "here")
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    assert place.library_folder() == tmp_path / "home" / ".cache" / "pop-splatting"
+    assert emulate.library_folder() == tmp_path / "home" / ".cache" / "pop-splatting"
 
 
 @pytest.mark.parametrize("mode", [0o770, 0o707, 0o777, 0o701, 0o750])
@@ -74,7 +74,7 @@ def test_a_cache_that_is_open_to_others_is_refused(read_only: Path, mode: int) -
     with pytest.raises(
         RuntimeError, match=rf"pop-splatting: is open to others \(mode {mode:o}\), so nothing is loaded"
     ):
-        place.library_folder()
+        emulate.library_folder()
 
 
 @pytest.mark.parametrize("what", ["the folder", "a file"])
@@ -92,7 +92,7 @@ def test_what_belongs_to_somebody_else_is_refused(read_only: Path, what: str, mo
 
     monkeypatch.setattr(Path, "lstat", lstat)
     with pytest.raises(RuntimeError, match=rf"{path.name}: belongs to user {os.geteuid() + 1}, not to you"):
-        place.library_folder()
+        emulate.library_folder()
 
 
 def test_a_link_is_refused(read_only: Path, tmp_path: Path) -> None:
@@ -100,7 +100,7 @@ def test_a_link_is_refused(read_only: Path, tmp_path: Path) -> None:
     read_only.parent.mkdir()
     read_only.symlink_to(tmp_path / "elsewhere")
     with pytest.raises(RuntimeError, match="pop-splatting: is a link"):
-        place.library_folder()
+        emulate.library_folder()
 
 
 def plant(folder: Path, tmp_path: Path) -> None:

@@ -95,14 +95,6 @@ def both(
     return value, v_image, loss.item(), image.grad.numpy()
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_transposes_are_what_autograd_does(name: str) -> None:
-    x, y = Case(13, 12, seed=2).tensors(torch.float64)
-    image = x.clone().requires_grad_()
-    (getattr(losses, name)(image, y) * 3.0).backward()
-    torch.testing.assert_close(getattr(losses, name + "_vjp")(x, y, 3.0), image.grad, rtol=1e-14, atol=1e-18)
-
-
 @COMPILED
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -273,19 +265,6 @@ def test_gradient_reaches_logits_through_the_sigmoid(dtype: torch.dtype) -> None
     (1e-3 * pop_loss(o, mask)).backward()
     expected = 1e-3 * torch.tensor([-1.0, 0.5, 0.5], dtype=dtype) * (o * (1.0 - o)).detach()
     torch.testing.assert_close(logits.grad, expected)
-
-
-@pytest.mark.parametrize("important", [True, False])
-def test_an_empty_side_and_an_empty_scene_are_finite(important: bool) -> None:
-    o = torch.full((3,), 0.25, requires_grad=True)
-    loss = pop_loss(o, torch.full((3,), important))
-    loss.backward()
-    assert loss.item() == (0.75 if important else 0.25)
-    assert torch.all(torch.isfinite(o.grad))
-    nobody = torch.zeros(0, requires_grad=True)
-    loss = pop_loss(nobody, torch.zeros(0, dtype=torch.bool))
-    loss.backward()
-    assert loss.item() == 0.0
 
 
 def test_nothing_flows_through_the_mask_and_no_graph_is_made_without_need() -> None:

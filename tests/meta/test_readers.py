@@ -63,7 +63,7 @@ EXEMPT = {
     "pop_fast.io.images:main": "a child process that decodes what has been read; its end harms nobody",
     "cuda_ext.gpu_check.shared:Command._words": "the end of a log that it has written, with any bytes",
     "cuda_ext.gpu_check.stages": "shows what its own trainings and benchmarks have written",
-    "cuda_ext.gpu_check.command:commit_of": "takes one text of a file that read_json has judged",
+    "cuda_ext.gpu_check.__main__:commit_of": "takes one text of a file that read_json has judged",
     "cuda_ext.host": OWN,
     "cuda_ext.machine_code": OWN,
     "paper_repro.train_row:begin_from_base": "takes what load_checkpoint has judged",

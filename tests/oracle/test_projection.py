@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import mpmath
 import numpy as np
@@ -13,8 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
-from pop_ref import INRIA, PAPER, activations, camera, covariance, footprint, harmonics, projection
-from tests.oracle.scenes import tilted_camera
+from pop_ref import INRIA, PAPER, activations, covariance, footprint, harmonics, projection
 
 K = np.array([[7.0, 0.0, 3.25], [0.0, 9.0, 2.0], [0.0, 0.0, 1.0]])
 WIDTH, HEIGHT = 6, 5
@@ -70,25 +68,6 @@ def test_rotations_are_those_of_scipy(quat: list[float]) -> None:
     w, x, y, z = quat
     want = Rotation.from_quat([x, y, z, w]).as_matrix()
     np.testing.assert_allclose(covariance.rotmats_from_quats(np.array([quat]))[0], want, atol=2e-15)
-
-
-# World to camera.
-
-RNG = np.random.default_rng(9)
-VIEWMAT = tilted_camera().viewmat
-MEANS = RNG.normal(size=(6, 3))
-
-
-def test_the_camera_frame_is_that_of_homogeneous_coordinates() -> None:
-    homogeneous = np.concatenate([MEANS, np.ones((6, 1))], axis=1)
-    moved = camera.means_cam_from_means(MEANS, VIEWMAT)
-    np.testing.assert_allclose(moved, (homogeneous @ VIEWMAT.T)[:, :3], atol=1e-15)
-    np.testing.assert_allclose(camera.camera_center(VIEWMAT), np.linalg.inv(VIEWMAT)[:3, 3], atol=1e-15)
-
-
-def test_the_far_plane_itself_is_kept() -> None:
-    close = replace(PAPER, far_plane=8.0)
-    assert camera.in_front(np.array([8.0, math.nextafter(8.0, 9.0)]), close).tolist() == [True, False]
 
 
 # The footprint at its edges.

@@ -21,7 +21,6 @@ from pop_ref import (
     Gaussians,
     Profile,
     Splats,
-    dominance,
     margins,
     render,
     tiles,
@@ -248,10 +247,6 @@ def test_lists_and_backgrounds_that_do_not_fit_are_refused() -> None:
         composite(one_splat(), [[0], []], 4, 2, 2, np.zeros(3))
     with pytest.raises(ValueError, match="lists has 1 tiles"):
         composite_vjp(one_splat(), [[0]], 4, 2, 2, np.zeros((2, 4, 2)))
-
-
-def test_a_weight_of_zero_never_wins() -> None:
-    assert dominance.dominant_id([3, 4], [0.0, 0.0]) == -1
 
 
 # The depth modes: by hand for one splat, and as a colour channel that holds depths.

@@ -1,4 +1,4 @@
-"""Training: the ladder of ten losses stands, recipes and density control do what their names say, Adam is torch's."""
+"""Training: the ladder of ten losses stands, recipes and schedules do what their names say, settings show in a step."""
 
 from __future__ import annotations
 
@@ -9,40 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from pop_ref import density, losses
 from pop_ref.activations import opacities_from_logits, opacities_from_logits_vjp
 from pop_ref.ambiguities import AMBIGUITIES
-from pop_ref.conformance.backends import shipped
 from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER, Profile
-from pop_ref.density import (
-    GSPLAT,
-    POP,
-    Rows,
-    Statistics,
-    accumulate,
-    average_grads,
-    blurs_at,
-    densifies_at,
-    grow_masks,
-    resets_at,
-    rows_from_params,
-    split_rows,
-    zero_statistics,
-)
-from pop_ref.optimizer import (
-    LEARNING_RATES,
-    adam_step,
-    is_updated,
-    learning_rates,
-    means_learning_rate,
-    sh_degree_at,
-    update_numbers,
-)
+from pop_ref.density import Rows, rows_from_params, split_rows
+from pop_ref.optimizer import adam_step, is_updated, learning_rates, means_learning_rate, sh_degree_at, update_numbers
 from pop_ref.polarization import pop_loss, pop_loss_vjp
 from pop_ref.recipes import BASELINES, L1_DIVIDED, RECIPES, Recipe
 from pop_ref.records import Render
@@ -130,18 +103,6 @@ def test_statistics_come_from_the_same_forward_pass_as_the_loss() -> None:
     assert np.any(state.statistics.grad_sum > 0.0)
 
 
-def test_pop_term_is_there_from_its_first_step_to_the_one_before_its_last() -> None:
-    recipe = replace(RECIPES["POP"], pop_start_iter=3, pop_stop_iter=5)
-    base = objective_at(2, recipe)[2]
-    assert not np.any(base[2])
-    for step, there in ((3, True), (4, True), (5, False)):
-        gaussians, view, (loss, v_image, v_opacities) = objective_at(step, recipe)
-        mask = view.dominant_counts > 0
-        assert loss - base[0] == pytest.approx(there * 1e-3 * pop_loss(gaussians.opacities, mask), abs=1e-16)
-        np.testing.assert_array_equal(v_image, base[1])
-        assert np.any(v_opacities) == there
-
-
 def test_l2_may_give_way_to_the_objective_of_3dgs() -> None:
     recipe = replace(RECIPES["L2"], l2_stop_iter=7)
     assert objective_at(6, recipe)[2][0] == objective_at(0, RECIPES["L2"])[2][0]
@@ -194,32 +155,7 @@ def test_a_population_may_die_out_during_training() -> None:
     assert np.all(np.isfinite(losses))
 
 
-# Adam against torch, and its schedules.
-
-
-@pytest.mark.parametrize(("betas", "eps"), [((0.9, 0.999), 1e-15), ((0.5, 0.75), 0.125)])
-def test_adam_equals_torch_on_rows_of_several_shapes(betas: tuple[float, float], eps: float) -> None:
-    rng = np.random.default_rng(3)
-    params = {"means": rng.normal(size=(5, 3)), "opacities": rng.normal(size=5), "sh0": rng.normal(size=(5, 1, 3))}
-    lr = {"means": 1e-3, "opacities": 0.05, "sh0": 0.0025}
-    tensors = {name: torch.tensor(array, requires_grad=True) for name, array in params.items()}
-    groups = [{"params": [tensors[name]], "lr": lr[name]} for name in params]
-    reference = torch.optim.Adam(groups, betas=betas, eps=eps, foreach=False)
-    m = {name: np.zeros_like(array) for name, array in params.items()}
-    v = {name: np.zeros_like(array) for name, array in params.items()}
-    for step in range(1, 26):
-        # gradients of very different sizes, some exactly zero, as training makes them
-        grads = {name: rng.normal(size=a.shape) * 10.0 ** rng.integers(-12, 3, a.shape) for name, a in params.items()}
-        for name, g in grads.items():
-            g[step % 5] = 0.0
-            tensors[name].grad = torch.tensor(g)
-        params, m, v = adam_step(params, grads, m, v, step, lr, betas=betas, eps=eps)
-        reference.step()
-        for name in params:
-            state = reference.state[tensors[name]]
-            np.testing.assert_allclose(params[name], tensors[name].detach().numpy(), rtol=1e-13, atol=1e-15)
-            np.testing.assert_allclose(m[name], state["exp_avg"].numpy(), rtol=1e-13, atol=1e-25)
-            np.testing.assert_allclose(v[name], state["exp_avg_sq"].numpy(), rtol=1e-13, atol=1e-30)
+# Adam and its schedules.
 
 
 def test_an_update_decays_second_moments_as_its_recipe_says() -> None:
@@ -252,7 +188,7 @@ def test_an_opacity_that_only_pop_touches_falls_under_the_pruning_threshold_in_s
     while opacities_from_logits(logit["o"])[0] >= 0.005:
         taken += 1
         gradient = {"o": opacities_from_logits_vjp(logit["o"], np.array([1e-3 / 40_000]))}
-        logit, m, v = adam_step(logit, gradient, m, v, taken, {"o": LEARNING_RATES["opacities"]})
+        logit, m, v = adam_step(logit, gradient, m, v, taken, {"o": LearningRates().opacities})
     assert taken == pytest.approx(steps, abs=5)
 
 
@@ -410,103 +346,11 @@ def test_gsplat_is_its_default_strategy() -> None:
 
 # Density control.
 
-STEPS = range(30_000)
-SMALL = 0.005
-
 
 def population(logits: list[float]) -> Rows:
     n = len(logits)
     params = {"means": np.zeros((n, 3)), "scales": np.zeros((n, 3)), "quats": np.ones((n, 4))}
     return rows_from_params({**params, "opacities": np.array(logits)})
-
-
-def window(grads: list[float], blurred: list[bool] | None = None) -> Statistics:
-    n = len(grads)
-    flags = np.array([False] * n if blurred is None else blurred, dtype=bool)
-    return replace(zero_statistics(n), grad_sum=np.array(grads), n_visible=np.ones(n, np.int64), blurred=flags)
-
-
-def test_the_average_may_divide_by_the_views_of_the_window() -> None:
-    s = replace(zero_statistics(3), grad_sum=np.array([6.0, 2.0, 0.0]), n_visible=np.array([3, 1, 0]), n_views=4)
-    by_window = replace(POP, grad_denominator="window")
-    assert average_grads(s, by_window).tolist() == [1.5, 0.5, 0.0]
-    assert average_grads(zero_statistics(1), by_window).tolist() == [0.0]
-
-
-def test_blur_threshold_is_each_views_own() -> None:
-    s, config = zero_statistics(1), replace(POP, theta_blur=0.055)
-    for height, blurred in ((20, False), (10, True)):
-        s = accumulate(s, np.zeros((1, 2)), np.ones(1, bool), np.array([6]), 10, height, config)
-        assert s.blurred.tolist() == [blurred]
-
-
-@pytest.mark.parametrize("backend", ["oracle", "fast64"])
-def test_thresholds_are_strict_as_in_gsplat_and_not_as_in_inria_and_the_largest_axis_decides(backend: str) -> None:
-    masks = shipped(backend).stage("grow_masks")
-    s, scales = window([2e-4, np.nextafter(2e-4, 1.0)]), np.full((2, 3), SMALL)
-    assert masks(s, scales, 1.0, 600, POP)[0].tolist() == [False, True]
-    assert masks(s, scales, 1.0, 600, replace(POP, inclusive=True))[0].tolist() == [True, True]
-    # a size that is the threshold is small
-    scales = np.array([[0.25, 0.0, 0.0], [0.0, 0.0, np.nextafter(0.25, 1.0)]])
-    clone, split = masks(window([1.0, 1.0]), scales, 1.0, 600, replace(POP, grow_scale3d=0.25))
-    assert (clone.tolist(), split.tolist()) == ([True, False], [False, True])
-
-
-def test_gradient_growth_beside_the_blur_rule_can_be_chosen() -> None:
-    s, scales = window([1.0, 0.0], [False, True]), np.full((2, 3), SMALL)
-    chosen = {
-        POP: ([True, False], [True, True]),
-        replace(POP, grow_on_gradient_in_blur_window=False): ([True, False], [False, True]),
-        replace(POP, grow_on_gradient=False): ([False, False], [False, True]),
-    }
-    for config, (before, inside) in chosen.items():
-        assert grow_masks(s, scales, 1.0, 2900, config)[0].tolist() == before
-        assert grow_masks(s, scales, 1.0, 3000, config)[0].tolist() == inside
-
-
-def test_split_only_blur_splits_small_ones_and_may_clone_them_as_well() -> None:
-    s = window([1.0, 1.0, 0.0, 0.0], [True, False, True, False])
-    clone, split = grow_masks(s, np.full((4, 3), SMALL), 1.0, 3000, replace(POP, blur_rule="split"))
-    assert clone.tolist() == [True, True, False, False]
-    assert split.tolist() == [True, False, True, False]
-
-
-def test_schedule_has_144_densification_steps_41_with_blur_and_4_resets() -> None:
-    densified = [s for s in STEPS if densifies_at(s, POP)]
-    assert (len(densified), densified[0], densified[-1]) == (144, 600, 14_900)
-    blurred = [s for s in densified if blurs_at(s, POP)]
-    assert (len(blurred), blurred[0], blurred[-1]) == (41, 3000, 7000)
-    assert [s for s in STEPS if resets_at(s, POP)] == []
-    assert [s for s in STEPS if resets_at(s, GSPLAT)] == [3000, 6000, 9000, 12_000]
-    assert resets_at(0, replace(GSPLAT, reset_at_zero=True))
-    assert not any(blurs_at(s, GSPLAT) for s in STEPS)
-
-
-@pytest.mark.parametrize("backend", ["oracle", "fast64"])
-def test_children_are_drawn_from_their_parent_and_1_6_times_smaller(backend: str) -> None:
-    rng, mask = np.random.default_rng(4), np.array([False, True, False, True])
-    shapes = {"means": (4, 3), "scales": (4, 3), "quats": (4, 4), "opacities": (4,), "sh0": (4, 1, 3)}
-    rows = rows_from_params({name: rng.normal(size=shape) for name, shape in shapes.items()})
-    eps = rng.normal(size=(2, 2, 3))
-    parents = {name: array[mask] for name, array in rows.params.items()}
-    split = shipped(backend).stage("split_rows")(rows, mask, eps).params
-    rotation, scales = Rotation.from_quat(parents["quats"], scalar_first=True), np.exp(parents["scales"])
-    for child in range(2):
-        here = slice(2 + 2 * child, 4 + 2 * child)
-        expected = parents["means"] + rotation.apply(scales * eps[child])
-        np.testing.assert_allclose(split["means"][here], expected, rtol=1e-13, atol=1e-15)
-        np.testing.assert_allclose(np.exp(split["scales"][here]), scales / 1.6, rtol=1e-14)
-        for name in ("quats", "opacities", "sh0"):
-            np.testing.assert_array_equal(split[name][here], parents[name])
-
-
-@pytest.mark.parametrize("backend", ["oracle", "fast64"])
-@given(logit=st.sampled_from([-40.0, 0.0, 40.0]) | st.floats(-30.0, 30.0))
-def test_two_revised_children_are_as_opaque_as_their_parent(logit: float, backend: str) -> None:
-    split = (population([logit]), np.array([True]), np.zeros((2, 1, 3)), True)
-    child = shipped(backend).stage("split_rows")(*split).params["opacities"][0]
-    # 1 - o = 1 / (1 + e^logit) on both sides, in logarithms so that neither end is rounded away
-    assert 2.0 * np.logaddexp(0.0, child) == pytest.approx(np.logaddexp(0.0, logit), rel=1e-12)
 
 
 def test_unfit_rows_and_draws_are_refused_by_name() -> None:
@@ -573,19 +417,3 @@ def test_in_a_round_of_pup_rates_fall_from_where_the_training_ended() -> None:
     before = learning_rates(29_999, 1.0, 40_000, rules=rules)
     assert before["means"] == pytest.approx(1.6e-4 * 0.01 ** (29_999 / 30_000), rel=1e-14)
     assert before["scales"] == first["scales"]
-
-
-def test_gradients_that_wait_are_spent_at_once() -> None:
-    recipe = Recipe(updates=UpdateRules(sh_rest_every=3))
-    rows = rows_from_params({"means": np.zeros((1, 3)), "shN": np.zeros((1, 3, 3))})
-    state = Training(rows, zero_statistics(1))
-    for step, size in enumerate((1.0, 2.0, 4.0)):
-        state = replace(state, step=step)
-        grads = {"means": np.ones((1, 3)), "shN": np.full((1, 3, 3), size)}
-        rows, waiting = update(state.rows, grads, state, 1.0, recipe)
-        state = replace(state, rows=rows, waiting=waiting)
-        assert (state.rows.params["shN"] != 0.0).any() == (step == 2)
-    assert not state.waiting
-    # m = (1 - beta1) g of the sum of all three
-    np.testing.assert_allclose(state.rows.m["shN"], 0.1 * 7.0, rtol=1e-14)
-    assert (state.rows.params["means"] != 0.0).all()

@@ -16,7 +16,7 @@ from paper_repro.figures import FIGURES, curves, style, tradeoffs
 from paper_repro.figures.data import Asked
 from paper_repro.figures.style import Drawn
 from paper_repro.jobs import Job, job_named
-from paper_repro.record import BINS, Result, run_id, settings_hash
+from paper_repro.results import BINS, Result, run_id, settings_hash
 from paper_repro.scenes import SCENES
 from paper_repro.train_row import Options, capture_folder
 

@@ -23,7 +23,6 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from paper_repro.claims import HEADLINES, METHODS, SWEEP, WINDOWS, claims, noise_of, questions
-from paper_repro.claims_page import READINGS, Answer, answers, columns, experiments, markdown, outcome, telling
 from paper_repro.cli import main
 from paper_repro.evidence import (
     COUNT,
@@ -43,6 +42,7 @@ from paper_repro.jobs import ROWS, job_named, load_row
 from paper_repro.judging import OTHERS, judge
 from paper_repro.paper import paper
 from paper_repro.results import Result
+from paper_repro.status import READINGS, Answer, answers, columns, experiments, markdown, outcome, telling
 from tests.repro.made import WHOLE, curve, whole
 
 SCHEDULE = {

@@ -26,8 +26,7 @@ from paper_repro.figures.style import foot, save
 from paper_repro.figures.tradeoffs import Marker, along, places
 from paper_repro.jobs import job_named, load_rows
 from paper_repro.paper import paper
-from paper_repro.record import BINS
-from paper_repro.results import RESULTS, Result, write
+from paper_repro.results import BINS, RESULTS, Result, write
 from paper_repro.train_row import Options, capture_folder, load_capture_of
 from pop_fast.errors import PopError
 from tests.repro.made import asked, curve, drawn, lines, result, texts

@@ -19,8 +19,7 @@ import pytest
 
 from paper_repro.cli import main
 from paper_repro.jobs import job_named
-from paper_repro.record import to_line
-from paper_repro.results import RESULTS, SCALES, Result, find, kept, read, read_all, write
+from paper_repro.results import RESULTS, SCALES, Result, find, kept, read, read_all, to_line, write
 from paper_repro.train_row import commit
 from paper_repro.verify import history, other_kind
 from pop_fast.errors import PopError

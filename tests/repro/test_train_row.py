@@ -24,8 +24,7 @@ from paper_repro import train_row as module
 from paper_repro.collect import PROBE, collect, file_hash, first_change
 from paper_repro.jobs import NotTrainableError, job_named, jobs_of, load_rows
 from paper_repro.probe import VIEWS, ProbedRun, gradient_sizes
-from paper_repro.record import run_id, settings_hash
-from paper_repro.results import read, write
+from paper_repro.results import read, run_id, settings_hash, write
 from paper_repro.train_row import (
     BusyError,
     Options,

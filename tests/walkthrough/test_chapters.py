@@ -32,7 +32,7 @@ from pop_ref.walkthrough.builder.command import main
 from pop_ref.walkthrough.builder.glossary import GLOSSARY_PAGE, TERMS, Term
 from pop_ref.walkthrough.builder.layout import chapter_page, index_page, prose
 from pop_ref.walkthrough.pages import run_chapter
-from tests.walkthrough.ran import CHAPTERS, ran
+from tests.walkthrough.conftest import CHAPTERS, ran
 
 ROOT = Path(__file__).resolve().parents[2]
 LEARN = ROOT / "docs" / "learn.md"

@@ -25,8 +25,8 @@ from pop_ref.walkthrough.builder.notebooks import notebook
 from pop_ref.walkthrough.builder.slides import FILE, chapters_of, deck, read_slides
 from pop_ref.walkthrough.pages import Outcome, run_chapter
 from pop_ref.walkthrough.widgets import html
-from tests.walkthrough.chromium import SCREENSHOTS, Page, keep
-from tests.walkthrough.ran import CHAPTERS, MISSING, executed, ran, run_of
+from tests.browser import SCREENSHOTS, Page, keep
+from tests.walkthrough.conftest import CHAPTERS, MISSING, executed, ran, run_of
 
 TEXT = """# minutes: 5
 

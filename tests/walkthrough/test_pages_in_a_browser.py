@@ -30,9 +30,9 @@ from pop_ref.walkthrough.builder.chapter import read_chapter
 from pop_ref.walkthrough.builder.layout import asset, chapter_page, index_page
 from pop_ref.walkthrough.widgets import FOLDER as WIDGET_FOLDER
 from pop_ref.walkthrough.widgets import PYODIDE, WIDGETS, html
-from tests.app import browser
-from tests.walkthrough.chromium import SCREENSHOTS, Page, keep
-from tests.walkthrough.ran import CHAPTERS, ran
+from tests import browser
+from tests.browser import SCREENSHOTS, Page, keep
+from tests.walkthrough.conftest import CHAPTERS, ran
 
 # how a page is opened; it is then looked at with the other preference too
 OPENED = [(900, False), (400, True)]

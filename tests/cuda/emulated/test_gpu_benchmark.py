@@ -56,7 +56,7 @@ def numbers(tree):
 
 @pytest.mark.rehearsal
 def test_every_number_of_the_benchmark_is_measured(bench, gpu, monkeypatch, tmp_path):
-    from gpu_steps import KERNELS
+    from gpu_kernels import KERNELS
 
     status, told = run(bench, monkeypatch, tmp_path / "bench.json")
     assert (status, list(told["cases"])) == (0, ["tiny"])
@@ -85,7 +85,7 @@ def test_gsplat_is_measured_beside_the_same_case(bench, monkeypatch, tmp_path):
     (tmp_path / "gsplat.py").write_text(STAND_IN)
     monkeypatch.syspath_prepend(str(tmp_path))
     sums = iter(range(1, 100))
-    for module in (bench, gpu_gsplat, sys.modules["gpu_steps"]):
+    for module in (bench, gpu_gsplat):
         monkeypatch.setattr(module, "kernel_sums", lambda run, calls=1: (run() and None) or {"kernels_ms": next(sums)})
     status, told = run(gpu_gsplat, monkeypatch, tmp_path / "beside.json")
     assert (status, told["gsplat"]) == (0, "stand-in")
@@ -122,7 +122,7 @@ def test_families_that_differ_are_told_beside_the_times(bench, monkeypatch):
 
 
 def test_kernel_times_are_added_up_by_name(bench):
-    from gpu_steps import summed
+    from gpu_kernels import summed
 
     def event(name, us, device=torch.autograd.DeviceType.CUDA, annotation=False):
         span = types.SimpleNamespace(elapsed_us=lambda: us)
@@ -243,8 +243,8 @@ def _tried(case, device):
 @pytest.mark.slow
 def test_the_predicted_case_is_what_was_predicted(gpu, monkeypatch):
     monkeypatch.syspath_prepend(str(BENCHMARKS))
+    from gpu_kernels import POP, make_trainer, step_loads
     from gpu_scenes import CASES, activated_scene
-    from gpu_steps import POP, make_trainer, step_loads
 
     whole, case = CASES[0], CASES[0].smaller(BY)
     assert (whole.n, whole.width * whole.height) == (270_000, pytest.approx(1.6e6, rel=0.01))

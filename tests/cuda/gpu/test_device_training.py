@@ -11,7 +11,7 @@ import torch
 
 from cuda_ext.render import lists
 from pop_fast.api.backend import get_backend
-from pop_fast.cuda import training
+from pop_fast.cuda import stages
 from pop_fast.density import GsplatStrategy, POPStrategy
 from pop_fast.train import TrainingRun, training_run
 from pop_ref.conformance.mutants.trial import every_law, law_named
@@ -123,12 +123,12 @@ def test_buffers_that_overflow_between_views_of_several_sizes_lose_nothing(engin
 def test_photographs_without_room_pass_through_to_the_same_bits(engine, tmp_path, monkeypatch, batch_size):
     capture = masked(mixed_sizes(tiny_capture()))
     runs = []
-    monkeypatch.setattr(training, "MOMENTS_SHARE", 0.0)
+    monkeypatch.setattr(stages, "MOMENTS_SHARE", 0.0)
     # room for all, for some, and for none
     for name, share in (("all", 1.0), ("some", 0.6), ("none", 0.0)):
         most = runs[0].stepper.facts()["photograph_bytes"] if runs else 1 << 30
         monkeypatch.setattr(torch.cuda, "mem_get_info", lambda *_, free=most: (free, free))
-        monkeypatch.setattr(training, "PHOTOGRAPHS_SHARE", share)
+        monkeypatch.setattr(stages, "PHOTOGRAPHS_SHARE", share)
         runs.append(TrainingRun(tiny_config(tmp_path / name, batch_size=batch_size), capture, engine=engine))
         runs[-1].run()
     facts = [run.stepper.facts() for run in runs]
