@@ -398,9 +398,10 @@ def test_no_command_runs_a_module_of_the_current_folder(
     assert "no cameras could be found for these 3 photographs" in said, said
 
 
-# the first child comes to its end at once
+# the first child comes to its end at once; where Snakemake is installed, it would be Snakemake's
 ENDED = """
 import shutil, sys
+sys.modules["snakemake"] = None
 def hook(event, args):
     if event == "subprocess.Popen" and "blocks" in args[1]:
         shutil.rmtree("out/blocks")
