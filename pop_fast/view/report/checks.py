@@ -49,8 +49,8 @@ _TIMES_THE_REST: Final = 6.0
 _FAR_OFF: Final = 0.06
 # a picture's longer side in patches, whose mean colour is compared: fine detail that a splat has not learned yet
 # cancels there, and what stood in one photograph alone does not. Where the median patch is farther off than this, the
-# whole is not learned yet. Of a box that stands elsewhere in every photograph such patches are 0.7 % of a photograph;
-# of the same scene without it, of the fox and of three trained rows of the bear up to 0.15 %
+# whole is not learned yet. Of a box that stands elsewhere in every photograph such patches are 0.4 to 0.9 % of a
+# photograph (five runs); of the same scene without it, of the fox and of three trained rows of the bear up to 0.15 %
 _PATCHES: Final = 24
 _LEARNED: Final = 0.01
 _ORBIT_SIDE: Final = 400

@@ -33,7 +33,7 @@ _WON: Final = 0.5  # dB, by scaling each render to its photograph's brightness
 _FITS: Final = 22.0
 _FITS_BADLY: Final = 19.0
 _PARTS: Final = 0.006  # of a training view, on average: what does not fit where the rest does
-_PARTS_BY_COLOUR: Final = 0.004  # the same of patches that have another mean colour
+_PARTS_BY_COLOUR: Final = 0.0025  # the same of patches that have another mean colour
 _EPOCHS: Final = 30  # how often each photograph is to be seen
 _LOST: Final = 0.1  # of the photographs, without a camera
 
