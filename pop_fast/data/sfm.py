@@ -409,9 +409,10 @@ def _made(folder: Path) -> Path:
 def _best(job: Search, tell: Progress) -> Any:
     """Search, and again where too few photographs were placed; keep the model that places more.
 
-    From 26 degrees to the next photograph on, SIFT's round features seldom match: of 14 in a ring 5 were placed, and of
-    7 none. The second search fits an ellipse to each, takes fainter ones, and looks for more pairs along the epipolar
-    lines of the first: it placed all of both. On photographs that the first places too, it took four times as long.
+    SIFT's round features seldom match where photographs are far apart: of 14 in a ring, 26 degrees apart, 5 were
+    placed, of 7 none. The second search fits an ellipse to each feature, takes fainter ones, and looks for more pairs
+    along the epipolar lines of the first ones: it placed all of both. On 8 photographs of the fox, of which both place
+    all, it took 39 s of one core and the first 7 s.
     """
     models = _models(job, tell, thorough=False)
     n = len(job.names)

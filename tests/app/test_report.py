@@ -300,6 +300,8 @@ def test_what_moved_over_detail_that_is_not_learned_is_told_by_its_colour(bright
 
 def test_a_training_leaves_what_its_report_shows(shared_result: Path, shared_capture: Path) -> None:
     found = read_checks(shared_result / "report_data" / "checks_step29.json")
+    assert found.given == found.placed == 8
+    assert found.patches.keys() == found.misfits.keys() != set()
     stats = json.loads((shared_result / "stats" / "val_step0029.json").read_text())
     assert found.photographs == 7
     assert found.held_out_psnr == pytest.approx(stats["psnr"], abs=1e-3)

@@ -16,10 +16,9 @@ pytest.register_assert_rewrite("pop_ref.conformance.laws")
 
 import cuda_ext  # noqa: E402  asserts must be rewritten first
 from cuda_ext.host import emulate  # noqa: E402
-from cuda_ext.host.emulate import library_folder  # noqa: E402
 
 # where the emulated module is built
-FOLDER = library_folder(Path(__file__).parent / "emulated")
+FOLDER = emulate.library_folder(Path(__file__).parent / "emulated")
 # asked before an emulated module can take the extension's place
 NO_CARD = cuda_ext.why_not()
 
