@@ -1,8 +1,8 @@
 """The parts of a run in blocks (trainings of blocks, and merges), where each one writes, and how they are run.
 
-Round 0 trains every block by itself. The rounds after it begin with the merged Gaussians: every block trains those of
-its own core, among all others as they are. A round's blocks do not wait for one another; its merge waits for all of
-them, and the next round for the merge.
+Round 0 trains every block by itself, or a coarse model of the whole. The rounds after it begin with the merged
+Gaussians: every block trains those of its own core, among all others as they are. A round's blocks do not wait for one
+another; its merge waits for all of them, and the next round for the merge.
 
 Parts are run by Snakemake where it is installed, else one after the other. Either way a part is a process of its own,
 `pop blocks train OUT i_j` or `pop blocks merge OUT`, so that its memory is given back when it ends. One that is
@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Final
 
 from pop_fast.api.backend import get_backend
-from pop_fast.blocks.plan import FOLDER, Job
+from pop_fast.blocks.plan import COARSE, FOLDER, Job
 from pop_fast.children import SAFE_PATH, module_command
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import FolderLock
@@ -61,7 +61,7 @@ def parts_of(job: Job) -> list[Part]:
     """List the parts of a run, in an order in which they can be done."""
     found = []
     for number in range(job.rounds + 1):
-        found += [Part(number, name) for name in job.names]
+        found += [Part(number, name) for name in (job.names if number else job.trained_first)]
         found.append(Part(number, None, last=number == job.rounds))
     return found
 
@@ -149,7 +149,10 @@ def _begins(part: Part, job: Job) -> str:
     count = len(job.names)
     of_round = f"round {part.round} of {job.rounds}: " if part.round else ""
     if part.block is None:
-        return f"{of_round}merging {count} blocks"
+        what = "dividing the coarse model into" if job.coarse and part.round == 0 else "merging"
+        return f"{of_round}{what} {count} blocks"
+    if part.block == COARSE:
+        return f"the coarse model of the whole, photographs shrunk by {job.coarse}"
     return f"{of_round}block {part.block}, {job.names.index(part.block) + 1} of {count}"
 
 

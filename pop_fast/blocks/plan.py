@@ -26,6 +26,7 @@ The folder of a run in blocks has a result's own files, which describe the merge
     blocks/i_j/             one block: the list of its photographs and its points (see `pop_fast.data.load`)
     blocks/i_j/result/      its training, an ordinary result folder
     blocks/i_j/trained      is there when its training is finished
+    blocks/coarse/          where blocks begin from a coarse model of the whole: its list, training and marker, likewise
     blocks/merged           is there when the blocks are merged for the last time
 
 and of every round r, from 0, that another one follows:
@@ -62,12 +63,16 @@ from pop_fast.io.read_back import read_json
 FOLDER: Final = "blocks"
 JOB: Final = f"{FOLDER}/job.json"
 _PLAN = "plan.json"
+# what a run in blocks that begins from a coarse model trains first; no block's name, which is "i_j"
+COARSE: Final = "coarse"
+# photographs shrunk by more show little
+_MOST_COARSE: Final = 16
 _FIX: Final = "start 'pop train --blocks' again with --overwrite"
 # rounds of a run where nobody says how many: of bonsai's 2.6 dB between merged and whole the first, the second and the
 # third give back 1.5, 0.5 and 0.3; and the steps of one as a share of a block's training
 DEFAULT_ROUNDS: Final = 2
 ROUND_SHARE: Final = 0.1
-_WHOLE: Final = ("rounds", "round_steps")
+_WHOLE: Final = ("rounds", "round_steps", "coarse")
 # more parts than a workflow shows, and surely a slip
 _MOST_ROUNDS: Final = 100
 
@@ -82,6 +87,8 @@ class Job:
     share: float = 0.25
     rounds: int = 0  # how often the merged Gaussians are trained on, every block those of its core
     round_steps: int = 0  # of a block in each round; 0 where there is none
+    # blocks begin from a model of the whole, whose photographs are shrunk by this; 0 trains each block by itself
+    coarse: int = 0
     # what is written when the blocks are merged, as `FinishOptions` has it
     finish: dict[str, Any] = field(default_factory=dict)
 
@@ -97,6 +104,16 @@ class Job:
             raise PopError(f"--blocks-rounds is {self.rounds}; it must be from 0 to {_MOST_ROUNDS}")
         if self.rounds > 0 and self.round_steps < 1:
             raise PopError(f"--blocks-round-steps is {self.round_steps}; it must be 1 or more")
+
+        if self.coarse and not 2 <= self.coarse <= _MOST_COARSE:
+            raise PopError(f"--blocks-coarse is {self.coarse}; it must be from 2 to {_MOST_COARSE}, or 0 for none")
+        if self.coarse and self.rounds == 0:
+            raise PopError("--blocks-coarse needs rounds, in which blocks are trained; say --blocks-rounds 2 too")
+
+    @property
+    def trained_first(self) -> list[str]:
+        """Return the names of what is trained before the first merge: the blocks, or the coarse model."""
+        return [COARSE] if self.coarse else self.names
 
     @property
     def names(self) -> list[str]:
@@ -210,6 +227,10 @@ def write_plan(folder: Path, plan: Plan, listing: Listing, transform: np.ndarray
         shots += [replace(shot, split="test") for shot in listing.shots if shot.name in block.held_out]
         points = SparsePoints(cloud.xyz[block.points], cloud.rgb[block.points])
         write_block(folder / FOLDER / block.name, replace(listing, shots=shots, cloud=points, transform=transform))
+    if plan.job.coarse:
+        held = {name for block in plan.blocks for name in block.held_out}
+        shots = [replace(shot, split="test" if shot.name in held else "train") for shot in listing.shots]
+        write_block(folder / FOLDER / COARSE, replace(listing, shots=shots, transform=transform))
     content = {"blocks": [entry_of(block) for block in plan.blocks], "partition": plan.partition.plain()}
     text = json.dumps(content, indent=2) + "\n"
     write_atomically(folder / FOLDER / _PLAN, lambda file: file.write(text.encode()))

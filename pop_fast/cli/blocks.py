@@ -76,15 +76,16 @@ def run(argv: Sequence[str]) -> int:
     with own_gpu(folder, config.backend):
         if part.round:
             return _train_round(folder, config, record, job, part)
-        return _train(folder, config, part.block, argv)
+        return _train(folder, config, job, part.block, argv)
 
 
 def _part(args: Args, job: Job) -> Part:
     """Find which part of the run is asked for; a PopError says that it has no such block or round."""
     from pop_fast.blocks.jobs import parts_of
 
-    if args.part == "train" and args.block not in job.names:
-        raise PopError(f"{args.result}: has no block {args.block}; its blocks are {', '.join(job.names)}")
+    known = list(dict.fromkeys([*job.trained_first, *job.names]))
+    if args.part == "train" and args.block not in known:
+        raise PopError(f"{args.result}: has no block {args.block}; its blocks are {', '.join(known)}")
     number = (0 if args.part == "train" else job.rounds) if args.round is None else args.round
     found = [part for part in parts_of(job) if (part.round, part.block) == (number, args.block)]
     if not found:
@@ -106,15 +107,15 @@ def _partition(folder: Path, config: TrainConfig, record: CaptureRecord, job: Jo
     return 0
 
 
-def _train(folder: Path, config: TrainConfig, block: str, argv: Sequence[str]) -> int:
+def _train(folder: Path, config: TrainConfig, job: Job, block: str, argv: Sequence[str]) -> int:
     from pop_fast.blocks.jobs import marker_of
-    from pop_fast.blocks.plan import read_plan
-    from pop_fast.blocks.run import config_of
+    from pop_fast.blocks.plan import COARSE, read_plan
+    from pop_fast.blocks.run import coarse_config, config_of
     from pop_fast.cli.train import check_backend, train_capture
 
     if read_plan(folder) is None:
         raise PopError(f"{folder}: its capture is not divided yet; run pop blocks partition {folder}")
-    own = config_of(folder, config, block)
+    own = coarse_config(folder, config, job.coarse) if block == COARSE else config_of(folder, config, block)
     options = _options(folder, own)
     own, chosen = choose_backend(own, options.resume)
     check_backend(own)
@@ -156,7 +157,7 @@ def _train_round(folder: Path, config: TrainConfig, record: CaptureRecord, job: 
     begun, names = time.perf_counter(), check_merged(folder, part.round)
     centers = read_core(folder, part.block, part.round)["means"].numpy()
     write_round_block(folder, config, record, names, part.block, part.round, centers)
-    own = round_config(folder, config, part, job.round_steps)
+    own = round_config(folder, config, part, job)
     options, place = _options(folder, own), Path(own.result_dir)
     own, chosen = choose_backend(own, options.resume)
     check_backend(own)

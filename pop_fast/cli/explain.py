@@ -84,7 +84,7 @@ def _explain(args: Args, at: tuple[int, int] | None) -> int:
     if at is not None:
         check_inside(view, *at)
     if args.profile is not None:
-        config = config.with_overrides(profile=args.profile, near_plane=None).in_world(capture.world_scale)
+        config = config.with_overrides(profile=args.profile, near_plane=None, eps2d=None).in_world(capture.world_scale)
     config = with_objective(config, args.objective)
     with reproducible(config.threads):
         scene = explain_view(splat.params, view, config, splat.sh_degree, splat.step)

@@ -94,6 +94,7 @@ def _job(config: TrainConfig, options: Any) -> Job:
         )
     finishing = {field.name: getattr(options, field.name) for field in fields(FinishOptions)}
     dividing = {"blocks": options.blocks, "margin": options.blocks_margin, "share": options.blocks_share}
+    dividing["coarse"] = options.blocks_coarse
     return Job(**dividing, rounds=rounds, round_steps=steps if rounds else 0, finish=finishing)
 
 
@@ -115,7 +116,8 @@ def train_in_blocks(config: TrainConfig, options: Any, chosen: str, argv: Sequen
         rounds = (
             f", then {job.rounds} round{'s' if job.rounds > 1 else ''} of {job.round_steps:,}" if job.rounds else ""
         )
-        print(printable(f"{config.method} in blocks {job.blocks}, {config.max_steps:,} steps each{rounds} -> {folder}"))
+        first = "from a coarse model" if job.coarse else f"{config.max_steps:,} steps each"
+        print(printable(f"{config.method} in blocks {job.blocks}, {first}{rounds} -> {folder}"))
         print(chosen)
         if begun is None:
             _begin(folder, config, options, job, division, argv)

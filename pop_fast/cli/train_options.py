@@ -43,6 +43,8 @@ class BlocksOptions:
         blocks_rounds: how often the merged blocks are trained on: each round trains what a block has in its core among
             all others as they are, and merges again. With --resume a finished run takes further rounds. (default: 2)
         blocks_round_steps: steps of a block in a round. (default: a tenth of --max-steps)
+        blocks_coarse: begin from a coarse model of the whole, whose photographs are shrunk by this, as 2, instead of
+            training each block by itself; 0 does not.
         blocks_jobs: how many blocks are trained at a time on the CPU of this machine; GPUs train one each. More than
             one needs Snakemake.
         blocks_profile: hand the blocks to a cluster by this Snakemake profile: slurm, or a folder of yours.
@@ -53,6 +55,7 @@ class BlocksOptions:
     blocks_share: float = 0.25
     blocks_rounds: Annotated[int | None, tyro.conf.arg(help_behavior_hint="")] = None
     blocks_round_steps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="")] = None
+    blocks_coarse: int = 0
     blocks_jobs: int = 1
     blocks_profile: str | None = None
 

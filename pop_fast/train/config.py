@@ -66,6 +66,7 @@ class TrainConfig:
             those built on it), "speedy_splat", or one that another package registers.
         near_plane: depth up to which a camera shows nothing, in units of the world that is trained in; None takes the
             profile's, which Inria's family counts in the capture's own units: a run writes down what that comes to.
+        eps2d: low-pass, px^2; None takes the profile's.
         antialiased: render with opacity compensation (Mip-Splatting) instead of classically.
         factor: photographs are shrunk by it.
         resize: how, where the capture does not bring them shrunk: "area" averages, "bicubic" does as Pillow does, and
@@ -125,6 +126,7 @@ class TrainConfig:
     backend: str = "auto"
     profile: str = PAPER.name
     near_plane: float | None = None
+    eps2d: float | None = None
     antialiased: bool = False
     factor: int = 1
     resize: Literal["area", "bicubic"] = "area"
@@ -261,9 +263,9 @@ class TrainConfig:
 
     @property
     def renderer(self) -> Profile:
-        """The rasterizer's constants, with the near plane of these settings."""
-        profile = profile_named(self.profile)
-        return profile if self.near_plane is None else replace(profile, near_plane=self.near_plane)
+        """The rasterizer's constants, with the near plane and the low-pass of these settings."""
+        own = {name: getattr(self, name) for name in ("near_plane", "eps2d")}
+        return replace(profile_named(self.profile), **{name: value for name, value in own.items() if value is not None})
 
     def in_world(self, world_scale: float) -> Self:
         """Return these settings with the near plane of a world, unless one was set.
@@ -322,11 +324,12 @@ class TrainConfig:
 
     def binding(self) -> dict[str, Any]:
         """Return the settings that a resumed run must share, flat."""
-        # a batch of one, a profile's own near plane, photographs at their size, rates that stay, Adam's usual decay and
-        # no regularizers are what every run had before there were others: its checkpoints say nothing of them
+        # a batch of one, a profile's own near plane and low-pass, photographs at their size, rates that stay, Adam's
+        # usual decay and no regularizers are what every run had before there were others: its checkpoints say nothing
+        # of them
         usual = {
             "batch_size": self.batch_size == 1,
-            "near_plane": self.near_plane is None,
+            **{name: getattr(self, name) is None for name in ("near_plane", "eps2d")},
             "coarse_stop_iters": not self.coarse_stop_iters,
             "lr.others_decay": self.lr.others_decay == 1.0,
             "lr.beta2": self.lr.beta2 == BETAS[1],
