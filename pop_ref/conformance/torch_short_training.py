@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pop_ref.conformance.short_training import BACKGROUND, DEGREE, VIEWS, ShortTraining, Watch
+from pop_ref.conformance.short_training import BACKGROUND, VIEWS, ShortTraining, Watch
 from pop_ref.methods import KEYS
 from pop_ref.settings import AppearanceRates, LearningRates
 
@@ -155,7 +155,7 @@ class Trainee:
             else:
                 said[_NAMES.get(name, name)] = value
         said |= {
-            "sh_degree": DEGREE, "threads": 1, "progress": False, "backend": self._backend, "test_every": 0,
+            "sh_degree": short.degree, "threads": 1, "progress": False, "backend": self._backend, "test_every": 0,
             "batch_size": short.batch, "background": short.background, "antialiased": short.antialiased,
         }  # fmt: skip
         return self._module("train.config").TrainConfig.of(

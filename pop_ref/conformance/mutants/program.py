@@ -935,6 +935,11 @@ _LINES: Final[Lines] = {
          "alpha.mul_(inside), weight.mul_(inside), scratch", "alpha, weight.mul_(inside), scratch",
          "test_collected:passes_over_photographs_sum_what_their_views_show"),
     ),
+    "stages/stage_set.py": (
+        ("whole_background_in_passes", "the picture of a pass over a view has all of its background in front of it too",
+         "blend.image + (1.0 - blend.alphas)[..., None] * background", "blend.image + background",
+         "test_collected:passes_over_photographs_sum_what_their_views_show"),
+    ),
     "stages/harmonics.py": (
         ("third_band_lacks_a_power",
          "the slope along y of one function of the third band lacks the derivative of its own y^2",
