@@ -115,6 +115,16 @@ def test_every_step_is_the_oracles_while_the_gaussians_change(backend):
     assert happened == {"cloned", "split", "pruned", "reset"}, f"{happened} only"
 
 
+@law("training", "foreign_steps")
+def test_every_step_is_the_oracles_by_a_strategy_of_somebody_else(backend):
+    # a split is by random numbers of its own; whom nobody asks for a term has no prior
+    cloned = ShortTraining("gsplat", {**CHANGES, "grow_scale3d": 100.0}, SHORT, ORDER[:4], seed=173, scene_scale=2.0)
+    happened = set()
+    for short in (PRIOR, cloned):
+        happened |= assert_steps(backend, short, backend.stage("foreign_steps")(short))
+    assert happened == {"cloned", "pruned", "reset"}, f"{happened} only"
+
+
 @law("training", "taken_steps")
 def test_every_step_is_the_oracles_with_terms_for_few_photographs(backend):
     weights = {"depth_lambda": 0.5, "opacity_reg": 0.25, "scale_reg": 0.125}
