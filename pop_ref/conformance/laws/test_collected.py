@@ -11,13 +11,13 @@ import functools
 
 import numpy as np
 
+from pop_ref.compositing import composite
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.error_bounds import pixel_error_bounds
 from pop_ref.conformance.gradient_error_bounds import screened, sensitivity_error_bounds, weight_error_bounds
 from pop_ref.conformance.law import law
 from pop_ref.conformance.short_training import VIEWS, clear_watch, collected
 from pop_ref.conformance.strategy_script import METHODS
-from pop_ref.compositing import composite
 from pop_ref.contributions import contributions
 from pop_ref.fisher import fisher_blocks, screen_moments
 from pop_ref.records import Camera

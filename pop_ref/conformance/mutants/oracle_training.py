@@ -588,7 +588,7 @@ _LINES: Final[Lines] = {
          "of turns beyond a tenth of a radian the gradient has one coefficient's slope wrong",
          "(a - 2.0 * b) / (2.0 * s)", "(a - b) / (2.0 * s)",
          "test_agreement:refined_viewmat_vjp_is_the_oracles"),
-        ("wide_turns_times_their_angle", "the sine of a wide turn is multiplied by the angle that it is to be divided by",
+        ("wide_turns_times_their_angle", "the sine of a wide turn is multiplied by the angle, not divided by it",
          "a, b = math.sin(angle) / angle,", "a, b = math.sin(angle) * angle,",
          "test_agreement:refined_viewmat_is_the_oracles"),
         ("small_turns_cancel",

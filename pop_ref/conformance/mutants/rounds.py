@@ -1,4 +1,4 @@
-"""Which mutants were written, or drawn, before anybody looked which law would notice; docs/kit.md says how many died."""
+"""Which mutants were written, or drawn, before anybody looked which law would notice; docs/kit.md has the shares."""
 
 from __future__ import annotations
 
