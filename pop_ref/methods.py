@@ -33,6 +33,7 @@ RECIPE_OF: Final[Mapping[str, Recipe]] = {
     "speedy-splat": BASELINES["Speedy-Splat"],
     "pup": BASELINES["PUP-3DGS"],
 }
+_MINI_STARTS: Final = RECIPE_OF["mini-splatting"].adam_restarts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,12 +53,12 @@ class Extras:
     hard_prune_share: float = 0.3
     prune_shares: tuple[float, ...] = (0.8, 0.5)
     score_divisor: int = 4
-    reinit_iters: tuple[int, ...] = (5_000, 10_000)
+    reinit_iters: tuple[int, ...] = _MINI_STARTS[:2]
     reinit_points: int = 3_500_000
     reinit_opacity: float = 0.1
-    sample_iter: int = 15_000
+    sample_iter: int = _MINI_STARTS[2]
     sampling_factor: float = 0.5
-    prune_iter: int = 20_000
+    prune_iter: int = _MINI_STARTS[3]
     prune_mass: float = 0.01
     importance: str = "indoor"
     max_gaussians: int = 4_500_000

@@ -93,8 +93,8 @@ def _picture_magnitude(inputs: tuple[Any, ...]) -> float:
     return 1.0 + sum(float(np.max(np.abs(a))) for a in inputs[:2])
 
 
-# rotations and translations: wide turns, slight ones, which have formulas of their own, and hardly any
-turns = st.sampled_from([2.0**-24, 1.0, 2.0**-4])
+# rotations and translations: wide turns, hardly any, and slight ones, as large as those with series of their own may be
+turns = st.sampled_from([2.0**-24, 1.0, 0.09375])
 corrections = st.tuples(arrays_of((6,), -1.0, 1.0), turns).map(lambda w: w[0] * w[1])
 
 CASES = (

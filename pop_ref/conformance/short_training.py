@@ -42,7 +42,6 @@ from pop_ref.settings import BETAS, EPS
 from pop_ref.short_training import Trained
 from pop_ref.training import Look, gaussians_from_params
 
-DEGREE: Final = 2
 SIZE: Final = 13, 11
 
 
@@ -66,6 +65,7 @@ class ShortTraining:
         batch: views of a step.
         sparse: sparse points, of which every photograph sees its own; 0 for none.
         size: width and height of all views, px.
+        degree: the highest of the harmonics.
         centred: whether principal points are the middle of the image, as Inria's code takes them to be.
     """
 
@@ -84,6 +84,7 @@ class ShortTraining:
     batch: int = 1
     sparse: int = 0
     size: tuple[int, int] = SIZE
+    degree: int = 2
     centred: bool = False
 
     @property
@@ -94,7 +95,7 @@ class ShortTraining:
     @functools.cached_property
     def params(self) -> Mapping[str, np.ndarray]:
         """Return raw parameters in numbers of single precision."""
-        return raw_params(gaussians(self.seed, DEGREE, self.count, self.size))
+        return raw_params(gaussians(self.seed, self.degree, self.count, self.size))
 
     @functools.cached_property
     def cameras(self) -> list[Camera]:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pop_ref.conformance.short_training import BACKGROUND, DEGREE, VIEWS, ShortTraining, Watch
+from pop_ref.conformance.short_training import BACKGROUND, VIEWS, ShortTraining, Watch
 from pop_ref.methods import KEYS
 from pop_ref.settings import AppearanceRates, LearningRates
 
@@ -64,6 +64,11 @@ class Trainee:
             self._step(run, step)
             found.append(_array(run.appearance.params["exposures"]))
         return found
+
+    def foreign_steps(self, short: ShortTraining) -> list[dict[str, Any]]:
+        """Take the steps of a run that is given the method as somebody else's strategy, by gsplat's protocol."""
+        run = self._run(short, foreign=True)
+        return [self._taken(run, step) for step in range(short.steps)]
 
     def corrected_steps(self, short: ShortTraining, corrections: np.ndarray) -> tuple[list[dict[str, Any]], np.ndarray]:
         """Take steps with cameras that are corrected and stay so; return them, and the cameras from which they saw.
@@ -128,14 +133,15 @@ class Trainee:
             "v": {key: _array(moments[key]["exp_avg_sq"]) for key in KEYS},
         }
 
-    def _run(self, short: ShortTraining, folder: str = "", **more: Any) -> Any:
+    def _run(self, short: ShortTraining, folder: str = "", foreign: bool = False, **more: Any) -> Any:
         """Return a run of the short training; the engine is the one that its settings have."""
         initial = {key: self._torch.as_tensor(value).to(self._float) for key, value in short.params.items()}
         config = self._config(short, folder, more)
         # in single precision a run chooses its engine itself
         engine = None if self._float == self._torch.float32 else self._engine(config)
         TrainingRun = self._module("train.training_run").TrainingRun
-        run = TrainingRun(config, self._capture(short), initial=initial, engine=engine)
+        given = {"initial": initial, "engine": engine, "strategy": config.strategy if foreign else None}
+        run = TrainingRun(config, self._capture(short), **given)
         drawn, Draws = short.draws(), self._module("density.protocol").Draws
         run.draws = Draws(
             lambda n: self._torch.as_tensor(drawn.normals(n)), lambda n: self._torch.as_tensor(drawn.uniforms(n))
@@ -155,7 +161,7 @@ class Trainee:
             else:
                 said[_NAMES.get(name, name)] = value
         said |= {
-            "sh_degree": DEGREE, "threads": 1, "progress": False, "backend": self._backend, "test_every": 0,
+            "sh_degree": short.degree, "threads": 1, "progress": False, "backend": self._backend, "test_every": 0,
             "batch_size": short.batch, "background": short.background, "antialiased": short.antialiased,
         }  # fmt: skip
         return self._module("train.config").TrainConfig.of(

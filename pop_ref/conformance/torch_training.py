@@ -232,17 +232,23 @@ class Trainer:
         max_steps: int | None = None,
         rates: AppearanceRates | None = None,
     ) -> dict[str, Any]:
-        """See `pop_ref.appearance.appearance_steps`; what is left out is the trainer's own."""
+        """See `pop_ref.appearance.appearance_steps`; what is left out is the trainer's own.
+
+        After every step the run goes on from what it has saved.
+        """
         config = self._config.TrainConfig()
         learned = grads[0] if grads else ()
         chosen = {"exposure": "exposures" in learned, "refine_cameras": "cameras" in learned}
         given = {"max_steps": max_steps or config.max_steps, "appearance_lr": rates or config.appearance_lr}
         views = [SimpleNamespace(viewmat=viewmat[None]) for viewmat in viewmats]
-        appearance = self._appearance.Appearance(replace(config, **chosen, **given), views)
+        config = replace(config, **chosen, **given)
+        appearance = self._appearance.Appearance(config, views)
         for step, grad in enumerate(grads):
             for name, param in appearance.params.items():
                 param.grad = grad[name].to(param.dtype)
             appearance.update(step)
+            saved, appearance = appearance.state_dict(), self._appearance.Appearance(config, views)
+            appearance.load_state_dict(saved)
         return {name: param.detach() for name, param in appearance.params.items()}
 
     def sh_degree_at(

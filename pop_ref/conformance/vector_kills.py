@@ -109,10 +109,6 @@ def main(words: list[str]) -> int:
     return 0
 
 
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
-
-
 Arrays = dict[str, np.ndarray]
 LARGE = 100
 
@@ -356,3 +352,7 @@ def _stage(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
     if not backend.has(name) or not all(backend.profile is None or p == backend.profile for p in profiles):
         return {}
     return outputs(backend.stage(name)(*args))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

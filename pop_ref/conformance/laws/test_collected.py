@@ -11,6 +11,7 @@ import functools
 
 import numpy as np
 
+from pop_ref.compositing import composite
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.error_bounds import pixel_error_bounds
 from pop_ref.conformance.gradient_error_bounds import screened, sensitivity_error_bounds, weight_error_bounds
@@ -225,6 +226,16 @@ def _map(camera):
     return np.mod(np.arange(camera.height * camera.width, dtype=np.float64), 7.0).reshape(camera.height, camera.width)
 
 
+def _assert_told(backend, given, found):
+    """Assert that the picture, the depths and the extents that a pass tells are the oracle's."""
+    image = composite(*given.view, given.scene.background, given.scene.profile).image
+    bounds, shown = given.error_bounds, np.all(given.splats.radii > 0, axis=1)
+    assert_close("training.passes", found["image"], image, bounds.image, backend.dtype, True, bounds.unambiguous)
+    ends = found["depths"], given.splats.depths
+    assert_close("training.passes", *ends, bounds.screen.e_depths, backend.dtype, True, shown, _row_of("depths"))
+    assert_same_bits("extents", found["radii"], given.splats.radii)
+
+
 @law("training", "view_passes")
 def test_passes_over_photographs_sum_what_their_views_show(backend):
     for asks in ({}, {"masked": True}, {"antialiased": True}):
@@ -233,6 +244,7 @@ def test_passes_over_photographs_sum_what_their_views_show(backend):
             found = backend.stage("view_passes")(watch, view, DIVISOR)
             given = screened(backend, watch.scene(view, watch.steps))
             expected, rows = contributions(*given.view, _map(watch.cameras[view]), given.scene.profile), given.sure
+            _assert_told(backend, given, found)
             assert_same_bits("pixels", found["n_pixels"][rows], expected.n_pixels[rows])
             weights, distances = weight_error_bounds(given.error_bounds)
             bounds = {"weight_sum": weights, "map_sum": 7.0 * expected.n_pixels, "distance_sum": distances}

@@ -168,11 +168,12 @@ def test_a_splat_is_kept_exactly_while_its_extent_overlaps_the_image(backend, ed
     sign, axis = (-1.0, edge % 2) if edge < 2 else (1.0, edge % 2)
     at_edge = np.array([width / 2.0, height / 2.0])
     at_edge[axis] = -reach if sign < 0 else (width, height)[axis] + reach
-    radii = np.full((3, 2), reach)
+    radii = np.full((4, 2), reach)
     step = np.zeros(2)
     step[axis] = sign * by
-    means2d = np.array([at_edge, at_edge + step, at_edge - min(by, 2.0 * reach) / by * step])
-    assert_same_bits("kept", on_screen(means2d, radii, width, height), [False, False, True])
+    inside = [share * step / by for share in (min(by, 2.0 * reach), 2.0**-16)]
+    means2d = np.array([at_edge, at_edge + step, *(at_edge - each for each in inside)])
+    assert_same_bits("kept", on_screen(means2d, radii, width, height), [False, False, True, True])
     assert not np.any(on_screen(np.array([[4.0, 2.0]]), np.zeros((1, 2), dtype=np.int64), width, height))
 
 

@@ -115,6 +115,16 @@ def test_every_step_is_the_oracles_while_the_gaussians_change(backend):
     assert happened == {"cloned", "split", "pruned", "reset"}, f"{happened} only"
 
 
+@law("training", "foreign_steps")
+def test_every_step_is_the_oracles_by_a_strategy_of_somebody_else(backend):
+    # a split is by random numbers of its own; whom nobody asks for a term has no prior
+    cloned = ShortTraining("gsplat", {**CHANGES, "grow_scale3d": 100.0}, SHORT, ORDER[:4], seed=173, scene_scale=2.0)
+    happened = set()
+    for short in (PRIOR, cloned):
+        happened |= assert_steps(backend, short, backend.stage("foreign_steps")(short))
+    assert happened == {"cloned", "pruned", "reset"}, f"{happened} only"
+
+
 @law("training", "taken_steps")
 def test_every_step_is_the_oracles_with_terms_for_few_photographs(backend):
     weights = {"depth_lambda": 0.5, "opacity_reg": 0.25, "scale_reg": 0.125}
@@ -161,6 +171,9 @@ def test_what_a_method_prunes_by_is_of_all_photographs(backend):
                                     ("pup", (3, 24), pup)):  # fmt: skip
         for seed in seeds:
             short = ShortTraining(method, settings, SHORT, (0, 1), seed, count=9, views=3, held_out=1)
+            if seed == 24:
+                # of one band, which is drawn from the second step on
+                short = replace(short, degree=1, options={**SHORT, "sh_interval": 1})
             found = backend.stage("taken_steps")(short)
             assert "pruned" in assert_steps(backend, short, found, least=0.0), method
 

@@ -621,6 +621,9 @@ _LINES: Final[Lines] = {
          "test_agreement:mean_activation_is_the_oracles"),
     ),
     "stages/appearance.py": (
+        ("series_without_signs", "the series of a slope, for small turns, has the sign of its first term throughout",
+         "a_slope = -sum((k + 1) * (-s) ** k", "a_slope = -sum((k + 1) * s**k",
+         "test_agreement:refined_viewmat_vjp_is_the_oracles"),
         ("exposure_transposed", "an exposure multiplies rows in place of columns: Inria's file read by another program",
          "image.reshape(-1, 3), exposure[:, :3].T)", "image.reshape(-1, 3), exposure[:, :3])",
          "test_agreement:expose_is_the_oracles"),
@@ -652,6 +655,9 @@ _LINES: Final[Lines] = {
         ("visible_to_every_camera", "of several cameras all have to see a Gaussian for the prior over what is visible",
          'return visible_from_radii(info["radii"]).any(0)', 'return visible_from_radii(info["radii"]).all(0)',
          "test_strategies:of_several_cameras_any_may_show_that_a_gaussian_is_important"),
+        ("others_have_no_term", "a strategy of somebody else is not asked for its term of the loss",
+         "return None if term is None else term(", "return None if term is not None else term(",
+         "test_whole_steps:every_step_is_the_oracles_by_a_strategy_of_somebody_else"),
     ),
     "stages/projection.py": (
         ("depth_clamped_not_slope", "the frustum clamp is of z, not of x / z (GaussianSplattingMlx PR#28)",
@@ -876,6 +882,9 @@ _LINES: Final[Lines] = {
         ("appearance_does_not_decay", "exposures and cameras are learned at their first rates to the end",
          "rate * decay**share", "rate",
          "test_few_photographs:rates_of_exposures_and_cameras_fall_from_step_to_step_and_not_as_one_another"),
+        ("resumed_without_moments", "exposures and cameras that are read from a checkpoint are without their moments",
+         'if key != "value"}', 'if key == "value"}',
+         "test_few_photographs:rates_of_exposures_and_cameras_fall_from_step_to_step_and_not_as_one_another"),
         ("cameras_drift_together",
          "the motion that all cameras share is left in them: the scene turns away from its held-out views",
          'if "cameras" in self.params:\n            self.params["cameras"].copy_',
@@ -933,6 +942,11 @@ _LINES: Final[Lines] = {
         ("pixels_beyond_the_border_count",
          "the pixels at which a Gaussian is blended are counted in whole tiles, also beyond the picture's border",
          "alpha.mul_(inside), weight.mul_(inside), scratch", "alpha, weight.mul_(inside), scratch",
+         "test_collected:passes_over_photographs_sum_what_their_views_show"),
+    ),
+    "stages/stage_set.py": (
+        ("whole_background_in_passes", "the picture of a pass over a view has all of its background in front of it too",
+         "blend.image + (1.0 - blend.alphas)[..., None] * background", "blend.image + background",
          "test_collected:passes_over_photographs_sum_what_their_views_show"),
     ),
     "stages/harmonics.py": (
