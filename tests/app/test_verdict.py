@@ -82,6 +82,9 @@ def orbit(shares: list[float]) -> dict[str, float]:
         ("Overfitting", {"train_psnr": 18.09, "held_out_psnr": 17.0}, "look", "both low"),
         # as close as these are, 6.2 dB say that they are not close enough
         ("Photographs", SIX_APART, "bad", "not enough for what this subject takes, as the 6.2 dB"),
+        # what few steps leave dark is no exposure yet
+        ("Exposure", {"stops": {"a": 0.0, "b": 0.6}, "train_psnr": 20.0, "steps": 300}, "look", "Not to be told yet"),
+        ("Exposure", {"stops": {"a": 0.0, "b": 0.6}, "train_psnr": 20.0, "steps": 3_000}, "look", "It drifts"),
         # hardly a drift, but 1.1 dB
         ("Exposure", {"matched_psnr": 30.6}, "look", "30.60 dB instead of 29.50"),
     ],
