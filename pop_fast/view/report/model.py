@@ -301,6 +301,7 @@ def _floating(checks: Checks) -> Iterator[Finding]:
     if covered:
         text += f" A veil hides much of {len(covered)} views between the photographs, as in {covered[0]}."
     text += " Leaving out those whose centres stand there takes part of it away" + (f"; {then}." if then else ".")
+    text += " The command leaves out what reaches in from beside the pictures, too, and tunes the rest."
     fix = ("export", "RESULT", "--to", "html", "--without-floaters")
     yield Finding("look" if few else "bad", "Floaters", text, fix)
 
