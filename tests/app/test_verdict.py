@@ -16,6 +16,7 @@ from pop_fast.cli.data_check import Args as DataCheck
 from pop_fast.cli.export import Args as Export
 from pop_fast.cli.train import arguments as train_arguments
 from pop_fast.train import TrainConfig
+from pop_fast.train.load_result import CaptureRecord, record_text
 from pop_fast.view.report.checks import Checks, read_checks
 from pop_fast.view.report.model import Finding, verdict
 from pop_fast.view.report.source import read_result, typed
@@ -244,6 +245,20 @@ def test_another_training_is_asked_for_as_the_judged_one_was(name: str, words: t
         assert again.max_steps == 3_600
         assert again.strategy.lambda_pop == run.strategy.lambda_pop
     assert "--preset" not in line or "--minutes" not in words
+
+
+def test_the_capture_is_asked_for_as_it_was_read(tmp_path: Path) -> None:
+    run = TrainConfig.of(method="pop", data="scene", result_dir=str(tmp_path))
+    record = CaptureRecord(images="stills", missing="skip", masks=False, source="transforms")
+    (tmp_path / "capture.json").write_text(record_text(record))
+    lines = [
+        typed(Finding("bad", "it", "is", (*words, "DATA")), run, tmp_path).next
+        for words in (("data", "check"), ("train",))
+    ]
+    assert lines[0] == ("data", "check", "scene", "--images", "stills")
+    _, options = train_arguments(lines[1][1:])
+    assert (options.images, options.missing, options.source) == ("stills", "skip", "transforms")
+    assert options.ignore_masks
 
 
 # What the report says to type next helps: commands are taken from reports and typed, and the results are measured.
