@@ -270,13 +270,13 @@ def _leave_out_floaters(left: Limited, limits: LimitOptions, shown: Shown) -> No
 
     steps = limits.fine_tune_steps
     capture, config, learned = _photographs(shown, left, limits.crop is not None)
-    left.keep(~are_floaters(left.params["means"], capture, config.test_every), "without floaters")
+    before, near = left.params, are_floaters(left.params["means"], capture, config.test_every)
+    left.keep(~near, "without floaters")
     if learned is None:
         left.said.append(_NOT_TUNED)
     if learned is None or not steps:
         return
-    before = left.params
-    veils = are_veils(before, capture, config, shown.sh_degree, renderer(config.backend)[0])
+    veils = are_veils(before, capture, config, shown.sh_degree, renderer(config.backend)[0])[~near]
     if not veils.any():
         return
     left.keep(~veils, "without veils")
@@ -286,7 +286,7 @@ def _leave_out_floaters(left: Limited, limits: LimitOptions, shown: Shown) -> No
     views = tuner.held_out
     where = f"{len(views)} held-out views" if views else "training views"
     after, had = (tuner.psnr(params, views) for params in (left.params, before))
-    left.said.append(f"tuned for {steps} steps: PSNR in {where} {after:.2f} dB, with the veils {had:.2f} dB")
+    left.said.append(f"tuned for {steps} steps: PSNR in {where} {after:.2f} dB, with all Gaussians {had:.2f} dB")
 
 
 def _quality(tuner: Tuner, found: Compact, output: Output) -> str:
