@@ -38,7 +38,7 @@ _SMALLER = """## Smaller
 |---|---|
 | `--min-opacity A` | Gaussians with a lower opacity; under 1/255 no picture changes |
 | `--crop XMIN YMIN ZMIN XMAX YMAX ZMAX` | those with their centre outside a box in the capture's own world frame |
-| `--without-floaters` | those that stand before a camera where nothing was photographed |
+| `--without-floaters` | those that stand before a camera where nothing was photographed, and veils; the rest is tuned |
 | `--final-prune SHARE` | those that contribute least and together make up this share of all blending weights |
 | `--max-gaussians N` | all but the N of the highest score |
 | `--target-mb M` | what a file of at most M megabytes has no room for: Gaussians of the lowest scores, bands of the \

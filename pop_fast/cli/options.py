@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
@@ -48,15 +49,17 @@ class LimitOptions:
         min_opacity: leave out Gaussians with a lower opacity; 1/255 = 0.0039 changes no picture.
         crop: keep those with their centres in the box XMIN YMIN ZMIN XMAX YMAX ZMAX, in the capture's own world frame.
         without_floaters: leave out those that stand, in the picture of a photograph's camera or of one that turns about
-            the subject, nearer than half the distance of the nearest sparse points there: haze and veils.
+            the subject, nearer than half the distance of the nearest sparse points there: haze and veils. Those that
+            reach into such a picture from beside it, and hide more of the turn than they show of the photographs, go
+            too where the rest can be tuned on the photographs.
         final_prune: leave out those that contribute least and together make up this share of all blending weights in
             the training views, as 0.003, and those that no training view shows.
         max_gaussians: keep at most so many, those of the highest scores.
         target_mb: make a file of at most so many megabytes (10^6 bytes): by fewer Gaussians, those of the highest
             scores, and where photographs are at hand also by a lower degree and a coarser encoding of the colours,
             whatever loses least in the training views.
-        fine_tune_steps: after max_gaussians or target_mb, train what is left for so many steps on the photographs, if
-            they are at hand; 0 leaves it as it is.
+        fine_tune_steps: after max_gaussians, target_mb or without_floaters, train what is left for so many steps on the
+            photographs, if they are at hand; 0 leaves it as it is.
         score: what `max-gaussians` and `target-mb` go by: Speedy-Splat's sensitivity, the blending weights
             (contributions) or the pixels dominated (dominance), each over all training views, or opacity and size alone
             (visibility); "auto" is sensitivity where a capture is known, otherwise visibility.
@@ -175,7 +178,7 @@ def limited(shown: Shown, limits: LimitOptions, output: Output) -> Limited:
     if limits.crop is not None:
         left.keep(shrink.inside(_means_of_capture(left.params, shown), limits.crop), "in the box")
     if limits.without_floaters:
-        left.keep(~_floaters(shown, left.params), "without floaters")
+        _leave_out_floaters(left, limits, shown)
     if limits.final_prune is not None:
         kept = shrink.all_but_the_least(_scores(shown, left.params, "contributions"), limits.final_prune)
         left.keep(kept, f"all but {limits.final_prune:.2%} of the blending weights")
@@ -213,18 +216,9 @@ def _fit_seen(left: Limited, limits: LimitOptions, output: Output, shown: Shown,
     capture, config, learned = _photographs(shown, left, limits.crop is not None)
     steps = limits.fine_tune_steps
     if learned is None:
-        left.said.append("not fine-tuned: what the run has learned of its photographs is in its checkpoints alone")
+        left.said.append(_NOT_TUNED)
         steps = 0
-    told = False
-    with bars() as progress:
-
-        def report(done: int, planned: int, seconds: float | None) -> None:
-            nonlocal told
-            if seconds is not None and not told:
-                told = True
-                print(f"fine-tuning: about {duration(seconds)}; --fine-tune-steps 0 leaves it out", flush=True)
-            progress("fine-tuning", done, planned)
-
+    with _told() as report:
         tuner = compact.Tuner(left.params, shown.sh_degree, config, capture, learned or {}, steps, report)
         if limits.target_mb is None:
             left.params = compact.tuned_to_the_end(tuner) if steps else left.params
@@ -242,6 +236,57 @@ def _fit_seen(left: Limited, limits: LimitOptions, output: Output, shown: Shown,
         f"{compact.degree_of(tuner.whole)}, written at level {found.level + 1} of {output.levels}"
     )
     left.said.append(_quality(tuner, found, output))
+
+
+_NOT_TUNED: Final = "not fine-tuned: what the run has learned of its photographs is in its checkpoints alone"
+
+
+@contextmanager
+def _told() -> Iterator[Callable[[int, int, float | None], None]]:
+    """Show how far fine-tuning is, and say once how long it takes."""
+    told = False
+    with bars() as progress:
+
+        def report(done: int, planned: int, seconds: float | None) -> None:
+            nonlocal told
+            if seconds is not None and not told:
+                told = True
+                print(f"fine-tuning: about {duration(seconds)}; --fine-tune-steps 0 leaves it out", flush=True)
+            progress("fine-tuning", done, planned)
+
+        yield report
+
+
+def _leave_out_floaters(left: Limited, limits: LimitOptions, shown: Shown) -> None:
+    """Leave out what stands where floaters do, and where the rest is tuned on the photographs, what veils the orbit.
+
+    Of what a veil leaves out photographs show a little, which the rest has to learn.
+    """
+    if shown.photographed is None:
+        raise PopError("floaters are found from the places of the photographs; give --capture DIR")
+    from pop_fast.train import compact
+    from pop_fast.train.engines import renderer
+    from pop_fast.view.report.checks import are_floaters, are_veils
+
+    steps = limits.fine_tune_steps
+    capture, config, learned = _photographs(shown, left, limits.crop is not None)
+    before, near = left.params, are_floaters(left.params["means"], capture, config.test_every)
+    left.keep(~near, "without floaters")
+    if learned is None:
+        left.said.append(_NOT_TUNED)
+    if learned is None or not steps:
+        return
+    veils = are_veils(before, capture, config, shown.sh_degree, renderer(config.backend)[0])[~near]
+    if not veils.any():
+        return
+    left.keep(~veils, "without veils")
+    with _told() as report:
+        tuner = compact.Tuner(left.params, shown.sh_degree, config, capture, learned, steps, report)
+        left.params = compact.tuned_to_the_end(tuner)
+    views = tuner.held_out
+    where = f"{len(views)} held-out views" if views else "training views"
+    after, had = (tuner.psnr(params, views) for params in (left.params, before))
+    left.said.append(f"tuned for {steps} steps: PSNR in {where} {after:.2f} dB, with all Gaussians {had:.2f} dB")
 
 
 def _quality(tuner: Tuner, found: Compact, output: Output) -> str:
@@ -284,15 +329,6 @@ def _means_of_capture(params: dict[str, Tensor], shown: Shown) -> Tensor:
 
     double = {name: value.double() for name, value in params.items()}
     return to_capture_frame(double, shown.world_transform)["means"]
-
-
-def _floaters(shown: Shown, params: Mapping[str, Tensor]) -> Tensor:
-    if shown.photographed is None:
-        raise PopError("floaters are found from the places of the photographs; give --capture DIR")
-    from pop_fast.view.report.checks import are_floaters
-
-    capture, config = shown.photographed()
-    return are_floaters(params["means"], capture, config.test_every)
 
 
 def _scores(shown: Shown, params: Mapping[str, Tensor], score: Score) -> Tensor:

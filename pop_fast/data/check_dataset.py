@@ -29,6 +29,7 @@ from pop_fast.data.photo_quality import (
     ok,
     warn,
 )
+from pop_fast.data.read_images import fix_of_absent
 from pop_fast.data.sfm import photo_folder
 from pop_fast.errors import CaptureError
 from pop_fast.io.images import find_image, list_images, read_image, read_mask, unreadable_photographs
@@ -135,7 +136,7 @@ def about_photos(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding
     absent = [photo for photo in photos if photo.path is None]
     if absent:
         names = ", ".join(photo.shot.name for photo in absent[:3])
-        fix = "restore them or train with --missing skip"
+        fix = fix_of_absent(root, [photo.shot for photo in absent], len(photos))
         yield bad("photographs", f"{len(absent)} of {len(photos)} listed are absent, first {names}; {fix}")
     for photo in photos:
         if photo.path is not None and photo.problem:

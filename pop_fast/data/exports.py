@@ -407,7 +407,8 @@ def read_transforms(paths: list[Path]) -> tuple[list[PosedImage], SparsePoints |
     named: Path | None = None
     for path in paths:
         listing = _load_transforms(path)
-        split = cast("Split | None", path.stem.partition("_")[2] or None)
+        # a list for training alone says nothing of what to hold out
+        split = cast("Split | None", path.stem.partition("_")[2] or None) if len(paths) > 1 else None
         shots += _read_listing(path, listing, split)
         points = listing.get("ply_file_path")
         if points is not None and not isinstance(points, str):

@@ -73,6 +73,7 @@ class Shown:
     exif: Exif = field(default_factory=Exif)  # what its camera noted
     digest: str = ""  # of the file's bytes
     sharpness: float = 0.0  # variance of the Laplacian, gray
+    # of what is not transparent, where a photograph has alpha
     brightness: float = 0.0  # mean gray, 0 to 255
     dark: float = 0.0  # share of pixels under 4
     bright: float = 0.0  # share of pixels over 251
@@ -96,15 +97,19 @@ def measure(path: Path, image: np.ndarray, name: str) -> Shown:
     height, width = image.shape[:2]
     gray = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_RGB2GRAY)
     small = _shrunk(gray)
+    # what is cut out of its background tells nothing of the exposure there
+    shown = small if image.shape[2] == 3 else small[_shrunk(np.ascontiguousarray(image[:, :, 3])) > 127]
+    if not shown.size:
+        shown = small
     return Shown(
         name,
         (width, height),
         exif=read_exif(path),
         digest=hashlib.sha256(path.read_bytes()).hexdigest(),
         sharpness=sharpness(small),
-        brightness=float(gray.mean()),
-        dark=float((small < 4).mean()),
-        bright=float((small > 251).mean()),
+        brightness=float(gray.mean() if image.shape[2] == 3 else shown.mean()),
+        dark=float((shown < 4).mean()),
+        bright=float((shown > 251).mean()),
         thumb=thumbnail(gray),
         features=_features(small),
     )

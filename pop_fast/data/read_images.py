@@ -100,22 +100,23 @@ def _locate(
 ) -> tuple[list[_Photo], list[str]]:
     """Pair every listed name with its file and its mask, by name."""
     photos: list[_Photo] = []
-    absent: list[Path] = []
+    absent: list[PosedImage] = []
     masks = root / "masks" if options.masks and (root / "masks").is_dir() else None
     for shot in shots:
         chosen, shrink = _image_folder(root, shot.folder, options)
         path = find_image(root / chosen, shot.file)
         if path is None:
-            absent.append(root / chosen / shot.file)
+            absent.append(replace(shot, folder=chosen))
             continue
         mask = None
         if options.masks:
             mask = shot.mask or (find_image(masks, shot.file) if masks else None)
         photos.append(_Photo(shot, path, mask, shrink))
     if absent and (options.missing == "error" or not photos):
+        first = root / absent[0].folder / absent[0].file
         raise CaptureError(
-            f"{listing}: lists {len(shots)} images, {len(absent)} of them absent, first {absent[0]}; "
-            "restore them or pass --missing skip"
+            f"{listing}: lists {len(shots)} images, {len(absent)} of them absent, first {first}; "
+            f"{fix_of_absent(root, absent, len(shots))}"
         )
     if masks and not options.part and not any(photo.mask for photo in photos):
         raise CaptureError(f"{masks}: holds no mask named as a photograph (<name>.png or <name>.jpg.png); rename them")
@@ -125,6 +126,19 @@ def _locate(
     if 0 < len(unmasked) < len(photos):
         notes.append(f"{len(unmasked)} of {len(photos)} photographs have no mask and count whole, first {unmasked[0]}")
     return photos, notes
+
+
+def fix_of_absent(root: Path, absent: Sequence[PosedImage], listed: int) -> str:
+    """Say what helps against photographs that are not where their list says, of so many that it lists.
+
+    Where all are absent, the folder that holds one of that name: the capture's own, or one in it.
+    """
+    if len(absent) < listed:
+        return "restore them or pass --missing skip"
+    for folder in (root, *sorted(path for path in root.iterdir() if path.is_dir())):
+        if find_image(folder, absent[0].file) is not None:
+            return f"{absent[0].file} lies in {folder}: pass --images {folder.relative_to(root).as_posix()}"
+    return "restore them"
 
 
 def _about_folders(root: Path, shots: Sequence[PosedImage], options: PhotoOptions) -> list[str]:

@@ -31,7 +31,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import IO, Any, Final, Literal
@@ -138,12 +138,15 @@ def run_sfm(
     if hopeless:
         raise CaptureError(f"{photos}: {'; '.join(hopeless)}")
     mixed = about_mixed_sizes(shown)
+    lenses: list[int] = []
     if single_camera is None:
         options = replace(options, single_camera=mixed is None)
+        lenses = [] if mixed is None else _lenses(shown)
     with folder_atomically(target, overwrite, recognise=own) as folder:
         sparse = folder if in_place else folder / "sparse"
         with tempfile.TemporaryDirectory(prefix="pop_sfm_") as work, quiet_colmap():
-            best = find_cameras(Search(str(photos), work, _stage(photos, names, Path(work)), options), progress)
+            staged = _stage(photos, names, Path(work))
+            best = find_cameras(Search(str(photos), work, staged, options, lenses), progress)
             for image in best.images.values():
                 image.name = names[int(Path(image.name).stem)].as_posix()
             (sparse / "0").mkdir(parents=True)
@@ -204,6 +207,15 @@ def _looked_at(photos: Path, names: list[Path], progress: Progress | None) -> li
         )
 
 
+def _lenses(shown: Sequence[Shown]) -> list[int]:
+    """Number the lenses of photographs: those of one size are of one, but for what their cameras noted.
+
+    Left to itself, COLMAP takes each photograph that says nothing of its camera to be of a lens of its own.
+    """
+    kinds = [(one.size, one.exif.camera, one.exif.focal) for one in shown]
+    return [kinds.index(kind) for kind in kinds]
+
+
 def _write_upright(sparse: Path, photos: Path, names: list[Path]) -> None:
     """Note which photographs their EXIF orientation asks to be turned, in quarter turns clockwise."""
     # a mirrored photograph is not what a camera sees, turned or not
@@ -251,6 +263,7 @@ class Search:
     work: str  # a folder of the search's own, with the photographs in `images`; the model is written to `best`
     names: list[str]  # of the photographs
     options: SfmOptions  # with `single_camera` decided
+    lenses: Sequence[int] = ()  # a number for the lens of each photograph; none where `single_camera` says all
 
     @property
     def database(self) -> Path:
@@ -443,13 +456,15 @@ def _extract(job: Search, tell: Progress, thorough: bool) -> None:
         extraction.sift.max_num_features = _FEATURES_EACH
     # listed first and in order, because the threads that find features would number photographs as they finish
     pycolmap.Database.open(job.database).close()
-    pycolmap.import_images(
-        job.database,
-        job.images,
-        camera_mode=pycolmap.CameraMode.SINGLE if job.options.single_camera else pycolmap.CameraMode.AUTO,
-        image_names=job.names,
-        options=pycolmap.ImageReaderOptions(camera_model=job.options.camera_model),
-    )
+    one = pycolmap.CameraMode.SINGLE
+    for lens in sorted(set(job.lenses)) or [None]:
+        pycolmap.import_images(
+            job.database,
+            job.images,
+            camera_mode=one if job.lenses or job.options.single_camera else pycolmap.CameraMode.AUTO,
+            image_names=[name for i, name in enumerate(job.names) if lens is None or job.lenses[i] == lens],
+            options=pycolmap.ImageReaderOptions(camera_model=job.options.camera_model),
+        )
     for start in range(0, n, _BATCH):
         tell(_FEATURES, start, n)
         pycolmap.extract_features(

@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pop_fast.cli.data_check import look_over
 from pop_fast.data import Capture, CaptureError, View, initialize_params, load_capture
 from pop_fast.data.cameras import PINHOLES, make_camera
 from pop_fast.data.colmap import model_name, parameter_count, read_model
@@ -177,7 +178,21 @@ def test_absent_photographs_are_an_error_or_are_skipped_with_a_note(root: Path) 
         (root / "images" / name).unlink()
     assert_one_line(lambda: raw(root, missing="skip"), "1 view(s)", "two or more")
     (root / "images" / "03.png").unlink()
-    assert_one_line(lambda: raw(root, missing="skip"), "4 of them absent")
+    assert_one_line(lambda: raw(root, missing="skip"), "4 of them absent", "restore them")
+
+
+@pytest.mark.parametrize("folder", [".", "stills"])
+def test_photographs_that_lie_in_another_folder_than_listed_are_found_by_name(tmp_path: Path, folder: str) -> None:
+    root = transforms_capture(tmp_path / "scene")
+    (root / folder).mkdir(exist_ok=True)
+    for photo in list((root / "images").iterdir()):
+        photo.rename(root / folder / photo.name)
+    asked = f"00.png lies in {root / folder}: pass --images {folder}"
+    message = assert_one_line(lambda: raw(root), "4 of them absent", asked)
+    assert "skip" not in message
+    (problem,) = [found for found in look_over(root) if "are absent" in found.text]
+    assert problem.text.endswith(asked)
+    assert shows(raw(root, images=folder), 0, 1, 2, 3)
 
 
 # Sizes of every kind.

@@ -214,6 +214,19 @@ def test_what_is_odd_among_photographs_is_named(check: Check, bare: Path, pictur
     assert "mixed cameras: the photographs have 3 sizes" in finding(check(bare), "LOOK", "cameras")
 
 
+def test_what_is_transparent_is_not_called_black(check: Check, tmp_path: Path, pictures: list[np.ndarray]) -> None:
+    for i, picture in enumerate(pictures):
+        alpha = np.zeros((*picture.shape[:2], 1), np.uint8)
+        alpha[40:80, 60:100] = 255
+        Image.fromarray(np.concatenate([picture * (alpha > 0), alpha], axis=2)).save(tmp_path / f"{i}.png")
+    levels = [picture[40:80, 60:100].mean() for picture in pictures]
+    assert not said(check(tmp_path), "pure black")
+    low, high = map(int, re.findall(r"brightness (\d+) to (\d+)", finding(check(tmp_path), "ok", "exposure"))[0])
+    # gray weighs the channels otherwise
+    assert abs(low - min(levels)) < 15
+    assert abs(high - max(levels)) < 15
+
+
 def test_exposures_and_lenses_that_differ_are_told(check: Check, tmp_path: Path, pictures: list[np.ndarray]) -> None:
     for i, picture in enumerate(pictures):
         exif = Image.Exif()

@@ -12,11 +12,13 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 
 from benchmarks.kinds import KINDS, write_kind
-from pop_fast.data import load_capture, run_sfm, sfm
+from pop_fast.data import CaptureError, load_capture, run_sfm, sfm
 from pop_fast.data.capture import View
 from pop_fast.data.sfm import pairs_of
 from pop_fast.demo.make import render_view
@@ -173,6 +175,32 @@ def test_photographs_are_searched_again_where_few_of_few_were_placed(
     else:
         assert sfm._best(job, lambda *_: None).num_reg_images() == kept
     assert (True in results) == (second is None)
+
+
+def test_photographs_of_one_size_and_focal_length_share_a_lens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    photos = tmp_path / "photos"
+    for i, (size, focal) in enumerate([((64, 48), 0), ((48, 64), 0), ((64, 48), 0), ((64, 48), 5), ((48, 64), 0)]):
+        exif = Image.Exif()
+        if focal:
+            exif[0x8769] = {0x920A: IFDRational(focal, 1)}
+        write_photograph(photos / "plain.png", photograph(i, *size))
+        Image.open(photos / "plain.png").save(photos / f"{i}.jpg", exif=exif)
+        (photos / "plain.png").unlink()
+    found: list[list[int]] = []
+
+    def cameras(job: sfm.Search, progress: object) -> None:
+        sfm._extract(job, lambda *_: None, thorough=False)
+        images = pycolmap.Database.open(job.database).read_all_images()
+        found.append([image.camera_id for image in sorted(images, key=lambda image: image.name)])
+        raise CaptureError("enough")
+
+    monkeypatch.setattr(sfm, "find_cameras", cameras)
+    for how in (None, False):
+        assert_one_line(lambda how=how: run_sfm(photos, tmp_path / "out", single_camera=how), "enough")
+    default, each = found
+    assert [default[i] == default[0] for i in range(5)] == [True, False, True, False, False]
+    assert default[1] == default[4] != default[3]
+    assert len(set(each)) >= 4
 
 
 def fill(folder: Path, *names: str | bytes) -> Path:

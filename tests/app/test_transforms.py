@@ -213,6 +213,8 @@ def test_blender_captures_have_their_own_split_field_of_view_and_transparency(tm
     assert not np.array_equal(capture.views[0].image, raw(tmp_path).views[0].image)
     (tmp_path / "transforms_test.json").unlink()
     assert [view.name for view in raw(tmp_path).test_views()] == ["val/r_0", "val/r_1"]
+    (tmp_path / "transforms_val.json").unlink()
+    assert [view.name for view in raw(tmp_path).test_views(2)] == ["train/r_0", "train/r_2"]
 
 
 def test_masks_named_by_a_frame_are_read(root: Path) -> None:

@@ -16,6 +16,7 @@ from pop_fast.cli.data_check import Args as DataCheck
 from pop_fast.cli.export import Args as Export
 from pop_fast.cli.train import arguments as train_arguments
 from pop_fast.train import TrainConfig
+from pop_fast.train.load_result import CaptureRecord, record_text
 from pop_fast.view.report.checks import Checks, read_checks
 from pop_fast.view.report.model import Finding, verdict
 from pop_fast.view.report.source import read_result, typed
@@ -82,6 +83,9 @@ def orbit(shares: list[float]) -> dict[str, float]:
         ("Overfitting", {"train_psnr": 18.09, "held_out_psnr": 17.0}, "look", "both low"),
         # as close as these are, 6.2 dB say that they are not close enough
         ("Photographs", SIX_APART, "bad", "not enough for what this subject takes, as the 6.2 dB"),
+        # what few steps leave dark is no exposure yet
+        ("Exposure", {"stops": {"a": 0.0, "b": 0.6}, "train_psnr": 20.0, "steps": 300}, "look", "Not to be told yet"),
+        ("Exposure", {"stops": {"a": 0.0, "b": 0.6}, "train_psnr": 20.0, "steps": 3_000}, "look", "It drifts"),
         # hardly a drift, but 1.1 dB
         ("Exposure", {"matched_psnr": 30.6}, "look", "30.60 dB instead of 29.50"),
     ],
@@ -241,6 +245,20 @@ def test_another_training_is_asked_for_as_the_judged_one_was(name: str, words: t
         assert again.max_steps == 3_600
         assert again.strategy.lambda_pop == run.strategy.lambda_pop
     assert "--preset" not in line or "--minutes" not in words
+
+
+def test_the_capture_is_asked_for_as_it_was_read(tmp_path: Path) -> None:
+    run = TrainConfig.of(method="pop", data="scene", result_dir=str(tmp_path))
+    record = CaptureRecord(images="stills", missing="skip", masks=False, source="transforms")
+    (tmp_path / "capture.json").write_text(record_text(record))
+    lines = [
+        typed(Finding("bad", "it", "is", (*words, "DATA")), run, tmp_path).next
+        for words in (("data", "check"), ("train",))
+    ]
+    assert lines[0] == ("data", "check", "scene", "--images", "stills")
+    _, options = train_arguments(lines[1][1:])
+    assert (options.images, options.missing, options.source) == ("stills", "skip", "transforms")
+    assert options.ignore_masks
 
 
 # What the report says to type next helps: commands are taken from reports and typed, and the results are measured.

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from pop_fast.data.capture import Capture, View, neighbour_degrees
 from pop_fast.data.photo_quality import GAMMA
+from pop_fast.density.passes import Passes
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.images import fit, to_uint8
@@ -39,6 +40,8 @@ _NEAREST_POINTS: Final = 0.02  # quantile, as a few points are always wrong
 _FEWEST_POINTS: Final = 20
 # what covers a pixel by as much is seen
 _SEEN: Final = 0.1
+# of the orbit's pixels, on average: what hides less is not seen
+_HAZE: Final = 1e-5
 # in what a capture says of its points, where they were made up
 _RANDOM: Final = "random ones"
 # a picture's longer side in blocks; of what moved, a block's error is so many times the median block's, and so much of
@@ -223,6 +226,28 @@ def are_floaters(means: Tensor, capture: Capture, test_every: int) -> Tensor:
         size = torch.tensor([view.width, view.height])
         found |= near & ((pixels >= 0.0) & (pixels < size)).all(1)
     return found
+
+
+def are_veils(
+    params: Mapping[str, Tensor], capture: Capture, config: TrainConfig, sh_degree: int, backend: Any
+) -> Tensor:
+    """Tell which Gaussians hide more of the orbit's views than they show of the photographs, wherever they stand.
+
+    In a view of the orbit counts what stands nearer than floaters do, also what reaches into it from outside of it; in
+    a training view what does not. Each is a share of the pixels, by blending weights, on average. bool [N]
+    """
+    train = capture.train_views(config.test_every)
+    hidden, shown = (torch.zeros(len(params["means"]), dtype=torch.float64) for _ in range(2))
+    orbit = orbit_views(train)
+    for sums, views, want_near in ((hidden, orbit, True), (shown, train, False)):
+        for view in views:
+            limit = near_limit(view, capture.points)
+            if limit is None:
+                continue
+            found = Passes.of(backend, [ViewTensors.of(view)], config).contributions(params, 0, sh_degree)
+            counts = (found.depths < limit) == want_near
+            sums += torch.where(counts, found.weight_sum, 0.0).cpu() / (view.width * view.height * len(views))
+    return (hidden > _HAZE) & (hidden > shown)
 
 
 def stops_between(photo: np.ndarray, render: np.ndarray) -> float:

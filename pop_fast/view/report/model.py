@@ -265,6 +265,11 @@ def _exposure(checks: Checks) -> Iterator[Finding]:
         text = f"Learned for each training photograph: {differ}{gain}"
         yield Finding("good", "Exposure", text)
         return
+    if _too_short(checks) and checks.train_psnr < _FITS:
+        # a render without its detail is as far from a photograph's brightness as another exposure would be
+        text = f"Not to be told yet, as the run had few steps: {differ}{gain}"
+        yield Finding("look", "Exposure", text, _MORE_STEPS)
+        return
     what = "It drifts" if spread >= _DRIFT or won >= _WON else "Even, but for some"
     text = f"{what}: {differ}{gain}"
     text += " Lock exposure and white balance next time; for these photographs, learn each one's."
@@ -296,6 +301,7 @@ def _floating(checks: Checks) -> Iterator[Finding]:
     if covered:
         text += f" A veil hides much of {len(covered)} views between the photographs, as in {covered[0]}."
     text += " Leaving out those whose centres stand there takes part of it away" + (f"; {then}." if then else ".")
+    text += " The command leaves out what reaches in from beside the pictures, too, and tunes the rest."
     fix = ("export", "RESULT", "--to", "html", "--without-floaters")
     yield Finding("look" if few else "bad", "Floaters", text, fix)
 

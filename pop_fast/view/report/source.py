@@ -18,7 +18,7 @@ from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.read_back import check_record, parse_json, read_arrays, read_json
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.load_result import read_record
+from pop_fast.train.load_result import CaptureRecord, read_record
 from pop_fast.train.presets import ALIASES, METHODS, Given, words_of
 from pop_fast.train.results import read_commands, read_config, shell_line
 from pop_fast.view.document import Window
@@ -90,9 +90,20 @@ def typed(finding: Finding, config: TrainConfig, folder: Path) -> Finding:
         return finding
     places = {"DATA": config.data, "RESULT": str(folder)}
     words = [places.get(word, word) for word in finding.next]
+    record = read_record(folder) or CaptureRecord()
+    if words[0] in ("train", "data") and record.images is not None:
+        words += ["--images", record.images]
     if words[0] == "train":
+        words += _read_again(record)
         words += [*_asked_again(config, finding.next), "--out", f"{folder}_next"]
     return replace(finding, next=tuple(words))
+
+
+def _read_again(record: CaptureRecord) -> list[str]:
+    """Return the options by which a capture was read; its folder of photographs is not among them."""
+    words = [] if record.missing == "error" else ["--missing", record.missing]
+    words += [] if record.masks else ["--ignore-masks"]
+    return words + ([] if record.source == "auto" else ["--source", record.source])
 
 
 def _asked_again(config: TrainConfig, words: Sequence[str]) -> list[str]:
