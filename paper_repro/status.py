@@ -122,7 +122,7 @@ def _outcome_line(by_scale: Sequence[tuple[str, Claim]]) -> str:
             line += f"; under {told.reading} **{told.verdict}**"
         line += f" ({numbers})" if numbers else ""
         if told.verdict == "not decided" and told.deciders:
-            line += f", which `{told.deciders[0]}` would decide"
+            line += f"; `{told.deciders[0]}` would decide it"
     return line + "."
 
 
