@@ -36,6 +36,7 @@ Stats = dict[str, Any]
 _KINDS = ("read", "refused", "told", "escaped", "crashed", "hung")
 NOTES = Path(__file__).resolve().parent / "NOTES.md"
 NOT_YET = "Not measured yet: run `python benchmarks/run.py`."
+FEWEST_CORES = 16
 BOUNDS = {"operations": "o", "bytes": "b"}
 ENGINES = {"fast": "`fast`", "compiled": "`compiled`, autograd", "native": "`compiled`, native"}
 
@@ -266,6 +267,9 @@ def cores(timed: Mapping[str, Any]) -> str:
     for case in timed["cores"]:
         one = sum(case["machines"]["1"].values())
         for threads, shares in case["machines"].items():
+            # on fewer cores the step was measured
+            if int(threads) < FEWEST_CORES:
+                continue
             ms = sum(shares.values())
             name = f"{case['width']}x{case['height']}, {case['num_gaussians']:,} Gaussians"
             rows.append([name, threads, f"{ms:.2f}", f"{one / ms:.1f}", *(f"{part:.2f}" for part in shares.values())])
@@ -320,7 +324,6 @@ def memory(timed: Mapping[str, Any]) -> str:
 
 # the part of the results that each table is made of, by its marks in NOTES.md
 TABLES: dict[str, tuple[str, Callable[[Mapping[str, Any]], str]]] = {
-    "steps": ("steps", steps),
     "native step": ("steps", native),
     "where a step goes": ("steps", parts),
     "what a step has to do": ("steps", counts),
