@@ -151,8 +151,8 @@ def _budgets(record: dict[str, Any]) -> str:
             size = f"{row['bytes'] / 1e6:.2f} MB, 1/{row['share']}"
             rows.append([name, f"`{row['format']}`", size, *cells])
     return f"""The table gives the change of the held-out PSNR at a tenth and a twentieth of the whole splat's PLY,
-for POP with `--preset quick` as above. This preset ends before the splat has converged, so a tuned file can be better than
-the whole splat. "Fewer Gaussians alone" is what `--target-mb` did before, "harmonics and digits too" is
+for POP with `--preset quick` as above. This preset ends before the splat has converged, so a tuned file can be better
+than the whole splat. "Fewer Gaussians alone" is what `--target-mb` did before, "harmonics and digits too" is
 `--fine-tune-steps 0`, and the last column is the default of {record["steps"]} steps (`benchmarks/sizes.py --budgets`).
 
 {_table(head, rows)}
