@@ -213,7 +213,7 @@ def _fit_seen(left: Limited, limits: LimitOptions, output: Output, shown: Shown,
     capture, config, learned = _photographs(shown, left, limits.crop is not None)
     steps = limits.fine_tune_steps
     if learned is None:
-        left.said.append("not fine-tuned: what the run has learned of its photographs is in its checkpoints alone")
+        left.said.append("not fine-tuned: only the checkpoints hold what the run learned of its photographs")
         steps = 0
     told = False
     with bars() as progress:
@@ -222,7 +222,7 @@ def _fit_seen(left: Limited, limits: LimitOptions, output: Output, shown: Shown,
             nonlocal told
             if seconds is not None and not told:
                 told = True
-                print(f"fine-tuning: about {duration(seconds)}; --fine-tune-steps 0 leaves it out", flush=True)
+                print(f"fine-tuning: about {duration(seconds)}; --fine-tune-steps 0 skips it", flush=True)
             progress("fine-tuning", done, planned)
 
         tuner = compact.Tuner(left.params, shown.sh_degree, config, capture, learned or {}, steps, report)
@@ -288,7 +288,7 @@ def _means_of_capture(params: dict[str, Tensor], shown: Shown) -> Tensor:
 
 def _floaters(shown: Shown, params: Mapping[str, Tensor]) -> Tensor:
     if shown.photographed is None:
-        raise PopError("floaters are found from the places of the photographs; give --capture DIR")
+        raise PopError("finding floaters needs the cameras; give --capture DIR")
     from pop_fast.view.report.checks import are_floaters
 
     capture, config = shown.photographed()

@@ -118,12 +118,16 @@ def _locate(
             "restore them or pass --missing skip"
         )
     if masks and not options.part and not any(photo.mask for photo in photos):
-        raise CaptureError(f"{masks}: holds no mask named as a photograph (<name>.png or <name>.jpg.png); rename them")
+        raise CaptureError(
+            f"{masks}: holds no mask named like a photograph (<name>.png or <name>.jpg.png); rename them"
+        )
     notes = [f"{len(absent)} of {len(shots)} listed images are absent and were skipped"] if absent else []
     notes += _about_folders(root, shots, options)
     unmasked = [photo.path for photo in photos if photo.mask is None]
     if 0 < len(unmasked) < len(photos):
-        notes.append(f"{len(unmasked)} of {len(photos)} photographs have no mask and count whole, first {unmasked[0]}")
+        notes.append(
+            f"{len(unmasked)} of {len(photos)} photographs have no mask and count in full, first {unmasked[0]}"
+        )
     return photos, notes
 
 
@@ -135,7 +139,7 @@ def _about_folders(root: Path, shots: Sequence[PosedImage], options: PhotoOption
     names = ", ".join(sorted(f"{chosen}/" for chosen, _ in read if chosen))
     whose = f"the photographs of {names}" if names else "the photographs"
     if all(shrink == 1 for _, shrink in read):
-        return [f"{whose} are used, made smaller before; --images says otherwise"]
+        return [f"{whose} are used, which were shrunk earlier; --images chooses others"]
     return [f"{whose} are shrunk by {options.factor} here"]
 
 

@@ -68,7 +68,7 @@ def _made_before(path: Path, target: Path) -> bool:
     if not target.is_dir() or not any(target.iterdir()):
         return False
     if target.stat().st_mtime < path.stat().st_mtime:
-        raise CaptureError(f"{target}: is older than {path}; remove the folder, and it is made again")
+        raise CaptureError(f"{target}: is older than {path}; remove the folder to have it made again")
     return True
 
 
@@ -201,7 +201,7 @@ def _open(path: Path) -> Any:
     with QUIET:
         video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not video.isOpened():
-        raise CaptureError(f"{path}: is no video that OpenCV can read; {_CONVERT}")
+        raise CaptureError(f"{path}: is not a video that OpenCV can read; {_CONVERT}")
     width, height = (int(video.get(size)) for size in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
     try:
         # as it is decoded, as it is handed over, and the sharpest so far

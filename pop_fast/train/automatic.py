@@ -161,7 +161,7 @@ def choose_length(
     memory = _PROGRAM_BYTES + _GAUSSIAN_BYTES * gaussians + _PIXEL_BYTES * pixels * photographs
     why = None
     if scaler < 1.0 and scaler == float(f"{longest:.3g}"):
-        why = f"each of {trained} photographs is seen {LOOKS} times: what more steps learn fits few photographs alone "
+        why = f"each of {trained} photographs is seen {LOOKS} times: more steps would overfit so few photographs "
         why += "(--steps-scaler S takes more)"
     return Choice(scaler, gaussians, seconds(scaler), memory, why)
 
@@ -218,10 +218,10 @@ def choose_terms(capture: Capture, config: TrainConfig, stops: float | None) -> 
     if weight is not None and config.method == "pop":
         few = f"{len(trained)} photographs are few{spread}"
         if any(view.seen is not None and len(view.seen) for view in trained):
-            text = f"depth is held to the sparse points (--depth-lambda {weight:g}), as {few}"
+            text = f"depth is tied to the sparse points (--depth-lambda {weight:g}), because {few}"
             wanted.append(("depth_lambda", weight, text))
         elif "depth_lambda" not in _said(config):
-            why.append(f"{few}, and depth is not held to sparse points: the capture has no tracks of them")
+            why.append(f"{few}, and depth is not tied to the sparse points: the capture has no tracks")
     found = exposures_of(capture).unevenness(np.stack([view.viewmat for view in capture.views]))
     drifts = []
     if found is not None and found > UNEVEN:
@@ -229,7 +229,7 @@ def choose_terms(capture: Capture, config: TrainConfig, stops: float | None) -> 
     if stops is not None and stops > DRIFT_STOPS:
         drifts.append(f"their exposures are {stops:.1f} stops apart")
     if drifts and config.batch_size == 1:
-        text = f"each photograph's exposure is learned (--exposure), as {' and '.join(drifts)}"
+        text = f"each photograph's exposure is learned (--exposure), because {' and '.join(drifts)}"
         wanted.append(("exposure", True, text))
     settings: dict[str, Any] = {}
     for name, value, text in wanted:
@@ -238,7 +238,7 @@ def choose_terms(capture: Capture, config: TrainConfig, stops: float | None) -> 
         reason = why_not_trained(get_backend(config.backend), replace(config, given=None, **{name: value}))
         if reason is None:
             settings[name] = value
-        why.append(text if reason is None else f"{text.partition(',')[2].removeprefix(' as ')}: {reason}")
+        why.append(text if reason is None else f"{text.partition(',')[2].removeprefix(' because ')}: {reason}")
     return Terms(settings, tuple(why))
 
 
@@ -253,7 +253,7 @@ def about_held_out(capture: Capture, config: TrainConfig) -> str | None:
     if own or not held_out or count > FEW or "test_every" in _said(config):
         return None
     return (
-        f"{held_out} of {count} photographs are held out to measure by, {100 * held_out / count:.0f} % of what there "
+        f"{held_out} of {count} photographs are held out for measuring, {100 * held_out / count:.0f} % of what there "
         "is to learn from; --test-every 0 trains on all of them, and measures nothing"
     )
 
@@ -358,7 +358,7 @@ def check_minutes(minutes: float | None, config: TrainConfig, automatic: bool) -
         raise PopError(f"--minutes is {minutes}; it must be > 0 and finite")
     if not automatic:
         said = f"--preset {config.preset}" if config.preset != "paper" else "--preset, --steps-scaler or --max-steps"
-        raise PopError(f"--minutes chooses the schedule, and {said} says another; leave one of them out")
+        raise PopError(f"--minutes chooses the schedule, but {said} sets another; leave one of them out")
 
 
 def line_of(choice: Choice, config: TrainConfig, size: tuple[int, int]) -> str:

@@ -355,7 +355,7 @@ def _options_of(words: Sequence[str]) -> Iterator[tuple[str, list[Any]]]:
     while rest:
         word = rest.pop(0)
         if not word.startswith("--"):
-            raise PopError(f"{word!r} stands where an option of pop train is expected, as --max-steps 100")
+            raise PopError(f"{word!r} is not an option; pop train expects one here, such as --max-steps 100")
         name, equals, value = word.removeprefix("--").partition("=")
         values = [value] if equals else []
         while rest and not rest[0].startswith("--"):
@@ -452,7 +452,7 @@ def _check_names(values: dict[str, Any]) -> None:
         if (name == "backend" and value == "auto") or value in known:
             continue
         names = ", ".join((*(("auto",) if name == "backend" else ()), *known))
-        where = "; one of another package is known where that is installed"
+        where = "; one from another package is known only where that is installed"
         raise PopError(f"{name} is {value!r}; it must be one of {names}{where}")
 
 

@@ -120,7 +120,7 @@ def test_cuda_asked_for_in_vain_is_one_sentence_before_anything_is_read(pop: Pop
 def test_a_run_on_a_gpu_from_the_command_line(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
     words = ("train", shared_capture, "--out", tmp_path / "r", *TRAIN, "--skip-sizes")
     outcome = pop.done(*words)
-    assert "backend cuda: a GPU and the build are here" in outcome.out
+    assert "backend cuda: there is a GPU, and the extension is built" in outcome.out
     assert " s on drift, loading " in outcome.out
     assert settings(tmp_path / "r")["resolved"]["backend"] == "cuda"
     stats = json.loads((tmp_path / "r" / "stats" / "val_step0029.json").read_text())
@@ -310,7 +310,7 @@ def test_gpus_that_are_left_idle_are_said_with_what_would_use_them(
 @pytest.mark.usefixtures("eight_gpus")
 def test_processes_use_as_many_gpus_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config, chosen = choose_backend(tiny_config(tmp_path, backend="auto", batch_size=8))
-    assert (config.backend, chosen) == ("cuda", "backend cuda: a GPU and the build are here")
+    assert (config.backend, chosen) == ("cuda", "backend cuda: there is a GPU, and the extension is built")
     monkeypatch.setenv("LOCAL_RANK", "7")
     assert check_gpus(config, 8) is None
     assert (check_gpus(config, 2) or "").startswith("2 of 8 GPUs are used")

@@ -94,7 +94,7 @@ def test_a_path_gives_as_many_pictures_and_frames_as_asked(
         ("--video clip.webm --fps nan", "clip.webm: fps is nan; it must be a number from 0.5 to 600"),
         ("--out r --video r/clip.webm", "r/clip.webm: lies in --out r, which holds pictures only"),
         ("--out r --path orbit --frames 0", "frames is 0; give --frames 1 or more"),
-        ("--out r --test-every 0", "holds no view out"),
+        ("--out r --test-every 0", "no view is held out"),
         ("--out r --path orbit --test-every 1", "needs 1 or more training views and there are 0"),
         ("--out r --path spiral", f"give --path one of {PATHS}, or a file that 'pop view' saved"),
         ("--out .", "the folder that this command runs in; choose another output folder"),

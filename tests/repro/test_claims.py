@@ -359,7 +359,7 @@ def test_what_bears_on_a_comparison_besides_the_method_stands_beside_it() -> Non
 def test_a_toy_is_said_to_tell_nothing_and_other_data_to_be_a_yardstick() -> None:
     runs = [*two("pop", n=40_000), *two("l2_blur")]
     for scale in ("toy", "shown"):
-        assert "Nothing here says anything of a method" in markdown(scale, runs)
+        assert "These numbers say nothing about a method" in markdown(scale, runs)
     assert telling() == ["paper", "full", "no_floor", "small"]
     text = markdown("small", runs)
     assert "NOT the paper's protocol" in text

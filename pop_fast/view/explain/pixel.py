@@ -278,7 +278,7 @@ def _pop_note(scene: ExplainedView) -> str:
         return "this objective has no POP term"
     stop = scene.config.strategy.pop_stop_iter
     if scene.step is not None and scene.step >= stop:
-        return f"in this run the POP term ended with step {stop - 1}; shown is what it would do now"
+        return f"in this run the POP term ended with step {stop - 1}; the table shows what it would do now"
     return ""
 
 

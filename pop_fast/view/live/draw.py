@@ -269,9 +269,9 @@ def _camera(entry: Any, where: str) -> KeyCamera:
     except (TypeError, KeyError, ValueError, OverflowError) as error:
         raise PopError(f"{where}: needs viewmat and fov_y_degrees ({error}); {_FIX}") from error
     if viewmat.shape != (4, 4) or not np.allclose(viewmat[:3, :3] @ viewmat[:3, :3].T, np.eye(3), atol=1e-4):
-        raise PopError(f"{where}: viewmat is no rigid 4 x 4 matrix; {_FIX}")
+        raise PopError(f"{where}: viewmat is not a rigid 4 x 4 matrix; {_FIX}")
     if not np.isfinite(viewmat).all() or not np.array_equal(viewmat[3], [0.0, 0.0, 0.0, 1.0]):
-        raise PopError(f"{where}: viewmat is no rigid 4 x 4 matrix; {_FIX}")
+        raise PopError(f"{where}: viewmat is not a rigid 4 x 4 matrix; {_FIX}")
     if np.linalg.det(viewmat[:3, :3]) < 0.0:
         raise PopError(f"{where}: viewmat is mirrored, which no camera is; {_FIX}")
     if not 0.0 < degrees < 180.0:

@@ -261,7 +261,7 @@ class LiveViewer:
         """Print why a view was closed, a bounded number of times."""
         self._lines += 1
         if self._lines <= _MOST_LINES:
-            last = "; what follows of this kind is not shown" if self._lines == _MOST_LINES else ""
+            last = "; further notes of this kind are not shown" if self._lines == _MOST_LINES else ""
             print(f"note: the viewer closed a view: {why}{last}", file=sys.stderr, flush=True)
 
     def _forget_sharing(self) -> None:
