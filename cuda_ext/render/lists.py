@@ -164,7 +164,7 @@ def count_instances(
         profile: of the kernels.
         state: address of the device's flags.
         device: where.
-        side: tiles are counted beside the sort, since they do not depend on the order; None takes turns.
+        side: tiles are counted in parallel with the sort, since they do not depend on the order; None takes turns.
     """
     kernels, side = load(), side or SideStream(device, used=False)
     with side.beside():

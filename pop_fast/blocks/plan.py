@@ -3,7 +3,7 @@
 The ground is spanned by the two directions in which the cameras are spread most: the first two principal axes of their
 centres, which are horizontal where a street is driven, a field is flown over or an object is walked around, and need no
 word for what is up. The first axis is cut into K strips of equally many cameras, and each strip along the second axis
-into L cores. The outer cores have no outer border, so that every point of the world lies in the core of one block and
+into L cores. The outer cores have no outer border, so that every point of the world is in the core of one block and
 in no other: what lies on a border belongs to the core of larger coordinates.
 
 A block's Gaussians are those of its core. To train them it gets
@@ -12,7 +12,7 @@ A block's Gaussians are those of its core. To train them it gets
     it: the core holds at least the share `share` of the sparse points in their picture. A border is so seen from both
     sides, and a core that is looked at from afar is trained by the blocks that look at it.
 -   the sparse points of the core and its margin, and of the points outside that its views have in their pictures an
-    even selection, at most as many. Without those, Gaussians of the core would have to explain what lies behind it;
+    even selection, at most as many. Without those, Gaussians of the core would have to explain what is behind it;
     with all of them, a block would be no smaller than the whole. What grows there is dropped when blocks are merged.
 
 What a view sees is judged by its picture's edges alone: the sparse points stand for surfaces, and what hides them is
@@ -63,7 +63,7 @@ FOLDER: Final = "blocks"
 JOB: Final = f"{FOLDER}/job.json"
 _PLAN = "plan.json"
 _FIX: Final = "start 'pop train --blocks' again with --overwrite"
-# rounds of a run where nobody says how many: of bonsai's 2.6 dB between merged and whole the first, the second and the
+# rounds of a run if the number is not given: of bonsai's 2.6 dB between merged and whole the first, the second and the
 # third give back 1.5, 0.5 and 0.3; and the steps of one as a share of a block's training
 DEFAULT_ROUNDS: Final = 2
 ROUND_SHARE: Final = 0.1
@@ -349,7 +349,7 @@ class Partition:
 def divide(centers: np.ndarray, grid: tuple[int, int]) -> Partition:
     """Divide the ground so that every core holds the same number of cameras, give or take one for each cut.
 
-    A border lies in the middle between the two cameras that it separates.
+    A border is in the middle between the two cameras that it separates.
 
     Args:
         centers: of the training cameras. [V, 3]

@@ -46,7 +46,7 @@ class Args(LimitOptions, CaptureArguments):
     splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|FILE")]
     """What to export."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE|DIR")] = None
-    """Where to: a file whose name says the format, or with --layout inria a new folder; by default a file beside here
+    """Where to: a file whose name says the format, or with --layout inria a new folder; by default a file here
     with the name of what is exported."""
     to: FormatName | None = None
     """The format, if the name does not show it; "spz" is its version 3, which most programs read, "spz-4" the latest
@@ -138,7 +138,7 @@ def planned_file(args: Args) -> tuple[Path, str]:
 
 
 def file_name(stem: str, to: str) -> str:
-    """Return the name of a file in a format that `--to` takes, where nobody names it."""
+    """Return the name of a file in a format that `--to` takes, if it is not given."""
     from pop_fast.io.formats import default_name
 
     return f"{stem}.html" if to == HTML else default_name(stem, to)
@@ -244,7 +244,7 @@ EXPORTS: Final = "export"
 
 @dataclass(frozen=True, kw_only=True)
 class FinishOptions(LimitOptions):
-    """What is written beside the results.
+    """What is written next to the results.
 
     Attributes:
         export: also write the splat in these formats into the result's folder export, in the capture's own frame. The
@@ -267,7 +267,7 @@ def finish(folder: Path, capture: Capture, options: Any) -> int:
 
 
 def after_results(write: Callable[[], object], doing: str, failed: str, left: str) -> int:
-    """Write something beside results that are complete, which they stay whatever becomes of it.
+    """Write something next to results that are complete, which they stay whatever becomes of it.
 
     Returns:
         The exit status: 0, or 1 where it could not be written, or 130 after Ctrl-C.

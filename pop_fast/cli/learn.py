@@ -78,7 +78,7 @@ class Train:
 
 @dataclass(frozen=True, kw_only=True)
 class Class:
-    """Grade a class, every submission in a process of its own; a submission is a program and runs with your rights."""
+    """Grade a class, every submission in its own process; a submission is a program and runs with your rights."""
 
     folder: Folder
     """A folder with one folder for each student, with files of the course."""
@@ -139,7 +139,7 @@ def _class(args: Class) -> int:
 
 
 def _graded_apart(folder: Path, seconds: float) -> dict[str, Any]:
-    """Grade a submission in a process of its own, which may take so long."""
+    """Grade a submission in its own process, which may take so long."""
     from pop_fast.children import module_command
     from pop_ref.learn.grading import read_grade, stopped
 

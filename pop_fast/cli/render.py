@@ -1,6 +1,6 @@
 """`pop render`: held-out views as pictures, or a camera path as pictures or a video.
 
-Beside the pictures lies renders.json: what was rendered, and which file shows which view. It is also how a folder of
+Next to the pictures is renders.json: what was rendered, and which file shows which view. It is also how a folder of
 pictures is known as this command's own, so that --overwrite replaces nothing else.
 """
 

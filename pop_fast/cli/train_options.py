@@ -197,7 +197,7 @@ def notes_before(capture: Capture, config: TrainConfig) -> Iterator[str]:
 
 
 def takes_hours(config: TrainConfig) -> bool:
-    """Tell whether a CPU is given the paper's schedule by nobody's word: neither a preset nor steps were said."""
+    """Tell whether a CPU is given the paper's schedule by default: neither a preset nor steps were given."""
     given = config.given
     said = given is None or given.steps_scaler is not None or "max_steps" in given.settings
     return not said and config.preset == "paper" and not on_gpu(config)

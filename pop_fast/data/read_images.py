@@ -7,7 +7,7 @@ the ratio of the two, each photograph by its own, and K of the shrunk image by t
 A photograph of any camera model becomes one of a pinhole camera with the same principal point. For a pixel centre p of
 the new image, d = K^-1 p is its ray and x = camera.img_from_cam(d) is where the photograph shows it; the new image is
 the photograph sampled there (bilinear, as COLMAP and gsplat). The new K keeps the principal point exactly and both
-focal lengths' ratio; one zoom factor is applied to them, the smallest one with which every new pixel lies inside the
+focal lengths' ratio; one zoom factor is applied to them, the smallest one with which every new pixel is inside the
 photograph. It is 1, and the photograph is returned as it is, bit for bit, where there is no distortion. Pixel centres
 are at +0.5, as COLMAP's are.
 """
@@ -411,7 +411,7 @@ def _fan(width: int, height: int, center: np.ndarray, steps: int = 48, along: in
 
 
 def _fits(fan: np.ndarray, center: np.ndarray, width: int, height: int) -> bool:
-    """Tell whether a fan's image lies inside the photograph and never turns back towards the centre.
+    """Tell whether a fan's image is inside the photograph and never turns back towards the centre.
 
     Without the second condition a polynomial that bends back far outside, as they all do somewhere, would look inside.
     """

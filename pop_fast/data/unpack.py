@@ -1,6 +1,6 @@
 """Make a folder of photographs of what is none: the frames of a video, what a ZIP archive holds.
 
-The folder lies beside the file, and a later call finds it there, with the cameras that were found in it.
+The folder is next to the file, and a later call finds it there, with the cameras that were found in it.
 
 A video is cut into as many stretches of equal length as frames are wanted. Of each stretch the sharpest frame is
 taken, at least half a stretch after the one before; where it looks like the one before, none is. One pass over the
@@ -31,7 +31,7 @@ from pop_fast.io.read_back import PICTURE, check_members, check_memory
 _FIX = "unpack it yourself, and give the folder"
 # what the system says of a member's name that cannot be a file's
 _NAMES = (errno.ENAMETOOLONG, errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.EINVAL, errno.EILSEQ)
-# beside the photographs of an archive, what other systems have put there
+# next to the photographs of an archive, what other systems have put there
 _LEFT_OUT = ("__MACOSX", ".DS_Store", "Thumbs.db")
 
 

@@ -1,7 +1,7 @@
 """What a run without a preset does: size, length and terms, by what is there and how fast this machine is.
 
 Size: photographs are shrunk by the whole number that brings their longest side nearest to `SIDES` px, in ratio.
-Length: the paper's schedule, or as much of it as the minutes allow. The minutes are foretold by a model that is
+Length: the paper's schedule, or as much of it as the minutes allow. The minutes are predicted by a model that is
 measured where it is used: steps of the run's own engine, on the capture, with as many Gaussians as the run begins with,
 and with as many as it is expected to have; in between the time of a step is taken to be linear in their number.
 
@@ -190,7 +190,7 @@ TERMS: Final = ("depth_lambda", "exposure")
 class Terms:
     """Terms of the loss that were chosen."""
 
-    settings: Mapping[str, Any] = field(default_factory=dict)  # by name, those that nobody said
+    settings: Mapping[str, Any] = field(default_factory=dict)  # by name, those not given
     why: tuple[str, ...] = ()  # a sentence for each that was chosen, or that could not be
 
 
@@ -247,7 +247,7 @@ def _said(config: TrainConfig) -> Mapping[str, Any]:
 
 
 def about_held_out(capture: Capture, config: TrainConfig) -> str | None:
-    """Say what holding out costs where photographs are few and nobody has asked for it; else None."""
+    """Say what holding out costs where photographs are few and it was not requested; else None."""
     held_out, count = len(capture.test_views(config.test_every)), len(capture.views)
     own = any(view.split is not None for view in capture.views)
     if own or not held_out or count > FEW or "test_every" in _said(config):
@@ -265,7 +265,7 @@ def with_choice(config: TrainConfig, scaler: float | None, terms: Mapping[str, A
     said = {**terms, **given.settings}
     plan = {"scale_lambda_pop": given.scale_lambda_pop, "steps_scaler": scaler}
     chosen = TrainConfig.of(method=given.method, preset=given.preset, **plan, **said)
-    # where it writes and which backend was found are nobody's word
+    # where it writes and which backend was found are not the user's choice
     return replace(
         chosen, data=config.data, result_dir=config.result_dir, backend=config.backend, progress=config.progress
     )
@@ -319,7 +319,7 @@ def mean_pixels(capture: Capture) -> float:
 
 
 def _grown(first: Mapping[str, Tensor], count: int) -> dict[str, Tensor]:
-    """Make more Gaussians of the first, smaller by as much, each at a place of its own within its parent."""
+    """Make more Gaussians of the first, smaller by as much, each at its own place within its parent."""
     import torch
 
     generator = torch.Generator().manual_seed(0)
@@ -373,6 +373,6 @@ def line_of(choice: Choice, config: TrainConfig, size: tuple[int, int]) -> str:
 
 
 def _rounded(count: float) -> int:
-    """Round to two digits, as nothing foretold is more exact."""
+    """Round to two digits, as no prediction is more exact."""
     digits = max(len(str(round(count))) - 2, 0)
     return round(count / 10**digits) * 10**digits

@@ -111,7 +111,7 @@ class TrainConfig:
             doubles its cost.
         max_renders: held-out views saved as pictures at the end.
         lpips_vgg: weights of LPIPS on VGG16: one merged file, or backbone and linear layers; empty for none.
-        lpips_alex: weights of LPIPS on AlexNet, likewise.
+        lpips_alex: weights of LPIPS on AlexNet, in the same form.
         target_cache_mb: memory for what SSIM needs of the photographs, kept between steps.
         progress: show a progress bar when standard error is a terminal.
         given: what these values come from; None where they were written down one by one.
@@ -220,7 +220,7 @@ class TrainConfig:
         return cls.of(method=method, preset=preset, **{name: resolved[name] for name in resolved if name in said})
 
     def with_overrides(self, **overrides: Any) -> Self:
-        """Return these settings with some said anew; those that nobody said stay the defaults they are."""
+        """Return these settings with some said anew; those not given stay the defaults they are."""
         if self.given is None:
             return replace(self, **overrides)
         again = Given.of(overrides, method=self.given.method)

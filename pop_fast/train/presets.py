@@ -205,7 +205,7 @@ class Given:
 
 
 def method_of(strategy: DensityControl) -> str:
-    """Return the name of the method that a strategy belongs to; that of its class where it is somebody else's."""
+    """Return the name of the method that a strategy belongs to; that of its class for a third-party strategy."""
     names = (name for name, method in METHODS.items() if type(strategy) is method.strategy)
     return next(names, type(strategy).__name__)
 

@@ -1,4 +1,4 @@
-"""What one browser shows: a camera, a size, a mode and what is left out, the picture of these, and the panel beside it.
+"""What one browser shows: a camera, a size, a mode and what is left out, their picture, and the panel next to it.
 
 The splat is at rest, or of a training between its steps. A recorded path of cameras is a JSON file, which
 `pop render --path FILE` takes.
@@ -343,7 +343,7 @@ class Panel:
             self._use(control, interval(control.min, control.max), self._update)
 
     def close(self) -> None:
-        """Forget the controls, which nobody can set any more."""
+        """Forget the controls, which can no longer be set."""
         for name in self._controls:
             self._rules.pop(name, None)
 

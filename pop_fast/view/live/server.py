@@ -164,7 +164,7 @@ class LiveViewer:
         self.host, self.port = host, int(listening.getsockname()[1])
         self._lines = 0
         self._guard = Guard(host, listening, self._tell)
-        # it prints a box of its own, whatever `verbose` is
+        # it prints its own box, whatever `verbose` is
         with self._guard.around_viser(), redirect_stdout(io.StringIO()):
             self._server = viser.ViserServer(host=host, port=self.port, label=title, verbose=False)
         self._forget_sharing()
