@@ -1,9 +1,9 @@
-"""What a run without a preset does: size, length and terms, by what is there and how fast this machine is.
+"""What a run without a preset does: size, length and terms, by the photographs and the speed of this machine.
 
 Size: photographs are shrunk by the whole number that brings their longest side nearest to `SIDES` px, in ratio.
 Length: the paper's schedule, or as much of it as the minutes allow. The minutes are predicted by a model that is
 measured where it is used: steps of the run's own engine, on the capture, with as many Gaussians as the run begins with,
-and with as many as it is expected to have; in between the time of a step is taken to be linear in their number.
+and with as many as it is expected to have. Between these the time of a step is assumed to be linear in their number.
 
 What is chosen goes into cfg.json with the run's settings, and is taken from there by a resumed run.
 """

@@ -1,8 +1,8 @@
 """Ctrl-C, SIGTERM and SIGHUP as a polite request: leave the step, write a checkpoint, then stop.
 
 Python runs a signal's handler in the main thread and between two of its instructions only, so a call of a compiled
-library that takes seconds keeps it waiting. Such a call is made in its own thread (`heard`), and is told by a flag
-that it may read (`StopRequest.address`).
+library that takes seconds delays the handler. Such a call is made in its own thread (`heard`), and can read a flag that
+says whether a stop was requested (`StopRequest.address`).
 """
 
 from __future__ import annotations
