@@ -247,7 +247,7 @@ def test_a_run_that_ends_soon_after_a_reset_is_warned_of_and_a_short_one_has_non
 def test_a_centred_principal_point_is_warned_of_where_the_cameras_have_another():
     away = [a_view(512, 512), a_view(512, 512, moved=(3.0, -4.0))]
     (warning,) = find_warnings(TrainConfig.of(method="3dgs"), away)
-    assert "a.jpg lies 5.0 pixels from there" in warning
+    assert "a.jpg is 5.0 pixels away" in warning
     assert "--profile gsplat_1_5" in warning
     assert list(find_warnings(TrainConfig.of(method="3dgs", profile="gsplat_1_5"), away)) == []
     assert list(find_warnings(TrainConfig.of(method="gsplat"), away)) == []
@@ -319,7 +319,9 @@ def test_processes_use_as_many_gpus_as_they_are(tmp_path: Path, monkeypatch: pyt
     assert (check_gpus(config, 4) or "").startswith("2 of 8 GPUs are used")
     assert check_gpus(replace(config, backend="fast"), 4) is None
     monkeypatch.setenv("LOCAL_RANK", "8")
-    with pytest.raises(PopError, match=r"process 8 of this machine has no GPU of its own, as there are 8; start one"):
+    with pytest.raises(
+        PopError, match=r"process 8 of this machine has no GPU of its own, because there are 8; start one"
+    ):
         check_gpus(config, 16)
     monkeypatch.setenv("LOCAL_RANK", "-1")
     with pytest.raises(PopError, match=r"LOCAL_RANK is '-1'; it must be the number of this process, from 0"):

@@ -255,7 +255,7 @@ def test_a_run_that_is_gone_on_with_otherwise_is_refused(train: Train, blocks, r
         (("--blocks", "2x1", "--blocks-profile", "slurm"), "needs Snakemake"),
         (("--blocks", "2x1", "--exposure"), "blocks would not"),
         (("--blocks", "2x1", "--refine-cameras"), "blocks would not"),
-        (("--blocks", "2x1", "--max-gaussians", "50"), "looks at all training photographs"),
+        (("--blocks", "2x1", "--max-gaussians", "50"), "needs all training photographs"),
         (("--blocks-margin", "0.1"), "add --blocks 2x2"),
         (("--blocks-jobs", "2"), "add --blocks 2x2"),
         (("--blocks-rounds", "1"), "add --blocks 2x2"),

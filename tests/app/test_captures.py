@@ -392,7 +392,7 @@ def test_captures_of_pinholes_load_without_pycolmap_and_plyfile_and_a_lens_that_
         (tmp_path / "sparse" / f"{name}.txt").write_text(content)
     done = in_a_child(LOAD, tmp_path)
     assert done.status != 0
-    assert "CaptureError: pycolmap cannot be imported" in done.err
+    assert "CaptureError: pycolmap, which finds cameras" in done.err
     assert "pip install pycolmap" in done.err
 
 

@@ -237,7 +237,7 @@ def recorded(**camera: Any) -> str:
         ('{"kind": "something"}', "is not a camera path of 'pop view' (kind 'something')"),
         ('{"kind": "pop camera path", "frame": "capture", "cameras": []}', "has no cameras"),
         ('{"kind": "pop camera path", "frame": "capture", "cameras": [{}]}', "cameras[0]: needs viewmat"),
-        (recorded(viewmat=np.diag([2.0, 1, 1, 1]).tolist()), "cameras[1]: viewmat is no rigid"),
+        (recorded(viewmat=np.diag([2.0, 1, 1, 1]).tolist()), "cameras[1]: viewmat is not a rigid"),
         (recorded(fov_y_degrees=180), "fov_y_degrees is 180"),
         (recorded(viewmat=np.diag([-1.0, 1, 1, 1]).tolist()), "cameras[1]: viewmat is mirrored"),
         (recorded(fov_y_degrees=10**400), "cameras[1]: needs viewmat and fov_y_degrees"),

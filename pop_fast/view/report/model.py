@@ -145,7 +145,7 @@ def _unfitting(checks: Checks) -> Iterator[Finding]:
         return
     short = " The run had few steps for it." if _too_short(checks) else ""
     more = _MORE_STEPS if short else ("data", "check", "DATA")
-    why = f"{text}.{short} A subject or a light that moved, or wrong cameras, make photographs that contradict "
+    why = f"{text}.{short} A subject or a light that moved, or wrong cameras, make photographs contradict "
     why += "one another"
     yield Finding("bad" if checks.train_psnr < _FITS_BADLY else "look", "Fit", f"They do not all fit: {why}.", more)
 
