@@ -272,7 +272,7 @@ def test_photographs_that_overlap_are_not_called_unrelated(check: Check, tmp_pat
     check(tmp_path)
 
 
-WRONG = {"walk.mp4": "is no video", "photos.zip": "outside of its folder", "gone": "no such folder"}
+WRONG = {"walk.mp4": "is not a video", "photos.zip": "outside of its folder", "gone": "no such folder"}
 
 
 @pytest.mark.parametrize("name", WRONG)

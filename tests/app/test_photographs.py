@@ -149,7 +149,7 @@ def test_reading_whole_and_bad_photographs_prints_nothing(tmp_path: Path, capfd:
     ("content", "word"),
     [
         (b"", "empty"),
-        (b"no picture at all", "is no image"),
+        (b"no picture at all", "is not an image"),
         (b"P5 2 2 255\n" + bytes(4), "is not an image that states its size"),
         (b"\xff\xd8\xff", "truncated"),
     ],
