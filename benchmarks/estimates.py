@@ -89,7 +89,7 @@ def train_by_processor_time(words: list[str]) -> int:
 def table_of(known: Mapping[str, Any]) -> str:
     """Lay the rows of a JSON file out: what was foretold, what came, and the ratio of the times."""
     lines = [
-        "| capture, `--minutes` | px, steps | time: foretold, taken | ratio | Gaussians | GB of memory |",
+        "| capture, `--minutes` | px, steps | time: predicted, taken | ratio | Gaussians | GB of memory |",
         "| --- | --- | --- | ---: | --- | --- |",
     ]
     for name, row in known.items():

@@ -180,18 +180,21 @@ def counters() -> str:
     found = read_json(MEASURED / "counters.json")
     head = "| kernel | us | instructions, millions | processors busy | issue slots used | warps there "
     lines = [head + "| what its warps wait for most |", "|---|---|---|---|---|---|---|"]
+    of_cub = []
     for kernel in found["kernels"]:
         if kernel["us"] < LEAST_SHOWN:
             continue
         name = kernel["kernel"].removeprefix("void ").removeprefix("pop::")
-        # a sort's arguments are lines of policy
-        name = f"cub::{name.split('<')[0]}" if name.startswith(("radix_sort::", "scan::")) else name
+        if name.startswith(("radix_sort::", "scan::")):
+            of_cub.append(kernel["us"])
+            continue
         waits = [f"{what.replace('_', ' ')} {share}" for what, share in kernel["warps_stalled_per_issue"].items()]
         waits = [words for words in waits if not words.startswith(("selected", "not selected"))]
         shares = f"{kernel['busy_percent']} % | {kernel['issue_percent']} % | {kernel['warps_percent']} %"
         millions = kernel["instructions"] / 1e6
         lines.append(f"| `{name}` | {kernel['us']:.0f} | {millions:.1f} | {shares} | {', '.join(waits[:2])} |")
-    return "\n".join(lines)
+    each = f"{min(of_cub):.0f} to {max(of_cub):.0f} us each, {sum(of_cub):.0f} together"
+    return "\n".join((*lines, "", f"Not listed: {len(of_cub)} kernels of CUB's sorts and sums ({each})."))
 
 
 def exchanged() -> str:

@@ -133,7 +133,7 @@ def stream_of(device: torch.device) -> int:
 
 
 class SideStream:
-    """A stream beside the current one, for kernels that need nothing of each other.
+    """A stream parallel to the current one, for kernels that need nothing of each other.
 
     Args:
         device: where.
@@ -155,7 +155,7 @@ class SideStream:
             yield
 
     def join(self) -> None:
-        """Let the current stream wait for what was asked for beside it."""
+        """Let the current stream wait for what was asked for in parallel."""
         if self._stream is not None:
             torch.cuda.current_stream(self._device).wait_stream(self._stream)
 

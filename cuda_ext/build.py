@@ -97,7 +97,7 @@ def tools() -> tuple[str, str]:
 
 
 def _program(name: str) -> str | None:
-    """Find a program beside this Python, where pip puts it, or on the PATH."""
+    """Find a program next to this Python, where pip puts it, or on the PATH."""
     return shutil.which(name, path=os.pathsep.join((str(Path(sys.executable).parent), os.environ.get("PATH", ""))))
 
 

@@ -34,26 +34,26 @@ _FIELDS = ("centre", "scale", "rotation", "opacity", "colour", "view dependence"
 
 _SMALLER = """## Smaller
 
-| option | what goes |
+| option | what it removes |
 |---|---|
-| `--min-opacity A` | Gaussians with a lower opacity; under 1/255 no picture changes |
-| `--crop XMIN YMIN ZMIN XMAX YMAX ZMAX` | those with their centre outside a box in the capture's own world frame |
-| `--without-floaters` | those that stand before a camera where nothing was photographed, and veils; the rest is tuned |
-| `--final-prune SHARE` | those that contribute least and together make up this share of all blending weights |
-| `--max-gaussians N` | all but the N of the highest score |
-| `--target-mb M` | what a file of at most M megabytes has no room for: Gaussians of the lowest scores, bands of the \
-colours, and digits of their coefficients |
+| `--min-opacity A` | Gaussians with a lower opacity; below 1/255 no picture changes |
+| `--crop XMIN YMIN ZMIN XMAX YMAX ZMAX` | Gaussians with their centre outside a box in the capture's own world frame |
+| `--without-floaters` | Gaussians that float in front of a camera where nothing was photographed, and veils; the rest is tuned |
+| `--final-prune SHARE` | the Gaussians that contribute least and together make up this share of all blending weights |
+| `--max-gaussians N` | all but the N Gaussians with the highest scores |
+| `--target-mb M` | whatever does not fit into M megabytes: Gaussians with the lowest scores, bands of the colours, \
+digits of their coefficients |
 
-Scores (`--score`) are Speedy-Splat's sensitivity, blending weights or dominated pixels, summed over the training views,
-or a guess from opacity and size where no capture is known. `pop train` takes the same options, for the files that
-`--export` names.
+A score (`--score`) is Speedy-Splat's sensitivity, the blending weights or the dominated pixels, summed over the
+training views. Without a capture it is an estimate from opacity and size. `pop train` takes the same options for the
+files that `--export` names.
 
-Where the photographs are at hand, `--target-mb` measures what loses least. Every degree of the colours is tried, those
-of a lower one fitted to what the training views show, and the best one with finer and coarser coefficients, where the
-format has them. Each is tuned for a few steps, written, read back and measured in training views; the best is tuned for
-`--fine-tune-steps` (300; 0 tunes nothing), and so is what `--max-gaussians` keeps. The run's own engine and loss do
-that, without density control; how long it takes is told after its first seconds. Held-out views are measured at the end
-and decide nothing. Without photographs, Gaussians alone go, those that are least visible.
+With the photographs, `--target-mb` searches for the smallest loss. It tries every degree of the colours (lower degrees
+are fitted to the training views), and the best degree with finer and coarser coefficients, if the format has them. Each
+candidate is tuned for a few steps, written, read back and measured in training views. The best one is tuned for
+`--fine-tune-steps` (300; 0 turns tuning off), and so is the result of `--max-gaussians`. Tuning uses the run's own
+engine and loss, without density control, and prints its duration after the first seconds. Held-out views are measured
+only at the end and decide nothing. Without photographs `--target-mb` only removes the least visible Gaussians.
 """
 
 
@@ -68,36 +68,36 @@ def page() -> str:
     losses += [[f"`{f.name}`", *(f.losses[field] for field in _FIELDS)] for f in FORMATS.values()]
     return f"""# File formats
 
-`pop export RESULT --to FORMAT` and `pop convert IN OUT` write these; every command that takes a splat reads them, the
-page apart. KSPLAT (`.ksplat`, `github.com/mkkellogg/GaussianSplats3D`) and SOG in a folder (its `meta.json`, or the
-folder) are read and not written. `--to spz` writes the version that most programs read, `--to spz-4` the latest one.
-Where nobody names the file, no two formats share a name: `scene.spz` and `scene-4.spz`, `scene.glb` and
-`scene-spz.glb`. Sizes are in MB, 10^6 bytes. `pop train` ends with the size of the splat in each and the held-out PSNR
-when it is read back from there.
+`pop export RESULT --to FORMAT` and `pop convert IN OUT` write these formats. Every command that takes a splat reads
+them, except `html`. KSPLAT (`.ksplat`, `github.com/mkkellogg/GaussianSplats3D`) and SOG in a folder (its `meta.json`,
+or the folder) can be read but not written. `--to spz` writes the version that most programs read, `--to spz-4` the
+latest version. Default file names differ between formats: `scene.spz` and `scene-4.spz`, `scene.glb` and
+`scene-spz.glb`. Sizes are in MB, 10^6 bytes. At its end `pop train` prints the size of the splat in each format, and
+the held-out PSNR of the splat read back from that file.
 
 {_table(["format", "suffix", "what it is", "bytes a Gaussian, degree 0", "degree 3", "opened by"], sizes)}
 
 ## What a round trip changes
 
-Bounds, which the tests hold every format to; opacities are meant activated, scales in world units, colour coefficients
-as they are.
+The table gives bounds that the tests enforce for every format. They apply to activated opacities, scales in world
+units and unchanged colour coefficients.
 
 {_table(["format", *_FIELDS], losses)}
 
-- An opacity that is stored as a byte comes back between 0.001 and 0.999: a raw opacity has to be finite.
-- The order of the Gaussians changes where neighbours in the file should be neighbours in space (`compressed-ply`,
-  `spz`, `sog`) and in `.splat`, the largest and most opaque first. Colour degrees that are all zero are left out.
-- PLY, compressed PLY, SOG and `.splat` hold the frame as it is, with y down for a capture from COLMAP; SPZ and glTF
-  have y up, so that the scene is half a turn about x or z from there. Readers here turn it back.
-- Every file but `.splat` says which world the splat is in, the capture's own or the frame that it was trained in, and
-  how the one came from the other: PLY and compressed PLY in a comment, SOG in `asset` of its `meta.json`, glTF in
-  `extras` of its `asset`, SPZ in an extension of the type 0x504F0001, which other readers skip. A file that says
-  nothing is taken to be in the capture's own world, as every export is where `--frame training` does not ask for the
-  other; one that gsplat's trainer wrote needs `--training-frame`.
-- SPZ is read in versions 2 to 4, also with coordinates that it says to be others (half turns of the usual ones); SOG in
-  version 2; glTF as one `.glb` with a splat that no node moves; KSPLAT in version 0.1, all of its compression levels.
-- `html` holds SPZ, and loses what that loses. It draws as the training's rasterizer does, to degree 3, but ends no
-  pixel early; in the profile `inria` its cut-off is an ellipse of 3 standard deviations and not a square.
+- An opacity stored as a byte is read back between 0.001 and 0.999, because a raw opacity has to be finite.
+- The order of the Gaussians changes in `compressed-ply`, `spz` and `sog`, which place neighbours in space next to each
+  other, and in `.splat`, which has the largest and most opaque first. Colour degrees that are all zero are left out.
+- PLY, compressed PLY, SOG and `.splat` keep the frame, with y down for a capture from COLMAP. SPZ and glTF have y up,
+  so the scene is rotated by half a turn about x or z. The readers of this package rotate it back.
+- Every file except `.splat` records whether the splat is in the capture's own world or in the training frame, and the
+  transformation between them: PLY and compressed PLY in a comment, SOG in `asset` of its `meta.json`, glTF in `extras`
+  of its `asset`, SPZ in an extension of type 0x504F0001, which other readers skip. A file without this record is taken
+  to be in the capture's own world. Exports are in that world unless `--frame training` is given. A file that gsplat's
+  trainer wrote needs `--training-frame`.
+- These versions are read: SPZ 2 to 4, also when it declares other coordinates (half turns of the usual ones); SOG 2;
+  glTF as one `.glb` whose nodes do not move the splat; KSPLAT 0.1 with all of its compression levels.
+- `html` contains SPZ and has the losses of SPZ. It draws like the training's rasterizer, up to degree 3, but does not
+  end pixels early. In the profile `inria` its cut-off is an ellipse of 3 standard deviations instead of a square.
 
 {_SMALLER}
 ## Measured
@@ -125,9 +125,9 @@ def _measured(sizes: dict[str, Any]) -> str:
         }
         formats = dict.fromkeys(row["format"] for row in found["rows"])
         rows += [[name, f"`{format}`", *(cells[format, share] for share in shares)] for format in formats]
-    return f"""Bytes, their share of the whole splat's PLY, and the change of the held-out PSNR. POP,
-`--preset quick --lr.beta2 0.999`, as `quick` was when this was measured:
-{"; ".join(sources)}. Every file is written by `pop export` and measured by `pop eval`
+    return f"""Cells give the size, its share of the whole splat's PLY, and the change of the held-out PSNR. The runs
+are POP with `--preset quick --lr.beta2 0.999`, which was `quick` at the time:
+{"; ".join(sources)}. `pop export` wrote every file and `pop eval` measured it
 (`benchmarks/sizes.py`).
 
 {_table(head, rows)}"""
@@ -150,22 +150,21 @@ def _budgets(record: dict[str, Any]) -> str:
             cells = [f"{row[kind]['psnr'] - found['psnr']:+.2f} dB" for kind in ("fewer", "spent", "tuned")]
             size = f"{row['bytes'] / 1e6:.2f} MB, 1/{row['share']}"
             rows.append([name, f"`{row['format']}`", size, *cells])
-    return f"""Change of the held-out PSNR in a tenth and a twentieth of the bytes of the whole splat's PLY. POP,
-`--preset quick` as above, which ends before the splat is as good as it gets: what is tuned can be better than the
-whole.
-"Fewer Gaussians alone" is what `--target-mb` did before, "harmonics and digits too" is `--fine-tune-steps 0`, the last
-column the default of {record["steps"]} steps (`benchmarks/sizes.py --budgets`).
+    return f"""The table gives the change of the held-out PSNR at a tenth and a twentieth of the whole splat's PLY,
+for POP with `--preset quick` as above. This preset ends before the splat has converged, so a tuned file can be better
+than the whole splat. "Fewer Gaussians alone" is what `--target-mb` did before, "harmonics and digits too" is
+`--fine-tune-steps 0`, and the last column is the default of {record["steps"]} steps (`benchmarks/sizes.py --budgets`).
 
 {_table(head, rows)}
 
-The whole splats, and what they come to when they are tuned for the same steps:
+The whole splats, before and after tuning for the same number of steps:
 
 {_table(["capture", "photographs shrunk by", "Gaussians", "PSNR, dB", "tuned, dB"], sources)}
 
-Published figures of methods that compress, on another scale: the nine scenes of Mip-NeRF 360, their photographs shrunk
-by 4 (outdoors) and 2 (indoors), tens of thousands of steps on a GPU. Each is the authors', as the survey
-3DGS.zip (`w-m.github.io/3dgs-compression-survey`, arXiv 2407.09510) lists it, but for the first. They say what
-a method reaches there, and nothing about the table above.
+The next table has published figures of compression methods in another setting: the nine scenes of Mip-NeRF 360, with
+photographs shrunk by 4 (outdoors) and 2 (indoors), and tens of thousands of steps on a GPU. All but the first are the
+authors' figures as the survey 3DGS.zip lists them (`w-m.github.io/3dgs-compression-survey`, arXiv 2407.09510). They
+cannot be compared with the table above.
 
 {_table(["method", "PSNR, dB", "MB", "source"], [list(row) for row in PUBLISHED])}"""
 

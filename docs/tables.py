@@ -79,9 +79,9 @@ RECIPE_NOTES = {
     "L2": "the module ablation's first row: no blur rule, no POP term, no reset",
     "Reset": "opacity reset in place of the POP term",
     "3DGS": "Inria's code, with its rasterizer's constants",
-    "3DGS 2023": "the same before its opacities moved half as fast; the next four are built on it or on 3DGS",
+    "3DGS 2023": "Inria's code before it halved the rate of opacities; the next four methods extend it or 3DGS",
     "gsplat": "gsplat's default strategy",
-    "PUP-3DGS": "two rounds of pruning by Fisher blocks and refining, after a whole training",
+    "PUP-3DGS": "after a whole training, two rounds of pruning by Fisher blocks and refining",
     "Mini-Splatting": "blur split, depth re-initialization, sampling and pruning by importance",
     "Taming-3DGS": "growth to a budget, by sampling from a score",
     "Speedy-Splat": "exact tile lists, soft and hard pruning by sensitivity",
@@ -257,7 +257,7 @@ def recipes() -> str:
     rows = [[name, f"`pop train scene {' '.join(options_for(recipe))}`".replace(" `", "`"), RECIPE_NOTES.get(name, "")]
             for name, recipe in (*RECIPES.items(), *BASELINES.items())]  # fmt: skip
     divided = " ".join(options_for(L1_DIVIDED[10]))
-    rows.append(["L1 div = 10", f"`pop train scene {divided}`", "and likewise 1, 2, 5, 20, 50, 100"])
+    rows.append(["L1 div = 10", f"`pop train scene {divided}`", "also with 1, 2, 5, 20, 50, 100"])
     return table(["row of the paper", "command", ""], rows)
 
 

@@ -115,7 +115,7 @@ def _fewest(published: Paper) -> Question:
     return Question(
         "fewest",
         "POP has the fewest Gaussians of the methods",
-        _by_dataset(counts, datasets) + "; not said of Tanks & Temples",
+        _by_dataset(counts, datasets) + "; not claimed for Tanks & Temples",
         "N(pop) is below that of each method of table 1",
         ("pop", *others),
         ask,
@@ -133,7 +133,7 @@ def _above(published: Paper) -> Question:
     return Question(
         "above",
         "POP has a higher PSNR than PUP-3DGS and Speedy-Splat",
-        f"{_signed(changes)} dB against PUP-3DGS and Speedy-Splat on Mip-NeRF 360, of which alone it is said",
+        f"{_signed(changes)} dB against PUP-3DGS and Speedy-Splat on Mip-NeRF 360, the only data set of this claim",
         "PSNR(pop) is above PSNR(pup) and PSNR(speedy_splat)",
         ("pop", *others),
         ask,
@@ -300,7 +300,7 @@ def _growth(published: Paper) -> Question:
 
     return Question(
         "growth",
-        "the blur rule goes on adding Gaussians as long as its window lasts",
+        "the blur rule keeps adding Gaussians as long as its window lasts",
         f"table 4: {', '.join(map(line, DATASETS))} Gaussians a densification step from 4k to 7k, to 11k, to 15k",
         "the growth of N a densification step by which the windows differ is no smaller from 7k to 15k than from 4k "
         "to 7k, as in all three data sets",

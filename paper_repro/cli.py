@@ -29,14 +29,14 @@ _SEED: Final = 42
 _TEXT: Final = """\
 usage: pop-repro COMMAND ...
 
-Every method, table and figure of the paper, from nothing or from the results that are there.
+Every method, table and figure of the paper, from scratch or from existing results.
 
 commands:
 {commands}
 
 start here:
   pop-repro run pop demo --scale toy                    one row in seconds, without data
-  pop-repro data check --data DATA                      what of the paper's scenes is there
+  pop-repro data check --data DATA                      which of the paper's scenes are present
   pop-repro queue --scale small --data DATA --nice 10     days of training, stopped and resumed at any time
   pop-repro table 1 --scale small                         the paper's first table from the results
   snakemake -s {snakefile} -n        the same as a workflow, for a cluster or a cloud
@@ -69,8 +69,8 @@ def _add_scale(parser: argparse.ArgumentParser) -> None:
 
 def _add_jobs(parser: argparse.ArgumentParser) -> None:
     """Add --rows, --scenes and --seeds."""
-    parser.add_argument("--rows", nargs="+", metavar="ROW", help="these rows alone (default: all)")
-    parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="these scenes alone (default: the scale's)")
+    parser.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows (default: all)")
+    parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="only these scenes (default: the scale's)")
     parser.add_argument("--seeds", type=int, default=1, metavar="N", help=f"seeds of each: {_SEED}, {_SEED + 1}, ...")
 
 
@@ -110,12 +110,12 @@ def _add_training(parser: argparse.ArgumentParser) -> None:
     _add_scale(parser)
     _add_data(parser)
     _add_results(parser)
-    _add_work(parser, "the folder of checkpoints; of a finished row it can be removed (default: %(default)s)")
+    _add_work(parser, "the folder of checkpoints; that of a finished row can be removed (default: %(default)s)")
     note = "the folder of splats and renders of finished rows, to be published (default: published in --work)"
     parser.add_argument("--published", type=Path, metavar="DIR", help=note)
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="CPU threads, 0 for all cores (default: 1)")
-    _add_backend(parser, "what takes the steps, as for pop train (default: %(default)s)")
-    note = "steps that a kill can cost (default: the scale's, 500 or so)"
+    _add_backend(parser, "the backend, as for pop train (default: %(default)s)")
+    note = "steps between checkpoints, which a kill can cost (default: the scale's, 500 or so)"
     parser.add_argument("--checkpoint-every", type=int, metavar="STEPS", help=note)
     note = "steps between two points of the curves (default: the scale's, 100 or so)"
     parser.add_argument("--log-every", type=int, metavar="STEPS", help=note)
@@ -124,7 +124,7 @@ def _add_training(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(f"--lpips-{net}", nargs="+", default=[], metavar="FILE", help=note)
     parser.add_argument("--keep-ply", action="store_true", help="keep the Gaussians of finished rows in --work")
     parser.add_argument("--keep-checkpoints", action="store_true", help="keep their checkpoints too")
-    note = "the machine has other work meanwhile: seconds are kept with the result, and compared with no other's"
+    note = "the machine also does other work: seconds are recorded, but never compared"
     parser.add_argument("--untimed", action="store_true", help=note)
 
 
@@ -154,7 +154,7 @@ _QUEUE: Final = """
     pop-repro queue --scale small --data DATA --nice 10     days; Ctrl-C or SIGTERM stops it, the same command continues
     pop-repro queue --scale small --data DATA --rows pop gsplat 3dgs --scenes fox bear_512 --seeds 3
     pop-repro queue --scale small --data DATA --list        what is missing, in order, without training
-    pop-repro queue --scale paper --data DATA --check     the hours of each row, and what is lacking here
+    pop-repro queue --scale paper --data DATA --check     the hours of each row, and what is missing here
 """
 
 
@@ -163,7 +163,7 @@ def run(words: Sequence[str]) -> int:
     parser = _parser_of("run", _RUN)
     parser.add_argument("row", metavar="ROW", help="a file of configs: pop, gsplat, 3dgs, l2_blur, ...")
     parser.add_argument("scene", metavar="SCENE", help="one of the scale's: fox, bonsai_800, garden, ...")
-    parser.add_argument("--seed", type=int, default=_SEED, help="of every random number (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=_SEED, help="seed of every random number (default: %(default)s)")
     parser.add_argument("--again", action="store_true", help="train a finished row again, and replace its result")
     _add_training(parser)
     args = parser.parse_args(words)
@@ -188,8 +188,8 @@ def queue(words: Sequence[str]) -> int:
     """Train the rows that are missing."""
     parser = _parser_of("queue", _QUEUE)
     _add_jobs(parser)
-    parser.add_argument("--nice", type=int, default=0, metavar="N", help="give way to other programs, 0 to 19")
-    parser.add_argument("--commit", action="store_true", help="commit each result in git when it is there")
+    parser.add_argument("--nice", type=int, default=0, metavar="N", help="nice value, 0 to 19")
+    parser.add_argument("--commit", action="store_true", help="commit each result in git")
     parser.add_argument("--list", action="store_true", help="list what is missing, in order, and train nothing")
     note = "say the hours and what of data, disk, memory and GPU is lacking, and train nothing; scale paper begins so"
     parser.add_argument("--check", action="store_true", help=note)
@@ -253,7 +253,7 @@ def verify(words: Sequence[str]) -> int:
     parser.add_argument("row", metavar="ROW", help="a row with a result")
     parser.add_argument("scene", metavar="SCENE", help="one of the scale's: fox, bonsai_800, garden, ...")
     parser.add_argument("--seed", type=int, default=_SEED, help="of the result (default: %(default)s)")
-    parser.add_argument("--steps", type=_positive, metavar="N", help="the first steps alone (default: all)")
+    parser.add_argument("--steps", type=_positive, metavar="N", help="only the first steps (default: all)")
     _add_scale(parser)
     _add_data(parser)
     _add_results(parser)
@@ -414,7 +414,7 @@ def data_check(words: Sequence[str]) -> int:
     """Say of each scene whether it is there as the protocol has it."""
     parser = _parser_of("data check", _DATA)
     _add_data(parser)
-    parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="these alone (default: all)")
+    parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="only these (default: all)")
     args = parser.parse_args(words)
     from paper_repro.data_check import check_scene, table
 
@@ -427,14 +427,14 @@ def data_check(words: Sequence[str]) -> int:
 
 # each with what runs it and what it does
 COMMANDS: Final = {
-    "run": (run, "train one row on one scene, or continue with it"),
-    "queue": (queue, "train every row of a scale that is missing, the cheapest first"),
+    "run": (run, "train one row on one scene, or resume it"),
+    "queue": (queue, "train all missing rows of a scale, the cheapest first"),
     "verify": (verify, "train a finished row again at its commit, and compare the bits"),
     "status": (status, "say which rows of a scale are done"),
     "table": (table, "make one of the paper's tables from the results"),
     "figure": (figure, "draw one of the paper's figures from the results"),
     "claims": (claims, "judge the paper's claims by the results"),
-    "data check": (data_check, "say which scenes are there, whole, and where to get the rest"),
+    "data check": (data_check, "say which scenes are present and complete, and where to get the rest"),
 }
 
 

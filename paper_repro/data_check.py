@@ -116,7 +116,7 @@ def table(found: Sequence[Found], root: Path) -> list[str]:
             places = ", ".join((root / parent / "NAME").as_posix() for parent in dataset.parents)
             lines.append(f"  looked for in {places}")
     if any(not item.scene.verified for item in found):
-        lines += ["", "~ as is recalled of the publication; nobody has compared it with the photographs for this table"]
+        lines += ["", "~ recalled from the publication; not compared with the photographs for this table"]
     return lines
 
 
@@ -212,4 +212,4 @@ def _wrong_size(scene: PaperScene, sizes: Sequence[tuple[int, int]], factor: int
 
 
 def _doubt(scene: PaperScene) -> str:
-    return "" if scene.verified else " (as is recalled; nobody compared it with the photographs here)"
+    return "" if scene.verified else " (recalled; not compared with the photographs here)"

@@ -84,7 +84,7 @@ def run_queue(jobs: Sequence[Job], results: Path, words: Sequence[str], threads:
         results: the folder of results.
         words: further words of `pop-repro run`: --data and the like.
         threads: CPU threads of a training.
-        commit: commit each result in git when it is there, with the pages that are made from the package's results.
+        commit: commit each result in git, with the pages that are made from the package's results.
 
     Returns:
         What became of them; a failed row does not keep the next ones from being trained.
@@ -119,8 +119,8 @@ def run_queue(jobs: Sequence[Job], results: Path, words: Sequence[str], threads:
 def _why(status: int) -> str:
     """Say what became of a row, at once: the queue's own end may be days away."""
     if status < 0:
-        return f"was killed by {signal.Signals(-status).name}; the queue, called again, continues with it"
-    told = {BusyError.status: "is left to another process", NotTrainableError.status: "cannot be trained"}
+        return f"was killed by {signal.Signals(-status).name}; the queue continues with it when it is run again"
+    told = {BusyError.status: "is trained by another process", NotTrainableError.status: "cannot be trained"}
     return told.get(status, f"failed with status {status}; its last lines say why")
 
 
@@ -296,7 +296,7 @@ def _gpu(jobs: Sequence[Job], backend: str) -> list[str]:
     if not torch.cuda.is_available():
         return [
             "GPU: there is no NVIDIA GPU here, and a CPU takes far longer than these hours; run it where there is one, "
-            "or train on the CPU all the same with --backend compiled"
+            "or train on the CPU anyway with --backend compiled"
         ]
     total = torch.cuda.get_device_properties(0).total_memory
     needed = max(map(_gaussians, jobs)) * _TRAINING + _PROGRAM

@@ -63,17 +63,17 @@ def telling() -> list[str]:
 def method() -> str:
     """Say how a claim is decided."""
     return (
-        "A claim holds on a scene when all that is asked of it holds beyond the noise of the seeds, does not hold when "
-        "something fails beyond it, and is not decided otherwise; over the scenes that have its runs it does not hold "
-        "when it does not on one of them. Noise is the standard deviation over seeds, pooled over all rows and scenes "
-        "of the scale that have several. Intervals are L ± t s √(Σ cᵢ²/nᵢ) for a combination L of means over nᵢ seeds, "
-        "with Student's t at the degrees of freedom of the pooled deviation s (contrasts in a one-way analysis of "
-        "variance, NIST/SEMATECH e-Handbook of Statistical Methods, 7.4.3.6); those of one claim at one scale hold "
-        f"together with a probability of {1.0 - ALPHA:.0%} (Bonferroni, 7.4.7.3 there). Counts and times are compared "
-        "by their logarithms. Where no row has two seeds there is no interval, and one seed decides nothing. What a "
-        "length of the schedule does is decided by the whole schedule alone. The default readings are those of "
-        "[protocol.md](protocol.md), part 3; a claim is judged under another one where all rows that it changes are "
-        "trained under it."
+        "A claim holds on a scene if all of its conditions hold beyond the noise of the seeds. It does not hold if one "
+        "of them fails beyond that noise. Otherwise it is not decided. Over all scenes that have its runs, it does not "
+        "hold if it does not hold on one of them. Noise is the standard deviation over seeds, pooled over all rows and "
+        "scenes of the scale that have several seeds. Intervals are L ± t s √(Σ cᵢ²/nᵢ) for a combination L of means "
+        "over nᵢ seeds, with Student's t at the degrees of freedom of the pooled deviation s (contrasts in a one-way "
+        "analysis of variance, NIST/SEMATECH e-Handbook of Statistical Methods, 7.4.3.6). The intervals of one claim "
+        f"at one scale hold together with a probability of {1.0 - ALPHA:.0%} (Bonferroni, 7.4.7.3 there). Counts and "
+        "times are compared by their logarithms. If no row has two seeds there is no interval, and one seed decides "
+        "nothing. Only the whole schedule decides questions about the length of the schedule. [protocol.md]"
+        "(protocol.md), part 3, lists the default readings of the paper. A claim is judged under another reading if "
+        "all rows that it changes are trained under it."
     )
 
 
@@ -83,9 +83,9 @@ def markdown(scale: str, results: Iterable[Result]) -> str:
     judged = claims(scale, mine)
     parts = [f"## Claims, scale {scale}"]
     if scale not in telling():
-        parts.append("**NOT the paper's protocol: a made-up scene. Nothing here says anything of a method.**")
+        parts.append("**NOT the paper's protocol: a made-up scene. These numbers say nothing about a method.**")
     elif scale != "paper":
-        parts.append("**NOT the paper's protocol: other photographs. The paper's numbers are a yardstick here.**")
+        parts.append("**NOT the paper's protocol: other photographs. The paper's numbers are only a reference here.**")
     parts.append(_noise(scale, noise_of(mine)))
     if scale != JUDGE:
         open_ = [c.id for c in judged if not any(told.evidence for told in (c.told, *c.others))]
@@ -122,12 +122,12 @@ def _outcome_line(by_scale: Sequence[tuple[str, Claim]]) -> str:
             line += f"; under {told.reading} **{told.verdict}**"
         line += f" ({numbers})" if numbers else ""
         if told.verdict == "not decided" and told.deciders:
-            line += f", which `{told.deciders[0]}` would decide"
+            line += f"; `{told.deciders[0]}` would decide it"
     return line + "."
 
 
 def _one(claim: Claim) -> str:
-    parts = [f"### {claim.id}: {claim.says}", f"Asked: {claim.holds_if}. In the paper: {claim.paper}."]
+    parts = [f"### {claim.id}: {claim.says}", f"Condition: {claim.holds_if}. In the paper: {claim.paper}."]
     rows = [
         [
             told.reading or "default",
@@ -146,15 +146,15 @@ def _one(claim: Claim) -> str:
 
 def _deciders(told: Told) -> str:
     under = f" under {told.reading}" if told.reading else ""
-    return f"What is open{under} is decided by:\n\n```sh\n" + "\n".join(told.deciders) + "\n```"
+    return f"These runs would decide what is open{under}:\n\n```sh\n" + "\n".join(told.deciders) + "\n```"
 
 
 def _noise(scale: str, noise: Noise) -> str:
     told = [(quantity, spread) for quantity in QUANTITIES if (spread := noise.of(quantity)) is not None]
     if not told:
         return (
-            f"Noise floor: none. No row has two seeds on one scene at scale {scale}, so that nothing is decided here "
-            f"by one seed."
+            f"Noise floor: none. No row has two seeds on one scene at scale {scale}, so nothing is decided here: "
+            f"one seed decides nothing."
         )
     texts = [
         f"{quantity.name} {_spread(quantity.name == PSNR.name, quantity.is_log, spread)}" for quantity, spread in told
@@ -167,7 +167,7 @@ def _spread(is_psnr: bool, is_log: bool, spread: Spread) -> str:
         return f"{expm1(s):.2%}" if is_log else f"{s:.3f} dB" if is_psnr else f"{s:.4f}"
 
     return (
-        f"{shown(spread.s)} ({spread.df} degrees of freedom, {spread.groups} pairs of row and scene, whose own lie "
+        f"{shown(spread.s)} ({spread.df} degrees of freedom, {spread.groups} pairs of row and scene, each "
         f"between {shown(spread.least)} and {shown(spread.largest)})"
     )
 
@@ -334,8 +334,8 @@ def _says(reading: Reading, votes: Sequence[tuple[tuple[str, ...], int]]) -> str
     pairs = {frozenset(rows) for rows, _ in votes}
     without = [sum(vote for rows, vote in votes if set(rows) != pair) for pair in pairs]
     if lead == 0 or any(left * lead <= 0 for left in without):
-        return f"Not decided: {counted}, and without one pair of rows the lead is gone."
-    return f"The runs speak for {'the default' if lead > 0 else reading.other}: {counted}, also without any one pair."
+        return f"Not decided: {counted}, and the lead is gone without one pair of rows."
+    return f"The runs favour {'the default' if lead > 0 else reading.other}: {counted}, also without any one pair."
 
 
 def _telling(results: Sequence[Result]) -> list[str]:
@@ -511,11 +511,11 @@ def _ambiguities() -> str:
         [a.id, a.impact, a.question, a.default, ", ".join(f"`{other}`" for other in a.alternatives) or "none"]
         for a in AMBIGUITIES
     ]
-    return grid(["label", "impact", "question", "default here", "can be chosen besides"], rows)
+    return grid(["label", "impact", "question", "default here", "other choices"], rows)
 
 
 def _claims(found: Sequence[Result]) -> str:
-    about = "What is asked: [claims.py](claims.py). What is compared with what: [protocol.md](protocol.md)."
+    about = "The conditions are in [claims.py](claims.py), the comparisons in [protocol.md](protocol.md)."
     parts = ["# The paper's claims", _MADE, about, method()]
     # the scale that is meant to decide says which runs it lacks even where it has none
     scales = [scale for scale in telling() if scale == JUDGE or any(r.scale == scale for r in found)]

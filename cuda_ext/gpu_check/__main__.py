@@ -6,7 +6,7 @@
     python3 -m cuda_ext.gpu_check --job 4    job 4, on a node of several GPUs: steps shared by ranks, blocks at once
 
 What has to be there: Python 3.11 or newer with torch for CUDA, NumPy, nanobind, hypothesis and pytest, cmake, nvcc.
-Results go to the folder named first, else to $OUT, else to out/gpu_check/results: one JSON file a job, and beside it
+Results go to the folder named first, else to $OUT, else to out/gpu_check/results: one JSON file a job, and next to it
 what its stages wrote while they ran. Nothing need survive between the jobs: each builds first, and keeps what it finds
 built. A stage that fails or runs out of time is reported with the reason, and the next one runs.
 

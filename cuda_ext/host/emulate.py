@@ -4,7 +4,7 @@
 is, bindings included, against headers that stand in for CUDA's. Device pointers are then addresses of CPU tensors.
 
 What is loaded from a library runs as whoever loads it. In a folder for everybody, such as that for temporary files,
-whoever knows the name can put a library of their own there first: `library_folder` is beside the code, or in a cache
+whoever knows the name can put a library of their own there first: `library_folder` is next to the code, or in a cache
 that is this user's alone.
 """
 
@@ -37,7 +37,7 @@ HERE, CUDA_EXT = Path(__file__).parent, Path(cuda_ext.__file__).resolve().parent
 FLAGS = ("-std=c++17", "-O1", "-fPIC", "-shared", "-ffp-contract=off", "-fno-strict-aliasing", "-U_FORTIFY_SOURCE")
 # more flags: POP_EMULATED_FLAGS="-fsanitize=address --param asan-stack=0", with libasan preloaded, watches every access
 FLAGS += tuple(os.environ.get("POP_EMULATED_FLAGS", "").split())
-# a domain of its own: with the compiled extension in one process, its types are not taken for the extension's
+# its own domain: with the compiled extension in one process, its types are not taken for the extension's
 FLAGS += ("-fvisibility=hidden", "-Wno-attributes", '-DPOP_CUDA_ARCHS="emulated"', "-DNB_DOMAIN=emulated")
 _LAUNCH = re.compile(r"([A-Za-z_]\w*(?:<[\w\s,:]*>)?)\s*<<<")
 # what the host asks and gets answered at once, also while a graph is captured
@@ -101,7 +101,7 @@ def build(folder: Path) -> Path:
 
     compiler = find_compiler()
     assert compiler is not None
-    # not what was compiled before, which lies below these folders
+    # not what was compiled before, which is below these folders
     kernels, stand_ins = (CUDA_EXT / "csrc").rglob("*"), (HERE / "include").rglob("*")
     there = [*CUDA_EXT.glob("*"), *kernels, HERE / "emulator.cpp", *stand_ins]
     files = sorted(file for file in there if file.suffix in (".cu", ".cuh", ".h", ".cpp"))

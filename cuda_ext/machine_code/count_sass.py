@@ -130,7 +130,7 @@ def warps_per_processor(registers: int, shared: int, threads: int, processor: Pr
 
 
 def find_nvdisasm() -> str | None:
-    """Return the path of nvdisasm: the PATH, beside nvcc, or inside the package triton; or None."""
+    """Return the path of nvdisasm: the PATH, next to nvcc, or inside the package triton; or None."""
     nvcc = find_nvcc()
     candidates = [Path(shutil.which("nvdisasm") or "")]
     if nvcc is not None:

@@ -1,11 +1,11 @@
 """Tile lists on the GPU: buffers, their growth, and what they say.
 
-Sorts and ranges run over the room that a list has and not over what is in it, because a captured step cannot ask how
-much that is. So the room follows the need: it grows when a step finds too little, and is brought back to `GROWTH` times
-the need at every densification step, when buffers are made anew in any case. The need of an image size is the most that
-one of its views had when last drawn: the heaviest view counts also where the last window passed it by, and a phase of
-large splats is forgotten once every view has been drawn again. A room that is not far off is kept, so that a need that
-varies a little neither moves memory about nor overflows at once.
+Sorts and ranges run over the capacity of a list and not over its length, because a captured step cannot ask for the
+length. So the capacity follows the need: it grows when a step finds too little, and returns to `GROWTH` times the need
+at every densification step, when buffers are made anew in any case. The need of an image size is the most that one of
+its views had when last drawn. So the heaviest view counts even if the last window did not draw it, and a phase of large
+splats is forgotten once every view has been drawn again. A capacity that is nearly right is kept, so that small changes
+of the need neither move memory nor cause an overflow.
 """
 
 from __future__ import annotations
@@ -164,7 +164,7 @@ def count_instances(
         profile: of the kernels.
         state: address of the device's flags.
         device: where.
-        side: tiles are counted beside the sort, since they do not depend on the order; None takes turns.
+        side: tiles are counted in parallel with the sort, since they do not depend on the order; None takes turns.
     """
     kernels, side = load(), side or SideStream(device, used=False)
     with side.beside():

@@ -289,7 +289,7 @@ def _on_host(*tensors: Tensor) -> list[Array]:
 
 def _not_rigid(rotations: Array) -> Array:
     R = rotations.astype(np.float64)
-    # of what is not finite, which has a rule of its own
+    # of what is not finite, which has its own rule
     with np.errstate(all="ignore"):
         off = np.abs(R @ R.swapaxes(-1, -2) - np.eye(3)).max((-1, -2))
         return ~((off < 1e-3) & (np.linalg.det(R) > 0.0))

@@ -103,7 +103,7 @@ def rasterization(
         rolling_shutter: only None, or gsplat's `RollingShutterType.GLOBAL`.
         profile: constants and strictness: "paper", "gsplat_1_5", "gsplat_1_6", "inria", or a `Profile`.
         dominance: compute the dominance keys of meta in the same pass; else they cost one more when first read.
-        counts: likewise for n_contrib and n_traversed.
+        counts: the same for n_contrib and n_traversed.
         backend: a name that `pop_fast.api.backend` knows, or a backend. "fast" renders on the CPU, "compiled" too with
             kernels in C++ (`pop_fast.compiled`), "cuda" on the GPU that holds the tensors (`cuda_ext`), "ref" with the
             oracle, slowly. "auto" takes the fastest that is there: "cuda" for tensors on a GPU, else "compiled" where
@@ -122,7 +122,7 @@ def rasterization(
     given = dict(locals())
     check_given(means=means, opacities=opacities, colors=colors, viewmats=viewmats, Ks=Ks)
     drawing = fastest_backend(means.device.type) if backend == "auto" else require_backend(backend)
-    # gsplat's default is a member of an enumeration of its own, which need not be imported to be recognized
+    # gsplat's default is a member of its own enumeration, which need not be imported to be recognized
     if getattr(rolling_shutter, "name", None) == "GLOBAL":
         given["rolling_shutter"] = None
     check_supported(given, drawing)

@@ -4,7 +4,7 @@ Round 0 trains every block by itself, or a coarse model of the whole. The rounds
 Gaussians: every block trains those of its own core, among all others as they are. A round's blocks do not wait for one
 another; its merge waits for all of them, and the next round for the merge.
 
-Parts are run by Snakemake where it is installed, else one after the other. Either way a part is a process of its own,
+Parts are run by Snakemake where it is installed, else one after the other. Either way a part is its own process,
 `pop blocks train OUT i_j` or `pop blocks merge OUT`, so that its memory is given back when it ends. One that is
 finished has left its marker and is not done again; a block that was interrupted resumes from its last checkpoint.
 """

@@ -1,22 +1,22 @@
 """Divide the ground of a capture into K x L cores that hold equally many cameras, and decide what each is trained on.
 
 The ground is spanned by the two directions in which the cameras are spread most: the first two principal axes of their
-centres, which are horizontal where a street is driven, a field is flown over or an object is walked around, and need no
-word for what is up. The first axis is cut into K strips of equally many cameras, and each strip along the second axis
-into L cores. The outer cores have no outer border, so that every point of the world lies in the core of one block and
-in no other: what lies on a border belongs to the core of larger coordinates.
+centres. These are horizontal for a drive along a street, a flight over a field or a walk around an object, and do not
+need a known up direction. The first axis is cut into K strips of equally many cameras, and each strip along the second
+axis into L cores. The outer cores have no outer border, so that every point of the world is in the core of one block
+and in no other: a point on a border belongs to the core of larger coordinates.
 
 A block's Gaussians are those of its core. To train them it gets
 
 -   the training views that stand in the core or within its margin, and those that stand elsewhere and see enough of
-    it: the core holds at least the share `share` of the sparse points in their picture. A border is so seen from both
-    sides, and a core that is looked at from afar is trained by the blocks that look at it.
--   the sparse points of the core and its margin, and of the points outside that its views have in their pictures an
-    even selection, at most as many. Without those, Gaussians of the core would have to explain what lies behind it;
+    it: the core holds at least the share `share` of the sparse points in their picture. So a border is seen from
+    both sides, and views from afar train the core too.
+-   the sparse points of the core and its margin, and an even selection of the outside points in its views, at most as
+    many again. Without those, Gaussians of the core would have to explain what is behind it;
     with all of them, a block would be no smaller than the whole. What grows there is dropped when blocks are merged.
 
-What a view sees is judged by its picture's edges alone: the sparse points stand for surfaces, and what hides them is
-not looked for. Each held-out view belongs to the block whose core it stands in, and the whole is measured on all.
+Whether a view sees a point is judged by the edges of its picture alone; occlusion is ignored. Each held-out view
+belongs to the block whose core it stands in, and the whole is measured on all.
 
 The folder of a run in blocks has a result's own files, which describe the merged splat, and:
 
@@ -68,7 +68,7 @@ COARSE: Final = "coarse"
 # photographs shrunk by more show little
 _MOST_COARSE: Final = 16
 _FIX: Final = "start 'pop train --blocks' again with --overwrite"
-# rounds of a run where nobody says how many: of bonsai's 2.6 dB between merged and whole the first, the second and the
+# rounds of a run if the number is not given: of bonsai's 2.6 dB between merged and whole the first, the second and the
 # third give back 1.5, 0.5 and 0.3; and the steps of one as a share of a block's training
 DEFAULT_ROUNDS: Final = 2
 ROUND_SHARE: Final = 0.1
@@ -370,7 +370,7 @@ class Partition:
 def divide(centers: np.ndarray, grid: tuple[int, int]) -> Partition:
     """Divide the ground so that every core holds the same number of cameras, give or take one for each cut.
 
-    A border lies in the middle between the two cameras that it separates.
+    A border is in the middle between the two cameras that it separates.
 
     Args:
         centers: of the training cameras. [V, 3]

@@ -163,7 +163,7 @@ def prepare(
 
     Args:
         resume: continue from the latest checkpoint of `config.result_dir`, or start where there is none.
-        beside: texts to write beside cfg.json, by file name.
+        beside: texts to write next to cfg.json, by file name.
     """
     keep_freed_memory()
     engine = hold_last(engine_of(config), start.fixed)

@@ -1,10 +1,10 @@
 """The parts of a run in blocks that read the capture: its division at the start, and the merges of trained blocks.
 
-Neither holds all photographs: the division reads none, a merge those that are held out. Of each block a merge takes the
-Gaussians of its core, and of no other: after the trainings by themselves those whose centre lies in it. In a round a
-block corrects what its photographs still show as if no other block did. Where a view shows two cores both do, and
-together they would correct it twice: so a merge takes a share (`TAKEN`) of what a round has changed. What the last
-merge makes is the run's result; what another one makes is what the next round starts from.
+Neither holds all photographs: the division reads none, a merge only those that are held out. From each block a merge
+takes only the Gaussians of its core; after the separate trainings these are the Gaussians whose centre is in it. In a
+round a block corrects the errors that its photographs still show, as if no other block did. Where a view shows two
+cores, both blocks correct the same error, so a merge applies only a share (`TAKEN`) of what a round has changed. The
+last merge makes the run's result, and every other merge the start of the next round.
 """
 
 from __future__ import annotations
@@ -244,9 +244,9 @@ _SETTINGS: Final = ("method", "preset", "seed", "lambda_pop", "blur_min_pixels",
 
 
 def kept_of(partition: Partition, number: int, params: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the rows of a block's Gaussians whose centre lies in its core.
+    """Return the rows of a block's Gaussians whose centre is in its core.
 
-    Every centre lies in one core, so that what different blocks keep never overlaps.
+    Every centre is in one core, so that what different blocks keep never overlaps.
     """
     kept = torch.from_numpy(partition.block_of(params["means"].double().numpy()) == number)
     return {key: value[kept] for key, value in params.items()}

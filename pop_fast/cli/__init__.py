@@ -29,7 +29,7 @@ COMMANDS: Final = {
     "eval": "measure a result, a checkpoint or a PLY on the held-out views",
     "render": "write held-out views, or a camera path as pictures or a video",
     "view": "show a splat in the browser, drawn by our own renderers (needs viser)",
-    "explain": "say why a pixel looks as it does, and where two renderers part",
+    "explain": "say why a pixel looks as it does, and where two renderers differ",
     "export": "write a result as PLY, SPZ, SOG, glTF, ..., a page that shows it, or an Inria-style folder",
     "convert": "turn a splat's file into another format",
     "compare": "put several results side by side in one table",
@@ -37,13 +37,13 @@ COMMANDS: Final = {
     "frames": "take sharp photographs out of a video",
     "sfm": "find the cameras of a folder of photographs (pycolmap)",
     "demo": "write the built-in demo capture, made from a seed",
-    "data check": "look a capture over before training: sizes, pairing, masks, memory",
+    "data check": "check a capture before training: sizes, pairing, masks, memory",
     "blocks": "do one part of a training in blocks: partition, train a block, merge",
-    "build-cpu": "compile the CPU kernels: about three times the speed (needs a C++ compiler)",
+    "build-cpu": "compile the CPU kernels: about four times the speed (needs a C++ compiler)",
     "build-cuda": "compile the CUDA extension (needs nvcc)",
     "learn": "build your own splatting in NumPy, judged stage by stage",
     "vectors": "write the conformance vectors for ports in other languages, and check a port's results",
-    "completion": "write a script by which a shell completes the words of pop",
+    "completion": "write a shell script that completes the words of pop",
     "doctor": "say what is installed, what is missing and how to get it",
 }
 
@@ -227,7 +227,7 @@ def describe(error: BaseException) -> str | None:
     if isinstance(error, MemoryError) or "not enough memory" in str(error) or "can't allocate memory" in str(error):
         return "out of memory; use smaller images (--factor 2 or more) or fewer Gaussians"
     if isinstance(error, RuntimeError) and "can't start new thread" in str(error):
-        return "the system allows no further thread; raise the limit (ulimit -u), or use fewer: --threads 1"
+        return "the system allows no more threads; raise the limit (ulimit -u), or use fewer: --threads 1"
     frames = traceback.extract_tb(error.__traceback__)
     here = bool(frames) and any(package in frames[-1].filename.replace("\\", "/") for package in _PACKAGES)
     if isinstance(error, ValueError | NotImplementedError) and here:

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 _EXAMPLES: Final = """
     pop blocks train out/city 0_1            train one block, or resume it
-    pop blocks merge out/city --round 0      put the trained blocks together, for the round that follows
-    pop blocks train out/city 0_1 --round 1  train what the block has in its core, among all others as they are
-    pop blocks merge out/city                the last merge: the result of the run, measured, and its report
-    pop blocks partition out/city            divide the capture again, as the run was begun
+    pop blocks merge out/city --round 0      merge the trained blocks for the next round
+    pop blocks train out/city 0_1 --round 1  train the Gaussians of the block's core; all others stay fixed
+    pop blocks merge out/city                the last merge: measures the result and writes its report
+    pop blocks partition out/city            divide the capture again with the settings of the run
 """
 
 
@@ -60,13 +60,13 @@ def run(argv: Sequence[str]) -> int:
     folder = args.result.absolute()
     job = read_job(folder)
     if job is None:
-        raise PopError(f"{args.result}: is no run in blocks; start one with pop train DATA --blocks 2x2 --out DIR")
+        raise PopError(f"{args.result}: is not a run in blocks; start one with pop train DATA --blocks 2x2 --out DIR")
     config, record = read_config(folder), read_record(folder) or CaptureRecord()
     if args.part != "train" and args.block is not None:
-        raise PopError(f"pop blocks {args.part} is of all blocks; leave {args.block} out")
+        raise PopError(f"pop blocks {args.part} applies to all blocks; leave {args.block} out")
     if args.part == "partition":
         if args.round is not None:
-            raise PopError("pop blocks partition is of all rounds; leave --round out")
+            raise PopError("pop blocks partition applies to all rounds; leave --round out")
         return _partition(folder, config, record, job)
     part = _part(args, job)
     if part.block is None:
@@ -209,5 +209,5 @@ def _merge(folder: Path, config: TrainConfig, record: CaptureRecord, job: Job, p
     status = finish(folder, capture, options) or report(folder)
     if status == 0:
         write_atomically(part.marker(folder), lambda file: file.write(b""))
-        print(f"pop report {folder} --check adds what looks at all photographs", file=sys.stderr)
+        print(f"pop report {folder} --check adds the parts that need all photographs", file=sys.stderr)
     return status

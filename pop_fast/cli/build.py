@@ -15,12 +15,12 @@ from pop_fast.compiled.build import BuildError, build
 from pop_fast.errors import PopError
 
 _CPU_EXAMPLES: Final = """
-    pop build-cpu             backend "compiled", which `pop train` takes by itself from then on
+    pop build-cpu             backend "compiled", which `pop train` uses from then on
     CXX=clang++ pop build-cpu
 """
 _CUDA_EXAMPLES: Final = """
     pop build-cuda                      for the GPU of this machine
-    pop build-cuda --arch sm_80 sm_90   for these, also where there is no GPU
+    pop build-cuda --arch sm_80 sm_90   for these, even without a GPU
 """
 
 

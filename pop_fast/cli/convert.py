@@ -40,7 +40,7 @@ class Args(LimitOptions):
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """The file to write, in the same frame."""
     to: FormatName | None = None
-    """The format, where the name does not say it; "spz" is its version 3, and "spz-4" the latest."""
+    """The format, if the name does not show it; "spz" is its version 3, and "spz-4" the latest."""
     overwrite: bool = False
     """Replace the file."""
 

@@ -1,4 +1,4 @@
-"""`pop data check`: look a capture over before training."""
+"""`pop data check`: check a capture before training."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ R = TypeVar("R")
 
 @dataclass(frozen=True, kw_only=True)
 class Args:
-    """Look a capture over before training: lenses, spacing, sizes, EXIF, pairing, masks, points, reprojection, memory;
+    """Check a capture before training: lenses, spacing, sizes, EXIF, pairing, masks, points, reprojection, memory;
     and its photographs: blur, exposure, copies. A folder of photographs alone can be looked over too.
 
     Exit status 0 when nothing stands against training, 1 when something does.
     """
 
     capture: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-    """The capture; of a video or a ZIP archive its photographs are taken out beside it, as pop train does."""
+    """The capture; photographs of a video or a ZIP archive are extracted next to it, as pop train does."""
     images: str | None = None
     """The photographs are in this folder of the capture."""
     all: bool = False
@@ -56,7 +56,7 @@ def run(argv: Sequence[str]) -> int:
     if hidden and not args.all:
         print(f"and {hidden} more of the same kinds; --all prints them")
     bad = sum(finding.state == "bad" for finding in findings)
-    verdict = f"{bad} problem{'s stand' if bad != 1 else ' stands'} against training"
+    verdict = f"{bad} problem{'s' if bad != 1 else ''} to fix before training"
     print(verdict if bad else "ready to train")
     return 1 if bad else 0
 

@@ -24,13 +24,13 @@ class Args:
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """The folder to make."""
     seed: int = 0
-    """Of textures, places, camera jitter and noise; the same seed gives the same bytes."""
+    """Seed of textures, places, camera jitter and noise; the same seed gives the same bytes."""
     views: int = 60
-    """Photographs."""
+    """Number of photographs."""
     width: int = 320
-    """Of a photograph, px."""
+    """Width of a photograph, px."""
     height: int = 240
-    """Of a photograph, px."""
+    """Height of a photograph, px."""
     overwrite: bool = False
     """Replace an existing folder."""
 

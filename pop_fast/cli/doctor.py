@@ -96,7 +96,7 @@ class Args:
     lpips_vgg: tuple[str, ...] = ()
     """Also read these LPIPS weights on VGG16: one merged file, or backbone and linear layers."""
     lpips_alex: tuple[str, ...] = ()
-    """Also read these LPIPS weights on AlexNet, likewise."""
+    """Also read these LPIPS weights on AlexNet, in the same form."""
 
 
 def run(argv: Sequence[str]) -> int:
@@ -112,7 +112,7 @@ def run(argv: Sequence[str]) -> int:
         fix = f"  ->  {finding.fix}" if finding.fix else ""
         print(f"  {marks[finding.state]:<9}{finding.name:<{width}}{finding.found}{fix}")
     missing = [finding.name for finding in findings if finding.state == "missing"]
-    print(f"missing: {', '.join(missing)}" if missing else "everything that pop needs is here")
+    print(f"missing: {', '.join(missing)}" if missing else "everything that pop needs is installed")
     return 1 if missing else 0
 
 
@@ -166,7 +166,7 @@ def cuda_build() -> DoctorLine:
         version = ".".join(map(str, nvcc_version(nvcc)))
     except (BuildError, RuntimeError, OSError) as error:
         return DoctorLine("CUDA build", "off", f"{error} (optional)")
-    return DoctorLine("CUDA build", "ok", f"nvcc {version} at {nvcc}, cmake and nanobind are here")
+    return DoctorLine("CUDA build", "ok", f"nvcc {version} at {nvcc}, cmake and nanobind are installed")
 
 
 def lpips(args: Args) -> Iterator[DoctorLine]:

@@ -46,9 +46,9 @@ class Args(CaptureArguments):
     lpips_vgg: tuple[str, ...] = field(default=())
     """Weights of LPIPS on VGG16: one merged file, or backbone and linear layers."""
     lpips_alex: tuple[str, ...] = field(default=())
-    """Weights of LPIPS on AlexNet, likewise."""
+    """Weights of LPIPS on AlexNet, in the same form."""
     per_view: bool = False
-    """Print a line a view."""
+    """Print one line for each view."""
 
 
 def run(argv: Sequence[str]) -> int:
@@ -82,7 +82,7 @@ def measured(splat: Splat, options: CaptureOptions, nets: Sequence[LPIPS]) -> tu
     capture, config = open_with_bars(splat, options, "held out")
     views = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
     if not views:
-        raise PopError(f"{capture.name}: holds no view out; give --test-every 8 or another number over 0")
+        raise PopError(f"{capture.name}: no view is held out; give --test-every 8 or another number over 0")
     small = too_small(views)
     if small is not None:
         raise PopError(f"{capture.name}: {small}; use larger images (a lower --factor)")

@@ -25,7 +25,7 @@ _EXAMPLES: Final = """
     pop explain out/scene_pop --view 3 --pixel 120,80                     the table
     pop explain out/scene_pop --view 3 --pixel 120,80 --html why.html     and a page with pictures and maps
     pop explain a.ply --capture scene --view IMG_7.jpg --maps maps        the maps alone, one PNG each
-    pop explain out/scene_pop --view 3 --pixel 120,80 --diff paper inria  where two profiles or backends part
+    pop explain out/scene_pop --view 3 --pixel 120,80 --diff paper inria  where two profiles or backends differ
 """
 
 
@@ -38,7 +38,7 @@ class Args(CaptureArguments):
     view: Annotated[str, tyro.conf.arg(metavar="INDEX|NAME")]
     """A view of the capture: its place by file name, from 0, or the name itself."""
     pixel: Annotated[str | None, tyro.conf.arg(metavar="X,Y")] = None
-    """The pixel: column and row, from 0 at the upper left. Only maps alone need none."""
+    """The pixel: column and row, from 0 at the upper left. Not needed for maps alone."""
     profile: Annotated[str | None, tyro.conf.arg(metavar=f"{{{','.join(PROFILES)}}}")] = None
     """The rasterizer's constants; by default as in training."""
     objective: Literal["run", "pop", "3dgs"] = "run"
@@ -54,7 +54,7 @@ class Args(CaptureArguments):
     diff: Annotated[tuple[str, str] | None, tyro.conf.arg(metavar="A B")] = None
     """Also compare two profiles or backends (fast, compiled, ref, cuda) on the view and at the pixel."""
     overwrite: bool = False
-    """Replace the folder of maps when it is there."""
+    """Replace the folder of maps if it exists."""
 
 
 def run(argv: Sequence[str]) -> int:

@@ -46,10 +46,10 @@ class Args(LimitOptions, CaptureArguments):
     splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|FILE")]
     """What to export."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE|DIR")] = None
-    """Where to: a file whose name says the format, or with --layout inria a new folder; by default a file beside here
+    """Where to: a file whose name says the format, or with --layout inria a new folder; by default a file here
     with the name of what is exported."""
     to: FormatName | None = None
-    """The format, where the name does not say it; "spz" is its version 3, which most programs read, "spz-4" the latest
+    """The format, if the name does not show it; "spz" is its version 3, which most programs read, "spz-4" the latest
     version, and "gltf-spz" glTF with an SPZ stream, a draft."""
     layout: Literal["file", "inria"] = "file"
     """"inria" writes point_cloud/, cameras.json, cfg_args, and held-out renders, as many tools expect."""
@@ -58,7 +58,7 @@ class Args(LimitOptions, CaptureArguments):
     drop_invisible: bool = False
     """Leave out Gaussians with opacity under 1/255: no renderer shows them."""
     overwrite: bool = False
-    """Replace the file, or the folder where it holds nothing but an earlier export."""
+    """Replace the file, or a folder that holds only an earlier export."""
 
 
 def run(argv: Sequence[str]) -> int:
@@ -124,7 +124,7 @@ class _Opened:
 def planned_file(args: Args) -> tuple[Path, str]:
     """Return the file to write and its format, which must agree."""
     if args.out is None and args.to is None:
-        raise PopError("nothing says what to write; give --out FILE or --to FORMAT")
+        raise PopError("nothing to write; give --out FILE or --to FORMAT")
     if args.out is None:
         stem = args.splat.resolve().name
         out = Path(file_name(stem if args.splat.is_dir() else stem.split(".")[0], str(args.to)))
@@ -138,7 +138,7 @@ def planned_file(args: Args) -> tuple[Path, str]:
 
 
 def file_name(stem: str, to: str) -> str:
-    """Return the name of a file in a format that `--to` takes, where nobody names it."""
+    """Return the name of a file in a format that `--to` takes, if it is not given."""
     from pop_fast.io.formats import default_name
 
     return f"{stem}.html" if to == HTML else default_name(stem, to)
@@ -150,7 +150,7 @@ def file_format(out: Path, to: str | None) -> str:
 
     is_page = out.suffix.lower() in (".html", ".htm")
     if is_page != (to == HTML) and to is not None:
-        raise PopError(f"{out}: a page ends in .html, and --to {to} was asked for; let them agree")
+        raise PopError(f"{out}: a page ends in .html, but --to is {to}; make them agree")
     return HTML if is_page else named_format(out, to)
 
 
@@ -163,7 +163,7 @@ def note_lost_frame(out: Path, name: str, frame: Frame | None) -> None:
     from pop_fast.io.formats import loses_frame
 
     if loses_frame(name, frame):
-        what = f"{name} has no room to say that it is in the training frame"
+        what = f"{name} cannot record that it is in the training frame"
         print(f"note: {out}: {what}; commands that read it need --training-frame", file=sys.stderr)
 
 
@@ -172,7 +172,7 @@ def check_file(out: Path, source: Path, overwrite: bool) -> None:
     if out.is_dir():
         raise PopError(f"{out}: a folder of this name is in the way; choose another --out")
     if out.exists() and source.exists() and out.samefile(source):
-        raise PopError(f"{out}: is the splat that is read; choose another --out")
+        raise PopError(f"{out}: is the input file; choose another --out")
     if out.exists() and not overwrite:
         raise PopError(f"{out}: exists; pass --overwrite or another --out")
     check_place(out)
@@ -244,7 +244,7 @@ EXPORTS: Final = "export"
 
 @dataclass(frozen=True, kw_only=True)
 class FinishOptions(LimitOptions):
-    """What is written beside the results.
+    """What is written next to the results.
 
     Attributes:
         export: also write the splat in these formats into the result's folder export, in the capture's own frame. The
@@ -262,12 +262,12 @@ class FinishOptions(LimitOptions):
 def finish(folder: Path, capture: Capture, options: Any) -> int:
     """Write what surrounds a run whose results are complete; see `after_results`."""
     own = FinishOptions(**{f.name: getattr(options, f.name) for f in fields(FinishOptions)})
-    left = f"the results in {folder} are complete, and pop export {folder} writes files of them"
+    left = f"the results in {folder} are complete; pop export {folder} writes the files"
     return after_results(lambda: _finish(folder, capture, own), "writing exports", "", left)
 
 
 def after_results(write: Callable[[], object], doing: str, failed: str, left: str) -> int:
-    """Write something beside results that are complete, which they stay whatever becomes of it.
+    """Write something next to results that are complete, which they stay whatever becomes of it.
 
     Returns:
         The exit status: 0, or 1 where it could not be written, or 130 after Ctrl-C.

@@ -27,7 +27,7 @@ class Args:
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """The folder to make; by default VIDEO's name with _frames."""
     count: int = 150
-    """Photographs that are wanted."""
+    """Number of photographs."""
     max_size: int = 0
     """Longest side of the photographs, px; 0 leaves them as they are."""
     overwrite: bool = False

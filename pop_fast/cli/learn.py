@@ -17,8 +17,8 @@ _EXAMPLES: Final = """
     pop learn start mine           write thirteen files to fill in
     pop learn check alpha          judge one of them, in seconds
     pop learn check --all          judge all of them, with a score; --json for a program that reads it
-    pop learn map                  the pipeline, and the picture that it draws as it stands
-    pop learn train                when all is written: train with your own code
+    pop learn map                  the pipeline, and the picture that it draws so far
+    pop learn train                at the end: train with your own code
     pop learn train --picture me.jpg
     pop learn class submissions    a table of a class, one folder a student
 """
@@ -43,7 +43,7 @@ class Check:
     folder: Folder = Path("mine")
     """Your files."""
     answer: bool = False
-    """Show the oracle's code: at once if the stage has passed, else when asked for the second time."""
+    """Show the oracle's code: at once if the stage has passed, else at the second request."""
     all: bool = False
     """Judge every stage, and count the functions that are right."""
     json: bool = False
@@ -69,19 +69,19 @@ class Train:
     picture: Path | None = None
     """A picture to fit instead of the toy; its middle square is taken."""
     scene: Path | None = None
-    """A capture to fit instead of the toy, as `pop train` takes it; one view in eight is put aside and judged by."""
+    """A capture to fit instead of the toy, as `pop train` takes it; one view in eight is held out."""
     steps: int = 120
-    """How many; the usual number takes some minutes in plain NumPy."""
+    """How many; the default takes some minutes in plain NumPy."""
     out: Path | None = None
-    """Photograph and render side by side; DIR/trained.png if not given. Beside it a film, which browsers play."""
+    """Photograph and render side by side; DIR/trained.png if not given. A film for browsers is written next to it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Class:
-    """Grade a class, every submission in a process of its own; a submission is a program and runs with your rights."""
+    """Grade a class, every submission in its own process; a submission is a program and runs with your rights."""
 
     folder: Folder
-    """One folder a student in it, each with files of the course."""
+    """A folder with one folder for each student, with files of the course."""
     seconds: float = 300.0
     """How long one submission may take."""
     out: Path | None = None
@@ -139,7 +139,7 @@ def _class(args: Class) -> int:
 
 
 def _graded_apart(folder: Path, seconds: float) -> dict[str, Any]:
-    """Grade a submission in a process of its own, which may take so long."""
+    """Grade a submission in its own process, which may take so long."""
     from pop_fast.children import module_command
     from pop_ref.learn.grading import read_grade, stopped
 
@@ -152,7 +152,7 @@ def _graded_apart(folder: Path, seconds: float) -> dict[str, Any]:
     if grade is not None:
         return grade
     if done.returncode == 0:
-        return stopped("what it prints cannot be told from a grade")
+        return stopped("its output cannot be distinguished from a grade")
     last = (done.stderr.strip().splitlines() or [""])[-1]
     return stopped(f"it ended with status {done.returncode}: {last}".rstrip(": "))
 

@@ -238,7 +238,7 @@ def _fit_seen(left: Limited, limits: LimitOptions, output: Output, shown: Shown,
     left.said.append(_quality(tuner, found, output))
 
 
-_NOT_TUNED: Final = "not fine-tuned: what the run has learned of its photographs is in its checkpoints alone"
+_NOT_TUNED: Final = "not fine-tuned: only the checkpoints hold what the run learned of its photographs"
 
 
 @contextmanager
@@ -251,7 +251,7 @@ def _told() -> Iterator[Callable[[int, int, float | None], None]]:
             nonlocal told
             if seconds is not None and not told:
                 told = True
-                print(f"fine-tuning: about {duration(seconds)}; --fine-tune-steps 0 leaves it out", flush=True)
+                print(f"fine-tuning: about {duration(seconds)}; --fine-tune-steps 0 skips it", flush=True)
             progress("fine-tuning", done, planned)
 
         yield report

@@ -1,6 +1,6 @@
 """`pop render`: held-out views as pictures, or a camera path as pictures or a video.
 
-Beside the pictures lies renders.json: what was rendered, and which file shows which view. It is also how a folder of
+Next to the pictures is renders.json: what was rendered, and which file shows which view. It is also how a folder of
 pictures is known as this command's own, so that --overwrite replaces nothing else.
 """
 
@@ -46,11 +46,11 @@ class Args(CaptureArguments):
     """"views" are the held-out views; the next three are paths made from the training cameras, of which "orbit" goes as
     far round as these stand; a file is a path that 'pop view' recorded."""
     frames: int = 120
-    """Frames of a path."""
+    """Number of frames of a path."""
     fps: float = 30.0
-    """Frames a second of a video."""
+    """Frames per second of a video."""
     overwrite: bool = False
-    """Replace the video, and the folder where it holds nothing but an earlier render."""
+    """Replace the video, and a folder that holds only an earlier render."""
 
 
 def run(argv: Sequence[str]) -> int:
@@ -100,7 +100,7 @@ def check_path(path: str) -> None:
     if not Path(path).is_file():
         names = ", ".join(("views", *PATHS))
         raise PopError(
-            f"path is '{path}', which is no file; give --path one of {names}, or a file that 'pop view' saved"
+            f"path is '{path}', which is not a file; give --path one of {names}, or a file that 'pop view' saved"
         )
     from pop_fast.view.live import read_path
 

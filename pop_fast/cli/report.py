@@ -24,7 +24,7 @@ class Args(CaptureArguments):
     result: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT")]
     """A folder that 'pop train' wrote."""
     check: bool = False
-    """Render and measure what the report shows besides the results; needs the capture."""
+    """Also render and measure what only the report shows; needs the capture."""
 
 
 def run(argv: Sequence[str]) -> int:

@@ -26,15 +26,15 @@ class Args:
     photos: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PHOTOS")]
     """The folder with the photographs."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
-    """Make a capture here; without it, sparse/0 is written beside the photographs."""
+    """Make a capture here; by default sparse/0 is written next to the photographs."""
     max_size: int = SfmOptions.max_size
-    """Longest side at which features are looked for, px."""
+    """Longest side of the images in the search for features, px."""
     camera_model: str = SfmOptions.camera_model
     """COLMAP's name of the lens model: SIMPLE_RADIAL, OPENCV, OPENCV_FISHEYE, ..."""
     single_camera: bool | None = SfmOptions.single_camera
-    """All photographs share one camera; by default when they are all of one size."""
+    """All photographs share one camera; by default if all have the same size."""
     matcher: Literal["auto", "exhaustive", "sequential"] = SfmOptions.matcher
-    """Compare all photographs with all, or each with its neighbours by name; "auto" compares up to 60 with all."""
+    """Compare all pairs of photographs, or each with its neighbours by name; "auto" compares up to 60 with all."""
     seed: int = SfmOptions.seed
     """Of every random choice."""
     overwrite: bool = False

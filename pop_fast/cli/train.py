@@ -56,21 +56,21 @@ if TYPE_CHECKING:
     from pop_fast.train.training_run import TrainingRun
 
 _EXAMPLES: Final = """
-    pop train photos                         size and schedule by what is there; results in out/photos_pop
-    pop train walk.mp4 --minutes 10          a video, or photos.zip; about so long
+    pop train photos                         chooses size and schedule; results in out/photos_pop
+    pop train walk.mp4 --minutes 10          a video, or photos.zip; about ten minutes
     pop train scene --preset paper           POP as published: 30,000 steps, photographs as they are
-    pop train scene --preset quick           1,500 steps at rates of their own, for a first look
+    pop train scene --preset quick           1,500 steps at its own rates, for a first look
     pop train scene --method gsplat          the control: gsplat's default strategy, with opacity reset
     pop train scene --method 3dgs            Inria's constants, learning rates, SSIM and rasterizer
     pop train scene --method taming          or pup, mini-splatting, speedy-splat: the paper's other methods
     pop train scene --out out/a --resume     continue from the last checkpoint
     torchrun --nproc-per-node 4 --no-python pop train scene --batch-size 4
-                                             four processes, a view of each step for each
-    pop train scene --backend fast           on the CPU, also where a GPU is
+                                             four processes, each with one view of every step
+    pop train scene --backend fast           on the CPU, even with a GPU
     pop train scene --export sog html        also as a small file and as a page, in out/scene_pop/export
     pop train scene --view                   watch it in the browser while it runs
     pop train city --blocks 3x2              in blocks of the ground, for a capture larger than memory
-    pop train scene --pop.lambda-pop 0.01    any setting, taken as it is; --help-all lists them all
+    pop train scene --pop.lambda-pop 0.01    any setting; --help-all lists them all
 """
 
 # settings that --help shows; --help-all shows the rest
@@ -289,7 +289,7 @@ def report(folder: Path) -> int:
 
         print(f"report: {write_report(folder)}")
 
-    left = f"the results in {folder} are complete, and pop report {folder} writes it"
+    left = f"the results in {folder} are complete; pop report {folder} writes the report"
     return after_results(write, "writing the report", "the report could not be written: ", left)
 
 

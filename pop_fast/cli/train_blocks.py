@@ -36,7 +36,7 @@ def check_blocks(config: TrainConfig, options: Any) -> None:
 
     _job(config, options)
     if "WORLD_SIZE" in os.environ:
-        raise PopError("--blocks starts processes of its own, one a block; start it without torchrun")
+        raise PopError("--blocks starts its own processes, one for each block; start it without torchrun")
     if options.view:
         raise PopError(
             "--view shows one training, and --blocks trains several; leave it out, and see the result with pop view"
@@ -44,15 +44,15 @@ def check_blocks(config: TrainConfig, options: Any) -> None:
     if config.exposure or config.refine_cameras:
         name = "--exposure" if config.exposure else "--refine-cameras"
         raise PopError(
-            f"{name} learns of a photograph in every block that it trains, and blocks would not agree on it and so not "
+            f"{name} would learn other values in every block that has a photograph, and so blocks would not "
             "fit together; leave it out with --blocks"
         )
     for name in _NEED_ALL:
         if getattr(options, name) not in (None, False):
             option = "--" + name.replace("_", "-")
             raise PopError(
-                f"{option} looks at all training photographs, which are not in memory when blocks are merged; leave it "
-                f"out with --blocks, and say it to pop export {config.result_dir}"
+                f"{option} needs all training photographs, which are not in memory when blocks are merged; leave it "
+                f"out with --blocks, and give it to pop export {config.result_dir}"
             )
     if options.blocks_profile is not None:
         profile_folder(options.blocks_profile)
@@ -60,8 +60,8 @@ def check_blocks(config: TrainConfig, options: Any) -> None:
         raise PopError(f"--blocks-jobs is {options.blocks_jobs}; it must be 1 or more")
     if options.blocks_jobs > 1 and not has_snakemake():
         raise PopError(
-            "--blocks-jobs over 1 needs Snakemake, which trains blocks at the same time; pip install "
-            "'pop-splatting[blocks]' brings it, or leave the option out: they are trained one after the other"
+            "--blocks-jobs over 1 needs Snakemake; install it with pip install 'pop-splatting[blocks]', or leave the "
+            "option out to train the blocks one after another"
         )
 
 
@@ -69,7 +69,7 @@ def _check_without(config: TrainConfig, options: Any) -> None:
     for field in fields(BlocksOptions):
         if getattr(options, field.name) != field.default:
             option = "--" + field.name.replace("_", "-")
-            raise PopError(f"{option} says how blocks are trained, and there are none; say --blocks 2x2 too")
+            raise PopError(f"{option} needs blocks; add --blocks 2x2")
     if options.resume:
         from pop_fast.blocks.plan import read_job
 
@@ -87,7 +87,7 @@ def _job(config: TrainConfig, options: Any) -> Job:
     if rounds is None:
         rounds = DEFAULT_ROUNDS if begun is None else begun.rounds
     if steps is not None and rounds == 0:
-        raise PopError(f"--blocks-round-steps is {steps}, and there are no rounds; say --blocks-rounds 1 too")
+        raise PopError(f"--blocks-round-steps is {steps}, but there are no rounds; add --blocks-rounds 1")
     if steps is None:
         steps = (
             begun.round_steps if begun is not None and begun.rounds else max(round(config.max_steps * ROUND_SHARE), 1)

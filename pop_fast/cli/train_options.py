@@ -72,8 +72,8 @@ _ALIASES: Final = {
     "--iterations": "--max-steps",
 }
 _SMALLER: Final = (
-    "--factor 2 (4, 8) trains on photographs shrunk by so much; --sfm.max-size is only how large they are while "
-    "cameras are searched for"
+    "--factor 2 (4, 8) trains on photographs shrunk by that factor; --sfm.max-size only limits their size in the "
+    "search for cameras"
 )
 # of which the nearest option by its letters is another thing
 _ELSEWHERE: Final = dict.fromkeys(("--max-size", "--resolution", "-r", "--downscale", "--downscale-factor"), _SMALLER)
@@ -94,7 +94,7 @@ def rename_aliases(argv: Sequence[str]) -> list[str]:
         name, equals, value = word.partition("=")
         name = name.replace("_", "-") if name.startswith("--") else name
         if name in _ELSEWHERE:
-            raise PopError(f"{name} is no option of pop train; {_ELSEWHERE[name]}")
+            raise PopError(f"{name} is not an option of pop train; {_ELSEWHERE[name]}")
         target = _ALIASES.get(name)
         if name in _IGNORED:
             continue
@@ -184,8 +184,8 @@ def about_large(capture: Capture, config: TrainConfig) -> str | None:
     view = max(capture.views, key=lambda view: view.width * view.height)
     shrink = math.ceil(max(view.width, view.height) / _USUAL_SIDE)
     return (
-        f"the photographs are up to {view.width}x{view.height} px, and every step draws one: seconds a step on a CPU "
-        f"(the time left is told after the first ones); --factor {config.factor * shrink} takes about "
+        f"the photographs are up to {view.width}x{view.height} px, so a step takes seconds on a CPU "
+        f"(the time left is shown after the first steps); --factor {config.factor * shrink} takes about "
         f"1/{shrink**2} of the time, at {round(view.width / shrink)}x{round(view.height / shrink)} px"
     )
 
@@ -200,7 +200,7 @@ def notes_before(capture: Capture, config: TrainConfig) -> Iterator[str]:
 
 
 def takes_hours(config: TrainConfig) -> bool:
-    """Tell whether a CPU is given the paper's schedule by nobody's word: neither a preset nor steps were said."""
+    """Tell whether a CPU is given the paper's schedule by default: neither a preset nor steps were given."""
     given = config.given
     said = given is None or given.steps_scaler is not None or "max_steps" in given.settings
     return not said and config.preset == "paper" and not on_gpu(config)

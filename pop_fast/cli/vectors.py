@@ -14,7 +14,7 @@ from pop_fast.io.atomic import folder_atomically
 
 _EXAMPLES: Final = """
     pop vectors export vectors             scenes with expected images and gradients; vectors/index.json explains them
-    pop vectors check vectors my_results   hold the results of a port to them
+    pop vectors check vectors my_results   compare the results of a port with them
 """
 
 
@@ -84,5 +84,9 @@ def _check(args: Check) -> int:
         if names:
             more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
             print(f"{title}, not judged: {', '.join(names[:_NAMED])}{more}")
-    print(f"{len(found.failed)} of {len(found.verdicts)} arrays fail" if found.failed else "all that is there passes")
+    print(
+        f"{len(found.failed)} of {len(found.verdicts)} arrays fail"
+        if found.failed
+        else "all arrays that are there pass"
+    )
     return 1 if found.failed else 0

@@ -41,7 +41,7 @@ class Args(CaptureArguments):
     host: str = "127.0.0.1"
     """The address to listen on; 0.0.0.0 shows it, unencrypted, to other machines that know the whole address too."""
     port: int = 8080
-    """The port; where it is taken, the next free one."""
+    """The port; if it is taken, the next free one."""
 
 
 def run(argv: Sequence[str]) -> int:
@@ -109,7 +109,7 @@ def announce(viewer: LiveViewer) -> None:
 
     print(f"viewer: {viewer.url}", flush=True)
     if viewer.host not in LOOPBACK:
-        print("note: whoever has this address and reaches it sees the splat and its photographs", flush=True)
+        print("note: anyone with this address who can reach it sees the splat and its photographs", flush=True)
 
 
 def check_address(host: str, port: int) -> None:

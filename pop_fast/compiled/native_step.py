@@ -164,7 +164,7 @@ class NativeTrainer:
         m, v: Adam's moments, likewise.
         threads: None takes torch's number.
         cache_mb: memory for what is made of photographs; the others' is made anew at every visit, to the same bits.
-        stop: whether somebody has asked for an end; a step that is being taken is then left, and changes nothing.
+        stop: whether a stop was requested; a step that is being taken is then left, and changes nothing.
         exposures: of the photographs, which learn with every step; None where none are learned.
     """
 
@@ -264,7 +264,7 @@ class NativeTrainer:
         return pairs[:n].clone()
 
     def run(self, until: int, phase: Phase) -> None:
-        """Take steps until the counter stands at `until`, all of one phase, or until somebody has asked for an end.
+        """Take steps until the counter stands at `until`, all of one phase, or until a stop was requested.
 
         Raises:
             ValueError: a Gaussian is no longer finite; the message names its row and step.

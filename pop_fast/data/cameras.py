@@ -222,7 +222,7 @@ def require_colmap() -> Any:
             signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
     except ImportError as error:
         raise CaptureError(
-            f"pycolmap cannot be imported ({error}), which finds cameras and reads all with distortion; pip install "
+            f"pycolmap, which finds cameras and reads those with distortion, cannot be imported ({error}); pip install "
             f"pycolmap, or use photographs of known cameras of the models {', '.join(PINHOLES)}"
         ) from error
     return pycolmap

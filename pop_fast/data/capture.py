@@ -344,7 +344,7 @@ def _from_cameras(viewmats: np.ndarray) -> np.ndarray:
     distance = float(np.median(np.linalg.norm(centers - origin, axis=1)))
     spread = float(np.ptp(centers, axis=0).max())
     if spread <= 1e-9 * max(1.0, float(np.abs(centers).max())) or distance == 0.0:
-        raise CaptureError("all cameras stand at one place; a scene can only be made from photographs that moved")
+        raise CaptureError("all cameras are at one place; a scene needs photographs from different places")
     transform = np.eye(4)
     transform[:3, :3] = turn / distance
     transform[:3, 3] = -origin / distance

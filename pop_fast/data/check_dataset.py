@@ -120,7 +120,7 @@ def about_spacing(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:
         first, second = sorted((k, int(nearest[k])))
         gap = f"{degrees[k]:.0f} degrees between {shots[first].name} and {shots[second].name}"
         gaps.setdefault((first, second), gap)
-    apart = f"neighbours {median:.1f} degrees apart as the subject sees them (median)"
+    apart = f"neighbours {median:.1f} degrees apart as seen from the subject (median)"
     if median <= FAR_APART:
         yield ok("spacing", f"{apart}; at most {next(iter(gaps.values()))}")
         return
@@ -145,7 +145,7 @@ def about_photos(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding
             yield from _about_size(photo)
     turned = sum(photo.shot.turns > 0 for photo in photos)
     if turned:
-        yield ok("EXIF", f"{turned} are stored turned and shown upright, as pop sfm noted")
+        yield ok("EXIF", f"{turned} are stored rotated and shown upright, as pop sfm noted")
     rotated = [photo.shot.name for photo in photos if photo.rotated and not photo.shot.turns]
     if rotated:
         note = "the pixels are used as stored, as COLMAP does; poses must have been made so too"
@@ -191,7 +191,7 @@ def about_masks(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding]
             yield bad("masks", str(error))
     if not kept:
         if folder.is_dir():
-            yield bad("masks", f"{folder} holds none named as a photograph (<name>.png or <name>.jpg.png)")
+            yield bad("masks", f"{folder} holds none named like a photograph (<name>.png or <name>.jpg.png)")
         return
     mean = float(np.mean(kept))
     text = f"{len(kept)} masks keep {100 * mean:.0f} % of the pixels (white = keep)"
@@ -244,7 +244,7 @@ def about_reprojection(root: Path) -> Iterator[CaptureFinding]:
     # COLMAP holds tracks against each other, and says what does not agree by errors of many kinds, without a file
     except Exception as problem:
         words = " ".join(str(problem).split())
-        fix = "training does without its tracks; write the model again to have them"
+        fix = "training ignores its tracks; write the model again to use them"
         yield warn("reprojection", f"{model}: COLMAP cannot read its tracks ({words}); {fix}")
         return
     if observations == 0:
@@ -306,4 +306,4 @@ def about_bare(root: Path, shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
         yield warn("photographs", left)
     turned = sum(one.exif.orientation in (3, 6, 8) for one in sound)
     if turned:
-        yield ok("EXIF", f"{turned} are stored turned; what is trained on is upright")
+        yield ok("EXIF", f"{turned} are stored rotated; training uses them upright")

@@ -1,8 +1,8 @@
-"""Read the cameras that other programs have written beside the photographs.
+"""Read the cameras that other programs have written next to the photographs.
 
 transforms.json is nerfstudio's, instant-ngp's and Blender's (`transforms_train.json` and its siblings). Poses are
 camera-to-world in OpenGL's axes (+x right, +y up, -z forward); their y and z columns are negated for OpenCV's.
-`applied_transform` is already part of the poses and of the points that nerfstudio writes beside them, so both are used
+`applied_transform` is already part of the poses and of the points that nerfstudio writes next to them, so both are used
 as they stand.
 
 Polycam's raw export: `keyframes/corrected_cameras/<time>.json`, else `keyframes/cameras`. The corrected cameras are
@@ -64,7 +64,7 @@ def photographs_of_polycam(root: Path) -> Path | None:
 
 
 def read_polycam(folder: Path, root: Path, images: str) -> tuple[list[PosedImage], list[str]]:
-    """Read every camera of an export, sorted by name; its photographs are in a folder of its own, not in `images`."""
+    """Read every camera of an export, sorted by name; its photographs are in its own folder, not in `images`."""
     del images
     photos = folder.parent / dict(_FOLDERS)[folder.name]
     relative = photos.relative_to(root).as_posix()
@@ -397,7 +397,7 @@ def find_transforms(folder: Path) -> list[Path]:
 
 
 def read_transforms(paths: list[Path]) -> tuple[list[PosedImage], SparsePoints | None]:
-    """Read cameras and poses of what `find_transforms` found, and the points beside them.
+    """Read cameras and poses of what `find_transforms` found, and the points next to them.
 
     Returns:
         One shot for every listed frame, sorted by name, and the points of `ply_file_path`, of `sparse_pc.ply` or of

@@ -82,14 +82,14 @@ def about_unplaced(folder: Path, shots: Sequence[PosedImage]) -> tuple[int, list
 
 def about_random_points(views: Sequence[View], made: int, wanted: int) -> list[str]:
     """Tell where random points can be expected to be poor: too few, or between cameras that all look away."""
-    fix = "bring points: run pop sfm on the photographs, or name a PLY file as ply_file_path"
+    fix = "add points: run pop sfm on the photographs, or name a PLY file as ply_file_path"
     length = float(np.linalg.norm(np.mean([view.viewmat[2, :3] for view in views], axis=0)))
     if length > _SAME_WAY:
         return [
-            f"all cameras look about the same way, so the {made:,} random points lie near them, not on the scene; {fix}"
+            f"all cameras look about the same way, so the {made:,} random points are near them, not on the scene; {fix}"
         ]
     if made < wanted:
-        return [f"only {made:,} of {wanted:,} random points lie where two cameras look; {fix}"]
+        return [f"only {made:,} of {wanted:,} random points are where two cameras look; {fix}"]
     return []
 
 
@@ -286,9 +286,7 @@ def _from_photos(root: Path, images: str | None, sfm: bool | SfmOptions, progres
     photos = photo_folder(root)
     if not sfm:
         count = len(photographs(photos))
-        raise CaptureError(
-            f"{root}: has {count} photographs but nothing says where they were taken; run pop sfm {root} first"
-        )
+        raise CaptureError(f"{root}: has {count} photographs but no cameras; run pop sfm {root} first")
     start = time.perf_counter()
     options = sfm if isinstance(sfm, SfmOptions) else SfmOptions()
     found = run_sfm(photos, root, progress=progress, **asdict(options))

@@ -163,20 +163,20 @@ def _about_camera(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     kinds = Counter(one.exif.camera for one in shown if one.exif.camera)
     lenses = Counter(round(one.exif.focal, 1) for one in shown if one.exif.focal)
     if not kinds and not lenses:
-        yield ok("EXIF", "no camera noted its lens or its exposure")
+        yield ok("EXIF", "no photograph records its lens or exposure")
         return
     named = ", ".join(f"{count} x {kind}" for kind, count in kinds.most_common(3))
     focal = ", ".join(f"{mm:g} mm" for mm, _ in lenses.most_common(4))
     text = f"{named or 'no camera named'}{f'; focal length {focal}' if focal else ''}"
     without = [one.name for one in shown if not one.exif.focal]
     if without:
-        fix = "where photographs were edited, use the originals: cameras are found more surely from a known lens"
+        fix = "where photographs were edited, use the originals: cameras are found more reliably with a known lens"
         yield warn(
             "EXIF",
             f"{len(without)} {number(len(without), 'has', 'have')} no focal length, {some(without)}; {fix}",
         )
     if len(kinds) > 1 or len(lenses) > 1:
-        yield warn("EXIF", f"{text}: several lenses or zooms; one fixed lens is placed more surely")
+        yield warn("EXIF", f"{text}: several lenses or zooms; one fixed lens is placed more reliably")
     else:
         yield ok("EXIF", text)
 
@@ -188,10 +188,10 @@ def _about_blur(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     blurred = [one.name for one, median in zip(shown, around, strict=True) if one.sharpness < _BLURRED * median]
     if blurred:
         fix = "out of focus or shaken: leave them out"
-        what = f"{len(blurred)} {number(len(blurred), 'is', 'are')} far less sharp than those around them"
+        what = f"{len(blurred)} {number(len(blurred), 'is', 'are')} far less sharp than their neighbours"
         yield warn("blur", f"{what}, {some(blurred)}; {fix}")
     else:
-        yield ok("blur", "all about as sharp as those around them")
+        yield ok("blur", "all about as sharp as their neighbours")
 
 
 def _about_exposure(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
@@ -204,7 +204,7 @@ def _about_exposure(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
                 f"{len(names)} {number(len(names), 'is', 'are')} over a quarter pure {what}, {some(names)}",
             )
     stops = exposure_stops([one.exif for one in shown])
-    fix = "lock the exposure, or train with --exposure: without it training takes one brightness for all"
+    fix = "lock the exposure, or train with --exposure: without it training assumes one brightness for all"
     if stops is not None and stops > DRIFT_STOPS:
         yield warn("exposure", f"exposures differ by {stops:.1f} stops; {fix}")
     elif not dark and not bright:
@@ -282,8 +282,8 @@ def about_mixed_sizes(shown: Sequence[Shown]) -> CaptureFinding | None:
         return None
     listed = ", ".join(f"{count} of {w}x{h} px" for (w, h), count in sizes.most_common(3))
     more = f" and {len(sizes) - 3} more" if len(sizes) > 3 else ""
-    text = f"mixed cameras: the photographs have {len(sizes)} sizes ({listed}{more}), and each is taken as another lens"
-    return warn("cameras", f"{text}; one camera, not zoomed or cropped, is placed more surely")
+    text = f"mixed cameras: the photographs have {len(sizes)} sizes ({listed}{more}), each treated as another lens"
+    return warn("cameras", f"{text}; one camera, not zoomed or cropped, is placed more reliably")
 
 
 def _share_something(one: Shown, other: Shown) -> bool:

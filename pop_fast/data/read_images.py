@@ -7,7 +7,7 @@ the ratio of the two, each photograph by its own, and K of the shrunk image by t
 A photograph of any camera model becomes one of a pinhole camera with the same principal point. For a pixel centre p of
 the new image, d = K^-1 p is its ray and x = camera.img_from_cam(d) is where the photograph shows it; the new image is
 the photograph sampled there (bilinear, as COLMAP and gsplat). The new K keeps the principal point exactly and both
-focal lengths' ratio; one zoom factor is applied to them, the smallest one with which every new pixel lies inside the
+focal lengths' ratio; one zoom factor is applied to them, the smallest one with which every new pixel is inside the
 photograph. It is 1, and the photograph is returned as it is, bit for bit, where there is no distortion. Pixel centres
 are at +0.5, as COLMAP's are.
 """
@@ -119,12 +119,16 @@ def _locate(
             f"{fix_of_absent(root, absent, len(shots))}"
         )
     if masks and not options.part and not any(photo.mask for photo in photos):
-        raise CaptureError(f"{masks}: holds no mask named as a photograph (<name>.png or <name>.jpg.png); rename them")
+        raise CaptureError(
+            f"{masks}: holds no mask named like a photograph (<name>.png or <name>.jpg.png); rename them"
+        )
     notes = [f"{len(absent)} of {len(shots)} listed images are absent and were skipped"] if absent else []
     notes += _about_folders(root, shots, options)
     unmasked = [photo.path for photo in photos if photo.mask is None]
     if 0 < len(unmasked) < len(photos):
-        notes.append(f"{len(unmasked)} of {len(photos)} photographs have no mask and count whole, first {unmasked[0]}")
+        notes.append(
+            f"{len(unmasked)} of {len(photos)} photographs have no mask and count in full, first {unmasked[0]}"
+        )
     return photos, notes
 
 
@@ -149,7 +153,7 @@ def _about_folders(root: Path, shots: Sequence[PosedImage], options: PhotoOption
     names = ", ".join(sorted(f"{chosen}/" for chosen, _ in read if chosen))
     whose = f"the photographs of {names}" if names else "the photographs"
     if all(shrink == 1 for _, shrink in read):
-        return [f"{whose} are used, made smaller before; --images says otherwise"]
+        return [f"{whose} are used, which were shrunk earlier; --images chooses others"]
     return [f"{whose} are shrunk by {options.factor} here"]
 
 
@@ -421,7 +425,7 @@ def _fan(width: int, height: int, center: np.ndarray, steps: int = 48, along: in
 
 
 def _fits(fan: np.ndarray, center: np.ndarray, width: int, height: int) -> bool:
-    """Tell whether a fan's image lies inside the photograph and never turns back towards the centre.
+    """Tell whether a fan's image is inside the photograph and never turns back towards the centre.
 
     Without the second condition a polynomial that bends back far outside, as they all do somewhere, would look inside.
     """

@@ -1,6 +1,6 @@
 """Make a folder of photographs of what is none: the frames of a video, what a ZIP archive holds.
 
-The folder lies beside the file, and a later call finds it there, with the cameras that were found in it.
+The folder is next to the file, and a later call finds it there, with the cameras that were found in it.
 
 A video is cut into as many stretches of equal length as frames are wanted. Of each stretch the sharpest frame is
 taken, at least half a stretch after the one before; where it looks like the one before, none is. One pass over the
@@ -31,7 +31,7 @@ from pop_fast.io.read_back import PICTURE, check_members, check_memory
 _FIX = "unpack it yourself, and give the folder"
 # what the system says of a member's name that cannot be a file's
 _NAMES = (errno.ENAMETOOLONG, errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.EINVAL, errno.EILSEQ)
-# beside the photographs of an archive, what other systems have put there
+# next to the photographs of an archive, what other systems have put there
 _LEFT_OUT = ("__MACOSX", ".DS_Store", "Thumbs.db")
 
 
@@ -68,7 +68,7 @@ def _made_before(path: Path, target: Path) -> bool:
     if not target.is_dir() or not any(target.iterdir()):
         return False
     if target.stat().st_mtime < path.stat().st_mtime:
-        raise CaptureError(f"{target}: is older than {path}; remove the folder, and it is made again")
+        raise CaptureError(f"{target}: is older than {path}; remove the folder to have it made again")
     return True
 
 
@@ -201,7 +201,7 @@ def _open(path: Path) -> Any:
     with QUIET:
         video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not video.isOpened():
-        raise CaptureError(f"{path}: is no video that OpenCV can read; {_CONVERT}")
+        raise CaptureError(f"{path}: is not a video that OpenCV can read; {_CONVERT}")
     width, height = (int(video.get(size)) for size in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
     try:
         # as it is decoded, as it is handed over, and the sharpest so far

@@ -202,7 +202,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
             What happened to the Gaussians, or None where this is no step at which they change.
 
         Warns:
-            UserWarning: the loss of this step should have had the term of `regularizer`, which nobody has asked for.
+            UserWarning: the loss of this step should have had the term of `regularizer`, which was never called.
         """
         if self.regularizes(step) and _REGULARIZED not in info:
             warnings.warn(

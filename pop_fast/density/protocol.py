@@ -158,9 +158,9 @@ def dominant_counts(info: Info) -> Tensor:
     counts = info.get("dominant_counts")
     if counts is None:
         raise ValueError(
-            "info has no 'dominant_counts', which POP is built on: render with pop_fast.rasterization "
-            "(a drop-in for gsplat's), or put into info how many pixels, [cameras, Gaussians], each one dominates, "
-            "that is, has the largest blending weight at"
+            "info has no 'dominant_counts', which POP needs: render with pop_fast.rasterization "
+            "(a drop-in for gsplat's), or add to info, [cameras, Gaussians], the number of pixels in which each "
+            "Gaussian has the largest blending weight"
         )
     return counts
 

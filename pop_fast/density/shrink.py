@@ -79,7 +79,7 @@ def all_but_the_least(scores: Tensor, share: float) -> Tensor:
     Those with a score of 0 go in any case.
 
     Raises:
-        PopError: the share lies outside [0, 1).
+        PopError: the share is outside [0, 1).
     """
     if not 0.0 <= share < 1.0:
         raise PopError(f"--final-prune {share:g} must be in [0, 1)")

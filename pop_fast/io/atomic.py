@@ -1,8 +1,8 @@
-"""Write files and folders whole or not at all: beside the target first, flushed to the disk, then renamed over it.
+"""Write files and folders whole or not at all: next to the target first, flushed to the disk, then renamed over it.
 
 A rename within one folder is atomic on POSIX and Windows, so a reader, or a run resumed after SIGKILL, sees the old
 content or the new content and never a mixture. A folder with content is exchanged for another in one step where the
-system can, as Linux does. What a killed writer left beside the target carries its process id in its name and is swept
+system can, as Linux does. What a killed writer left next to the target carries its process id in its name and is swept
 away by the next write to the same target.
 """
 
@@ -81,7 +81,7 @@ def write_atomically(path: str | os.PathLike[str], writer: Callable[[BinaryIO], 
 
     Raises:
         PopError: the operating system refused (disk full, no permission, ...); names the file and what to do. The
-            target is then as it was, and nothing is left beside it. Errors of `writer` itself pass through, likewise.
+            target is then as it was, and nothing is left next to it. Errors of `writer` itself pass through too.
     """
     path = Path(path)
     with _beside(path) as partial:
@@ -97,7 +97,7 @@ def file_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Let a library that opens its file by name write one file whole or not at all; see `write_atomically`.
 
     Yields:
-        Where to write: a file of the same name in a hidden folder beside `path`, for libraries that read the ending.
+        Where to write: a file of the same name in a hidden folder next to `path`, for libraries that read the ending.
     """
     path = Path(path)
     with _beside(path) as partial:
@@ -130,7 +130,7 @@ def folder_atomically(
 
     Raises:
         PopError: `path` exists, is not an empty folder, and `overwrite` is not set or the folder must not be replaced;
-            or the operating system refused. `path` is then as it was. Errors of the block pass through, likewise.
+            or the operating system refused. `path` is then as it was. Errors of the block pass through too.
 
     Example:
         with folder_atomically(out, overwrite, keeps=[photos], recognise=lambda file: file.suffix == ".png") as folder:
@@ -244,7 +244,7 @@ def _partial(path: Path) -> Path:
 
 
 def _sweep(path: Path) -> None:
-    """Remove what writers of `path` that are no longer alive left beside it."""
+    """Remove what writers of `path` that are no longer alive left next to it."""
     prefix = f".{path.name}."
     for left in path.parent.iterdir():
         parts = left.name.removeprefix(prefix).split(".")

@@ -124,7 +124,7 @@ def find_image(folder: Path, name: str) -> Path | None:
     )
     if len(found) > 1:
         raise CaptureError(
-            f"{folder / name}: is absent, and both {found[0].name} and {found[1].name} could stand for it; remove one"
+            f"{folder / name}: is absent, and both {found[0].name} and {found[1].name} could be meant; remove one"
         )
     return found[0] if found else None
 
@@ -242,7 +242,7 @@ def _decode(path: Path) -> np.ndarray:
         raise CaptureError(f"{path}: {defect}; {FIX}")
     if size is None:
         # a size that nobody has seen is nobody's to judge, and OpenCV also decodes what no camera writes
-        raise CaptureError(f"{path}: is no image that states its size as PNG, JPEG, WebP, TIFF and BMP do; {FIX}")
+        raise CaptureError(f"{path}: is not an image that states its size like PNG, JPEG, WebP, TIFF and BMP do; {FIX}")
     try:
         # IMREAD_UNCHANGED keeps alpha and 16 bit, and leaves the EXIF orientation alone
         with QUIET:

@@ -175,7 +175,7 @@ def check_memory(path: Path | str, needed: int, packed: int, what: str, fix: str
     if needed > max(floor, _MOST_TIMES * packed):
         raise PopError(
             f"{path}: {what} would take {_mb(needed)} of memory to read, and the file has {_mb(packed)}, "
-            f"which holds no such content; {fix}"
+            f"too little for such content; {fix}"
         )
     free = free_bytes()
     if free is not None and needed > free:

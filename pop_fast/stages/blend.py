@@ -135,7 +135,7 @@ class Stop:
 def weights_of_alphas(alpha: Tensor, transmittances: Tensor, stop: Stop) -> Tensor:
     """Take a step's alphas off the light and return the weights; both are 0 from where a pixel stops.
 
-    T never grows, so that one comparison of all T with the stop finds what lies behind it, with no flag carried along.
+    T never grows, so that one comparison of all T with the stop finds what is behind it, with no flag carried along.
 
     Args:
         alpha: in and, where a pixel stops, out. [n, K, P]
@@ -307,7 +307,7 @@ class Blender:
                 for a, q_k in zip(reversed(alpha.unbind(1)), reversed(q.unbind(1)), strict=True):
                     q_k.sub_(behind)
                     behind.addcmul_(a, q_k)
-                # nothing lies behind a pixel that had stopped before this step
+                # nothing is behind a pixel that had stopped before this step
                 torch.ops.aten.threshold_backward.grad_input(behind, step.transmittance, 0.0, grad_input=behind)
                 release_buffer(step.transmittance)
                 yield step.blocks.view(-1), self._rows(entries, alpha, weight, q, v, absolute)

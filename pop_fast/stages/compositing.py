@@ -37,7 +37,7 @@ class Composite:
     n_blended: Tensor | None  # [H, W] int32, or None when not asked for
     # list entries visited, the terminating one included. [H, W] int32, or None when not asked for
     n_traversed: Tensor | None
-    n_pairs: int | None  # (entry, pixel) pairs evaluated, None where nobody counts them
+    n_pairs: int | None  # (entry, pixel) pairs evaluated, None if they are not counted
 
 
 def composite(

@@ -332,7 +332,7 @@ class PairWalk:
         )
 
     def offsets(self, pairs: Pairs) -> tuple[Tensor, Tensor]:
-        """Return how far every splat's centre lies from every pixel's, along x and y, px. [n, K, P] each"""
+        """Return how far every splat's centre is from every pixel's, along x and y, px. [n, K, P] each"""
         basis = self.blender.basis
         u, v = (t[pairs.rows].to(basis.dtype)[:, :, None] for t in (self.entries.u, self.entries.v))
         return u - basis[1], v - basis[2]

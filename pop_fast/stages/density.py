@@ -110,7 +110,7 @@ def lowest_share(scores: Tensor, share: float) -> Tensor:
     """See `pop_ref.selection.lowest_share`. [N] bool Optimizations: the threshold is selected, not sorted for.
 
     Raises:
-        ValueError: the share lies outside [0, 1], or a score is not a number.
+        ValueError: the share is outside [0, 1], or a score is not a number.
     """
     _check_share(share)
     bad = scores.isnan().nonzero()
@@ -125,7 +125,7 @@ def least_mass(importance: Tensor, share: float = 0.01) -> Tensor:
     """See `pop_ref.selection.least_mass`. [N] bool Optimizations: one sort.
 
     Raises:
-        ValueError: the share lies outside [0, 1], or an importance is negative or not finite.
+        ValueError: the share is outside [0, 1], or an importance is negative or not finite.
     """
     _check_share(share)
     importance = _checked_weights("importance", importance)
@@ -141,7 +141,7 @@ def sample_without_replacement(weights: Tensor, k: int, uniforms: Tensor) -> Ten
 
     Raises:
         ValueError: k is negative or more than the positive weights, a weight is negative or not finite, or a uniform
-            lies outside [0, 1).
+            is outside [0, 1).
     """
     weights = _checked_weights("weights", weights)
     if uniforms.shape != weights.shape:
@@ -210,7 +210,7 @@ _LUMA = (19595, 38470, 7471)
 
 
 def budget_at(nth: int, n: int, start: int, target: int) -> int:
-    """See `pop_ref.taming.budget_at`; ValueError where nth lies outside 0 to n, or there are none."""
+    """See `pop_ref.taming.budget_at`; ValueError where nth is outside 0 to n, or there are none."""
     if n < 1 or not 0 <= nth <= n:
         raise ValueError(f"nth is {nth} of {n}; it must be in 0 to n, and n >= 1")
     return start + (target - start) * (2 * n * nth - nth * nth) // (n * n)

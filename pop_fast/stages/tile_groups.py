@@ -8,7 +8,7 @@ The exponent of alpha is a matrix product over a tile's pixels (meaning: `pop_re
 
     alpha = o exp(-sigma) = 2^(f . p) with p = (1, x, y, x^2, xy, y^2) in pixels from the tile's centre
 
-and six coefficients f per (splat, tile). The constant and linear coefficients cancel for needles whose centre lies far
+and six coefficients f per (splat, tile). The constant and linear coefficients cancel for needles whose centre is far
 from the tile, so they are computed in float64 and rounded once; what is left within a tile is of the order of the
 exponent itself. The transpose needs the same six moments of G = alpha dL/dalpha, M = sum_p G p. Moved from the tile's
 centre to the splat's they can be added up over tiles, and every geometric gradient of the splat is linear in the sums.
@@ -122,7 +122,7 @@ class Entries:
 
     @classmethod
     def of(cls, means2d: Tensor, lists: PackedLists) -> Entries:
-        """Gather where each entry's splat lies, seen from its tile."""
+        """Gather where each entry's splat is, seen from its tile."""
         x, y = (_with_padding(t, 0.0).index_select(0, lists.ids) for t in columns(means2d))
         size, tile = lists.tile_size, lists.block_tiles
         row = torch.div(tile, lists.tiles_x, rounding_mode="floor")

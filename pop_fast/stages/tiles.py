@@ -102,7 +102,7 @@ def tile_lists(
     tile_x = left.to(torch.int32).index_select(0, splat) + k - row_of_rect * per_row
     tile_y = top.to(torch.int32).index_select(0, splat) + row_of_rect
     if conics is not None and opacities is not None:
-        # by way of the depth order, so that what is gathered for the entries lies close together
+        # by way of the depth order, so that what is gathered for the entries is close together
         shapes = [t.index_select(0, rows) for t in (*columns(means2d), *columns(conics), opacities)]
         touched = _touches(shapes, splat, tile_x, tile_y, tile_size, profile).nonzero().squeeze(1)
         splat, tile_x, tile_y = (t.index_select(0, touched) for t in (splat, tile_x, tile_y))

@@ -5,7 +5,7 @@ Meaning, names and shapes are those of `pop_ref.records`. A tensor is component-
 `columns` takes a tensor apart into components, and `from_columns` puts components together.
 
 Stages use elementwise operations only, never a matrix product over the N Gaussians: a product's rounding depends on how
-many columns it has, and then a Gaussian that nobody sees would change the bits of those that are seen.
+many columns it has, and then an invisible Gaussian would change the bits of those that are seen.
 """
 
 from __future__ import annotations

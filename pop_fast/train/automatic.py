@@ -1,9 +1,9 @@
-"""What a run without a preset does: size, length and terms, by what is there and how fast this machine is.
+"""What a run without a preset does: size, length and terms, by the photographs and the speed of this machine.
 
 Size: photographs are shrunk by the whole number that brings their longest side nearest to `SIDES` px, in ratio.
-Length: the paper's schedule, or as much of it as the minutes allow. The minutes are foretold by a model that is
+Length: the paper's schedule, or as much of it as the minutes allow. The minutes are predicted by a model that is
 measured where it is used: steps of the run's own engine, on the capture, with as many Gaussians as the run begins with,
-and with as many as it is expected to have; in between the time of a step is taken to be linear in their number.
+and with as many as it is expected to have. Between these the time of a step is assumed to be linear in their number.
 
 What is chosen goes into cfg.json with the run's settings, and is taken from there by a resumed run.
 """
@@ -161,7 +161,7 @@ def choose_length(
     memory = _PROGRAM_BYTES + _GAUSSIAN_BYTES * gaussians + _PIXEL_BYTES * pixels * photographs
     why = None
     if scaler < 1.0 and scaler == float(f"{longest:.3g}"):
-        why = f"each of {trained} photographs is seen {LOOKS} times: what more steps learn fits few photographs alone "
+        why = f"each of {trained} photographs is seen {LOOKS} times: more steps would overfit so few photographs "
         why += "(--steps-scaler S takes more)"
     return Choice(scaler, gaussians, seconds(scaler), memory, why)
 
@@ -190,7 +190,7 @@ TERMS: Final = ("depth_lambda", "exposure")
 class Terms:
     """Terms of the loss that were chosen."""
 
-    settings: Mapping[str, Any] = field(default_factory=dict)  # by name, those that nobody said
+    settings: Mapping[str, Any] = field(default_factory=dict)  # by name, those not given
     why: tuple[str, ...] = ()  # a sentence for each that was chosen, or that could not be
 
 
@@ -218,10 +218,10 @@ def choose_terms(capture: Capture, config: TrainConfig, stops: float | None) -> 
     if weight is not None and config.method == "pop":
         few = f"{len(trained)} photographs are few{spread}"
         if any(view.seen is not None and len(view.seen) for view in trained):
-            text = f"depth is held to the sparse points (--depth-lambda {weight:g}), as {few}"
+            text = f"depth is tied to the sparse points (--depth-lambda {weight:g}), because {few}"
             wanted.append(("depth_lambda", weight, text))
         elif "depth_lambda" not in _said(config):
-            why.append(f"{few}, and depth is not held to sparse points: the capture has no tracks of them")
+            why.append(f"{few}, and depth is not tied to the sparse points: the capture has no tracks")
     found = exposures_of(capture).unevenness(np.stack([view.viewmat for view in capture.views]))
     drifts = []
     if found is not None and found > UNEVEN:
@@ -229,7 +229,7 @@ def choose_terms(capture: Capture, config: TrainConfig, stops: float | None) -> 
     if stops is not None and stops > DRIFT_STOPS:
         drifts.append(f"their exposures are {stops:.1f} stops apart")
     if drifts and config.batch_size == 1:
-        text = f"each photograph's exposure is learned (--exposure), as {' and '.join(drifts)}"
+        text = f"each photograph's exposure is learned (--exposure), because {' and '.join(drifts)}"
         wanted.append(("exposure", True, text))
     settings: dict[str, Any] = {}
     for name, value, text in wanted:
@@ -238,7 +238,7 @@ def choose_terms(capture: Capture, config: TrainConfig, stops: float | None) -> 
         reason = why_not_trained(get_backend(config.backend), replace(config, given=None, **{name: value}))
         if reason is None:
             settings[name] = value
-        why.append(text if reason is None else f"{text.partition(',')[2].removeprefix(' as ')}: {reason}")
+        why.append(text if reason is None else f"{text.partition(',')[2].removeprefix(' because ')}: {reason}")
     return Terms(settings, tuple(why))
 
 
@@ -247,13 +247,13 @@ def _said(config: TrainConfig) -> Mapping[str, Any]:
 
 
 def about_held_out(capture: Capture, config: TrainConfig) -> str | None:
-    """Say what holding out costs where photographs are few and nobody has asked for it; else None."""
+    """Say what holding out costs where photographs are few and it was not requested; else None."""
     held_out, count = len(capture.test_views(config.test_every)), len(capture.views)
     own = any(view.split is not None for view in capture.views)
     if own or not held_out or count > FEW or "test_every" in _said(config):
         return None
     return (
-        f"{held_out} of {count} photographs are held out to measure by, {100 * held_out / count:.0f} % of what there "
+        f"{held_out} of {count} photographs are held out for measuring, {100 * held_out / count:.0f} % of what there "
         "is to learn from; --test-every 0 trains on all of them, and measures nothing"
     )
 
@@ -265,7 +265,7 @@ def with_choice(config: TrainConfig, scaler: float | None, terms: Mapping[str, A
     said = {**terms, **given.settings}
     plan = {"scale_lambda_pop": given.scale_lambda_pop, "steps_scaler": scaler}
     chosen = TrainConfig.of(method=given.method, preset=given.preset, **plan, **said)
-    # where it writes and which backend was found are nobody's word
+    # where it writes and which backend was found are not the user's choice
     return replace(
         chosen, data=config.data, result_dir=config.result_dir, backend=config.backend, progress=config.progress
     )
@@ -319,7 +319,7 @@ def mean_pixels(capture: Capture) -> float:
 
 
 def _grown(first: Mapping[str, Tensor], count: int) -> dict[str, Tensor]:
-    """Make more Gaussians of the first, smaller by as much, each at a place of its own within its parent."""
+    """Make more Gaussians of the first, smaller by as much, each at its own place within its parent."""
     import torch
 
     generator = torch.Generator().manual_seed(0)
@@ -358,7 +358,7 @@ def check_minutes(minutes: float | None, config: TrainConfig, automatic: bool) -
         raise PopError(f"--minutes is {minutes}; it must be > 0 and finite")
     if not automatic:
         said = f"--preset {config.preset}" if config.preset != "paper" else "--preset, --steps-scaler or --max-steps"
-        raise PopError(f"--minutes chooses the schedule, and {said} says another; leave one of them out")
+        raise PopError(f"--minutes chooses the schedule, but {said} sets another; leave one of them out")
 
 
 def line_of(choice: Choice, config: TrainConfig, size: tuple[int, int]) -> str:
@@ -373,6 +373,6 @@ def line_of(choice: Choice, config: TrainConfig, size: tuple[int, int]) -> str:
 
 
 def _rounded(count: float) -> int:
-    """Round to two digits, as nothing foretold is more exact."""
+    """Round to two digits, as no prediction is more exact."""
     digits = max(len(str(round(count))) - 2, 0)
     return round(count / 10**digits) * 10**digits

@@ -125,7 +125,7 @@ def load_splats(path: Path) -> tuple[dict[str, Tensor], int | None]:
     content = read_torch_file(path, fix)
     try:
         if not isinstance(content, dict) or "splats" not in content:
-            raise ValueError("has no splats, so it is no checkpoint of 'pop train' or gsplat")
+            raise ValueError("has no splats, so it is not a checkpoint of 'pop train' or gsplat")
         params = check_splats(content["splats"])
     except ValueError as error:
         raise PopError(f"{path}: {error}; {fix}") from error

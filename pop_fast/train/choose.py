@@ -27,12 +27,12 @@ def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConf
     name = None if step is None else step.unknown_setting(chosen)
     if name is None or get_backend(chosen.backend).device != "cpu":
         return chosen, why
-    return chosen, f"{why}; its fused step has no {name}, so autograd takes the steps"
+    return chosen, f"{why}; its fused step has no {name}, so autograd is used"
 
 
 def _choose(config: TrainConfig, resume: bool) -> tuple[TrainConfig, str]:
     if config.backend != "auto":
-        return config, f"backend {config.backend}, as asked for"
+        return config, f"backend {config.backend}, as requested"
     begun = _begun_with(Path(config.result_dir)) if resume else None
     if begun is not None:
         try:
@@ -48,7 +48,7 @@ def _choose(config: TrainConfig, resume: bool) -> tuple[TrainConfig, str]:
             reasons.insert(0, reason)
             continue
         on_cpu = backend.device == "cpu"
-        why = "; ".join(reasons) if on_cpu else "a GPU and the build are here"
+        why = "; ".join(reasons) if on_cpu else "there is a GPU, and the extension is built"
         return replace(config, backend=backend.name), f"backend {backend.name}{' (CPU)' if on_cpu else ''}: {why}"
     raise PopError("; ".join(reasons))
 
@@ -85,8 +85,8 @@ def check_gpus(config: TrainConfig, processes: int = 1) -> str | None:
     count, rank = count_gpus(), local_rank() if processes > 1 else 0
     if rank >= count > 0:
         raise PopError(
-            f"process {rank} of this machine has no GPU of its own, as there {_are(count)}; start one process a GPU "
-            f"(--nproc-per-node {count}), or train on CPUs (--backend fast)"
+            f"process {rank} of this machine has no GPU of its own, because there {_are(count)}; start one process a "
+            f"GPU (--nproc-per-node {count}), or train on CPUs (--backend fast)"
         )
     here = os.environ.get("LOCAL_WORLD_SIZE", "") if processes > 1 else "1"
     used = int(here) if here.isdigit() else processes

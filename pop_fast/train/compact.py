@@ -273,7 +273,7 @@ def _chosen(tuner: Tuner, scores: Tensor, most: int, coding: Coding) -> _Trial:
         trial = _tried(tuner, scores, most, coding, degree, middle if degree else 0, steps)
         best = trial if best is None or trial.psnr > best.psnr else best
         if len(trial.scores) == len(scores):
-            # a still lower degree would save bytes that nobody asks for
+            # a still lower degree would save bytes that are not needed
             break
     assert best is not None
     degree = best.compact.degree

@@ -112,7 +112,7 @@ class TrainConfig:
             doubles its cost.
         max_renders: held-out views saved as pictures at the end.
         lpips_vgg: weights of LPIPS on VGG16: one merged file, or backbone and linear layers; empty for none.
-        lpips_alex: weights of LPIPS on AlexNet, likewise.
+        lpips_alex: weights of LPIPS on AlexNet, in the same form.
         target_cache_mb: memory for what SSIM needs of the photographs, kept between steps.
         progress: show a progress bar when standard error is a terminal.
         given: what these values come from; None where they were written down one by one.
@@ -222,7 +222,7 @@ class TrainConfig:
         return cls.of(method=method, preset=preset, **{name: resolved[name] for name in resolved if name in said})
 
     def with_overrides(self, **overrides: Any) -> Self:
-        """Return these settings with some said anew; those that nobody said stay the defaults they are."""
+        """Return these settings with some said anew; those not given stay the defaults they are."""
         if self.given is None:
             return replace(self, **overrides)
         again = Given.of(overrides, method=self.given.method)
@@ -358,7 +358,7 @@ def _options_of(words: Sequence[str]) -> Iterator[tuple[str, list[Any]]]:
     while rest:
         word = rest.pop(0)
         if not word.startswith("--"):
-            raise PopError(f"{word!r} stands where an option of pop train is expected, as --max-steps 100")
+            raise PopError(f"{word!r} is not an option; pop train expects one here, such as --max-steps 100")
         name, equals, value = word.removeprefix("--").partition("=")
         values = [value] if equals else []
         while rest and not rest[0].startswith("--"):
@@ -455,7 +455,7 @@ def _check_names(values: dict[str, Any]) -> None:
         if (name == "backend" and value == "auto") or value in known:
             continue
         names = ", ".join((*(("auto",) if name == "backend" else ()), *known))
-        where = "; one of another package is known where that is installed"
+        where = "; one from another package is known only where that is installed"
         raise PopError(f"{name} is {value!r}; it must be one of {names}{where}")
 
 

@@ -1,4 +1,4 @@
-"""What a run's bits depend on besides its settings: threads, denormal numbers, versions, the machine."""
+"""What a run's bits depend on apart from its settings: threads, denormal numbers, versions, the machine."""
 
 from __future__ import annotations
 

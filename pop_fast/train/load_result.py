@@ -53,7 +53,7 @@ class CaptureOptions:
     capture: Path | None = None
     """The capture; by default the one it was trained on."""
     factor: int | None = None
-    """Photographs are shrunk by it."""
+    """Photographs are shrunk by this factor."""
     test_every: int | None = None
     """Every n-th view by file name is held out."""
     images: str | None = None
@@ -184,15 +184,15 @@ def open_capture(
     record = read_record(splat.folder) or CaptureRecord()
     data = str(options.capture or splat.config.data)
     if not data:
-        raise PopError(f"{splat.path}: nothing says which capture it shows; give --capture DIR")
+        raise PopError(f"{splat.path}: its capture is unknown; give --capture DIR")
     if options.capture is None and not Path(data).is_dir():
-        raise PopError(f"{splat.path}: was trained on {data}, which is not there; give --capture DIR")
+        raise PopError(f"{splat.path}: was trained on {data}, which is missing; give --capture DIR")
     asked = {"factor": options.factor, "test_every": options.test_every}
     changes: dict[str, Any] = {"data": data, **{name: value for name, value in asked.items() if value is not None}}
     frame = frame_of_splat(splat, options)
     changes["normalize"] = frame == "training"
     if frame is None:
-        taken = "says nothing of its world, and is taken to be in the capture's own"
+        taken = "does not state its frame, and is taken to be in the capture's own world"
         print(f"note: {splat.path}: {taken}; that of gsplat's trainer needs --training-frame", file=sys.stderr)
     config = _in_frame(replace(splat.config, **changes), splat)
     source = record.source if options.capture is None else "auto"
@@ -239,7 +239,7 @@ def _check_same_frame(splat: Splat, capture: Capture) -> None:
     # what a view of the scene's size would be off by, as a share of that size
     if not np.allclose(theirs, ours, rtol=1e-3, atol=1e-3):
         raise PopError(
-            f"{splat.path}: was trained on a capture that normalizes otherwise than {capture.name}: other views, "
+            f"{splat.path}: was trained on a capture that normalizes differently from {capture.name}: other views, "
             "points or poses; give the capture that it was trained on, or pop export --frame capture and measure that"
         )
 

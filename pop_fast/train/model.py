@@ -104,5 +104,5 @@ def require_usable(params: Mapping[str, Tensor], when: str) -> None:
         name, index, value = found
         raise PopError(
             f"{name}{index} is {value} {when}: lower the learning rate of {name} and start again, "
-            "or look at the photographs and masks of the capture"
+            "or check the photographs and masks of the capture"
         )

@@ -83,13 +83,13 @@ def find_warnings(config: TrainConfig, views: Sequence[ViewTensors]) -> Iterator
     blurs = any(plan.is_blur_step(step) for step in _density_steps(config, plan.refine_every))
     if blurs and max(pixels, plan.blur_min_pixels) < ENOUGH_PIXELS:
         yield (
-            f"theta_blur is {pixels:.1f} pixels of {smallest.name} ({smallest.width} x {smallest.height}), where the "
-            "paper's smallest images make it 10.7: nearly every Gaussian that is seen will count as blur and grow; "
+            f"theta_blur is {pixels:.1f} pixels of {smallest.name} ({smallest.width} x {smallest.height}); it "
+            "is 10.7 on the paper's smallest images. Nearly every visible Gaussian will count as blur and grow; "
             f"--{config.method}.blur-min-pixels {ENOUGH_PIXELS} fixes it"
         )
     if config.depth_lambda != 0.0 and not any(view.points is not None and len(view.points) for view in views):
         yield (
-            f"depth_lambda is {config.depth_lambda}, and the term does nothing: the capture does not say which "
+            f"depth_lambda is {config.depth_lambda}, but the term has no effect: the capture does not say which "
             "photograph sees which sparse point (COLMAP's tracks); pop sfm and COLMAP write that with the cameras"
         )
     if profile_named(config.profile).principal_point == "centred":
@@ -97,8 +97,8 @@ def find_warnings(config: TrainConfig, views: Sequence[ViewTensors]) -> Iterator
         worst = max(away, key=lambda name: away[name])
         if away[worst] > ENOUGH_OFF_CENTRE:
             yield (
-                f"profile {config.profile} draws with the principal point in the middle of the image, as Inria's code, "
-                f"and that of {worst} lies {away[worst]:.1f} pixels from there: every photograph is compared with an "
+                f"profile {config.profile} draws with the principal point in the middle of the image, as Inria's code "
+                f"does, but that of {worst} is {away[worst]:.1f} pixels away: every photograph is compared with an "
                 "image that is shifted by as much; --profile gsplat_1_5 uses the principal point"
             )
     resets = [step for step in _density_steps(config, plan.reset_every) if plan.is_reset_step(step)]
@@ -107,7 +107,7 @@ def find_warnings(config: TrainConfig, views: Sequence[ViewTensors]) -> Iterator
         step = resets[left.index(min(left))]
         yield (
             f"opacities are reset after step {step:,} and have {min(left):,} steps ({min(left) // plan.refine_every} "
-            f"densification steps) to recover, where 3DGS has {RECOVERY_EVENTS} densification steps; "
+            f"densification steps) to recover; 3DGS has {RECOVERY_EVENTS} densification steps; "
             f"--{config.method}.reset-every 0 leaves resets out"
         )
 

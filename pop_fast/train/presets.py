@@ -87,10 +87,10 @@ QUICK_SCALER: Final = 0.05
 # chooses size and length by what is there: `pop_fast.train.automatic`
 AUTOMATIC: Final = "auto"
 PRESETS: Final = {"paper": 1.0, "quick": QUICK_SCALER, AUTOMATIC: 1.0}
-# what "quick" multiplies the rates by: with so few steps the published ones leave most of the way undone, and rates as
-# high as these must fall towards the end. Opacities go fast enough. Chosen on fox; what it brings on four captures
-# stands in benchmarks/NOTES.md. A longer schedule of "auto" begins with rates that are lower by as much as it is
-# longer, never below the published ones, and they fall by less
+# what "quick" multiplies the rates by: with so few steps the published rates are too low, and rates as high as these
+# must fall towards the end. The rate of opacities is high enough. Chosen on fox; benchmarks/NOTES.md has the results on
+# four captures. A longer schedule of "auto" begins with rates that are lower in proportion to its length, never below
+# the published ones, and they fall by less
 QUICK_RATES: Final = {"means": 12.0, "scales": 6.0, "quats": 6.0, "sh0": 8.0, "sh_rest": 12.0}
 QUICK_DECAY: Final = 0.1
 # Adam's second moments: the usual 0.999 remembers most of so few steps, also those of coarse photographs. Longer
@@ -205,7 +205,7 @@ class Given:
 
 
 def method_of(strategy: DensityControl) -> str:
-    """Return the name of the method that a strategy belongs to; that of its class where it is somebody else's."""
+    """Return the name of the method that a strategy belongs to; that of its class for a third-party strategy."""
     names = (name for name, method in METHODS.items() if type(strategy) is method.strategy)
     return next(names, type(strategy).__name__)
 
@@ -254,7 +254,7 @@ def _quick(strategy: DensityControl) -> DensityControl:
 
 
 def values_of(recipe: Recipe) -> dict[str, Any]:
-    """Return what a recipe says besides density control and the POP term, in the names of `TrainConfig`."""
+    """Return what a recipe says apart from density control and the POP term, in the names of `TrainConfig`."""
     return {
         **{name: getattr(recipe, name) for name in ("max_steps", "sh_interval")},
         "photometric": recipe.pixelwise,

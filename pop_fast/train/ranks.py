@@ -193,5 +193,5 @@ def join() -> Ranks:
         group.init_process_group("cpu:gloo,cuda:nccl" if by_gpu else "gloo", timeout=_PATIENCE)
     except (RuntimeError, ValueError) as error:
         given = ", ".join(f"{name}={os.environ[name]}" for name in _VARIABLES)
-        raise PopError(f"cannot meet the other processes ({given}): {error}; start them with torchrun") from error
+        raise PopError(f"cannot connect to the other processes ({given}): {error}; start them with torchrun") from error
     return TorchRanks()

@@ -69,7 +69,7 @@ def steady_updates(lr: Mapping[str, float], steps: int) -> Updates:
 
 
 def _share(steps: Tensor, max_steps: int, rules: UpdateRules) -> Tensor:
-    """Return how much of the means' decay lies behind each step."""
+    """Return how much of the means' decay is behind each step."""
     start = rules.rounds_start_iter
     if start > 0:
         in_rounds = start + (steps - start) % rules.round_steps + 1.0

@@ -1,8 +1,8 @@
 """Ctrl-C, SIGTERM and SIGHUP as a polite request: leave the step, write a checkpoint, then stop.
 
 Python runs a signal's handler in the main thread and between two of its instructions only, so a call of a compiled
-library that takes seconds keeps it waiting. Such a call is made in a thread of its own (`heard`), and is told by a flag
-that it may read (`StopRequest.address`).
+library that takes seconds delays the handler. Such a call is made in its own thread (`heard`), and can read a flag that
+says whether a stop was requested (`StopRequest.address`).
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ T = TypeVar("T")
 
 
 class Abandoned(KeyboardInterrupt):
-    """A piece of work was left because somebody has asked for an end."""
+    """A piece of work was left because a stop was requested."""
 
 
 class StopRequest:
-    """Whether somebody has asked for an end.
+    """Whether a stop was requested.
 
     Without a lock, unlike `threading.Event`: a handler runs in the middle of whatever the main thread is doing, and
     would wait for ever for a lock that this thread itself holds, as it does within `Event.wait`.
@@ -35,7 +35,7 @@ class StopRequest:
 
     @property
     def asked(self) -> bool:
-        """Tell whether somebody has asked."""
+        """Tell whether a stop was requested."""
         return bool(self._flag.value)
 
     @property
@@ -55,7 +55,7 @@ class StopRequest:
         """Let a request end the block at once, as nothing that must be kept is changed by it.
 
         Raises:
-            Abandoned: somebody has asked, before the block or while it ran.
+            Abandoned: a stop was requested, before the block or while it ran.
         """
         if not allowed:
             yield
@@ -72,7 +72,7 @@ class StopRequest:
 def heard(function: Callable[..., T], *args: Any) -> T:
     """Call a function that may take seconds within compiled code, so that signals are heard meanwhile.
 
-    In the main thread it is called in a thread of its own, which is left behind when a signal's handler raises; the
+    In the main thread it is called in its own thread, which is left behind when a signal's handler raises; the
     function must not depend on the thread that it runs in. In another thread it is only called.
     """
     if threading.current_thread() is not threading.main_thread():

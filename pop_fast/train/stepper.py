@@ -53,7 +53,7 @@ class Stepper(Protocol):
     def steps(self, first: int, last: int, phase: Phase) -> list[StepStats]:
         """Take the steps from `first` to before `last`, all of one phase, and return each one's measurements.
 
-        They are fewer where somebody has asked for an end: `step` then tells how many, and nothing is changed by the
+        They are fewer where a stop was requested: `step` then tells how many, and nothing is changed by the
         one that was left.
 
         Raises:
@@ -82,12 +82,12 @@ class Task:
     step: int  # steps taken
     appearance: Appearance  # what is learned of the photographs
     ranks: Ranks = ALONE  # the processes that draw the views of a step
-    stop: StopRequest = field(default_factory=StopRequest)  # whether somebody has asked for an end
+    stop: StopRequest = field(default_factory=StopRequest)  # whether a stop was requested
     scene_scale: float = 1.0  # by which depth is compared, world units
 
     @property
     def may_abandon(self) -> bool:
-        """Tell whether a step may be left half way: not where other processes or somebody else's strategy take part."""
+        """Tell whether a step may be left half way: not where other processes or a third-party strategy take part."""
         return self.ranks.size == 1 and isinstance(self.strategy, DensityControl)
 
 
@@ -124,7 +124,7 @@ class Fused(Protocol):
         ...
 
     def run(self, until: int, phase: Phase) -> None:
-        """Take steps of one phase until the counter stands at `until`, or until somebody has asked for an end."""
+        """Take steps of one phase until the counter stands at `until`, or until a stop was requested."""
         ...
 
     def step_stats(self, first: int, last: int) -> Sequence[Sequence[float]]:

@@ -322,10 +322,7 @@ def check_batch(config: TrainConfig, own_strategy: bool, ranks: Ranks) -> None:
     if size > 1 and learned:
         option = learned[0].replace("_", "-")
         raise PopError(
-            f"batch_size is {size}; what --{option} learns of a photograph needs steps of one view: "
-            f"leave out --batch-size, or --{option}"
+            f"batch_size is {size}; --{option} needs steps of one view: leave out --batch-size, or --{option}"
         )
     if size > 1 and not own_strategy:
-        raise PopError(
-            f"batch_size is {size}; it must be 1 with a strategy of somebody else, which looks at one render a step"
-        )
+        raise PopError(f"batch_size is {size}; it must be 1 with a third-party strategy, which uses one render a step")

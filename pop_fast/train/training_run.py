@@ -91,7 +91,7 @@ class TrainingRun:
             resume: continue from the latest checkpoint of `config.result_dir`, or start where there is none.
             overwrite: replace the results of an earlier run in `config.result_dir`, once the first step has been taken.
             loading_seconds, sfm_seconds: how long reading and the search for cameras took, for the statistics.
-            beside: texts to write beside cfg.json, by file name.
+            beside: texts to write next to cfg.json, by file name.
             strategy: decides over the Gaussians in the place of the config's, by gsplat's protocol; on the CPU.
             initial: raw parameters to start from, which are copied; None makes them from the capture's points. Their
                 precision is that of the training; a GPU trains in float32 only.
@@ -188,7 +188,7 @@ class TrainingRun:
         with self._times.is_loading():
             self._stepper = self.stepper
         due = found and writes and self.step in self.config.eval_steps
-        if due and not self._results.read_stats("val", self.step - 1):  # as somebody had asked for an end meanwhile
+        if due and not self._results.read_stats("val", self.step - 1):  # as a stop was requested meanwhile
             self._evaluate(self.step - 1)
 
     def _loop(self) -> dict[str, Any]:

@@ -40,7 +40,7 @@ _PICTURES = (*IMAGE_SUFFIXES, *HEIF_SUFFIXES)
 
 
 def picture_names(views: Sequence[str], suffix: str = ".png") -> list[Path]:
-    """Give every view a file name of its own, relative to the folder that the pictures go to.
+    """Give every view its own file name, relative to the folder that the pictures go to.
 
     "images/a.jpg" becomes images/a.png. A suffix that is no image's is part of the name: "cam.00" becomes cam.00.png.
     What leads out of the folder is dropped: "..", and of absolute names the root and the folders that all of them
@@ -112,7 +112,7 @@ def planned_views(capture: Capture, config: TrainConfig, path: str, frames: int)
     if path == "views":
         views = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
         if not views:
-            raise PopError(f"{capture.name}: holds no view out; give --test-every 8, or --path orbit")
+            raise PopError(f"{capture.name}: no view is held out; give --test-every 8, or --path orbit")
         return views
     if frames < 1:
         raise PopError(f"frames is {frames}; give --frames 1 or more")

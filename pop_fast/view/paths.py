@@ -159,7 +159,7 @@ _FPS: Final = (0.5, 600.0)
 
 
 class VideoFile:
-    """A video under construction: frames go to a hidden file beside `path`, which appears when the block ends well.
+    """A video under construction: frames go to a hidden file next to `path`, which appears when the block ends well.
 
     Args:
         path: the file to make or to replace: .webm (VP9), .avi (Motion JPEG), or .mp4 (H.264), for which the wheels of

@@ -52,8 +52,8 @@ def _parser() -> argparse.ArgumentParser:
     actions = parser.add_subparsers(dest="action", required=True)
     starting = actions.add_parser("start", help="write thirteen files to fill in; nothing is written over")
     checking = actions.add_parser("check", help="judge one of them, in seconds")
-    mapping = actions.add_parser("map", help="the pipeline, and the picture that it draws as it stands")
-    training = actions.add_parser("train", help="when all is written: train with your own code")
+    mapping = actions.add_parser("map", help="the pipeline, and the picture that it draws so far")
+    training = actions.add_parser("train", help="at the end: train with your own code")
     checking.add_argument("stage", nargs="?", default="", help="a file's name without .py: alpha, ...; not with --all")
     checking.add_argument(
         "--all", action="store_true", help="judge every stage, and count the functions that are right"

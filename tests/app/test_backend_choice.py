@@ -120,7 +120,7 @@ def test_cuda_asked_for_in_vain_is_one_sentence_before_anything_is_read(pop: Pop
 def test_a_run_on_a_gpu_from_the_command_line(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
     words = ("train", shared_capture, "--out", tmp_path / "r", *TRAIN, "--skip-sizes")
     outcome = pop.done(*words)
-    assert "backend cuda: a GPU and the build are here" in outcome.out
+    assert "backend cuda: there is a GPU, and the extension is built" in outcome.out
     assert " s on drift, loading " in outcome.out
     assert settings(tmp_path / "r")["resolved"]["backend"] == "cuda"
     stats = json.loads((tmp_path / "r" / "stats" / "val_step0029.json").read_text())
@@ -247,7 +247,7 @@ def test_a_run_that_ends_soon_after_a_reset_is_warned_of_and_a_short_one_has_non
 def test_a_centred_principal_point_is_warned_of_where_the_cameras_have_another():
     away = [a_view(512, 512), a_view(512, 512, moved=(3.0, -4.0))]
     (warning,) = find_warnings(TrainConfig.of(method="3dgs"), away)
-    assert "a.jpg lies 5.0 pixels from there" in warning
+    assert "a.jpg is 5.0 pixels away" in warning
     assert "--profile gsplat_1_5" in warning
     assert list(find_warnings(TrainConfig.of(method="3dgs", profile="gsplat_1_5"), away)) == []
     assert list(find_warnings(TrainConfig.of(method="gsplat"), away)) == []
@@ -310,7 +310,7 @@ def test_gpus_that_are_left_idle_are_said_with_what_would_use_them(
 @pytest.mark.usefixtures("eight_gpus")
 def test_processes_use_as_many_gpus_as_they_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config, chosen = choose_backend(tiny_config(tmp_path, backend="auto", batch_size=8))
-    assert (config.backend, chosen) == ("cuda", "backend cuda: a GPU and the build are here")
+    assert (config.backend, chosen) == ("cuda", "backend cuda: there is a GPU, and the extension is built")
     monkeypatch.setenv("LOCAL_RANK", "7")
     assert check_gpus(config, 8) is None
     assert (check_gpus(config, 2) or "").startswith("2 of 8 GPUs are used")
@@ -319,7 +319,9 @@ def test_processes_use_as_many_gpus_as_they_are(tmp_path: Path, monkeypatch: pyt
     assert (check_gpus(config, 4) or "").startswith("2 of 8 GPUs are used")
     assert check_gpus(replace(config, backend="fast"), 4) is None
     monkeypatch.setenv("LOCAL_RANK", "8")
-    with pytest.raises(PopError, match=r"process 8 of this machine has no GPU of its own, as there are 8; start one"):
+    with pytest.raises(
+        PopError, match=r"process 8 of this machine has no GPU of its own, because there are 8; start one"
+    ):
         check_gpus(config, 16)
     monkeypatch.setenv("LOCAL_RANK", "-1")
     with pytest.raises(PopError, match=r"LOCAL_RANK is '-1'; it must be the number of this process, from 0"):

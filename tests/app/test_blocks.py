@@ -253,13 +253,13 @@ def test_a_run_that_is_gone_on_with_otherwise_is_refused(train: Train, blocks, r
         (("--blocks", "2x1", "--blocks-jobs", "0"), "must be 1 or more"),
         (("--blocks", "2x1", "--blocks-jobs", "2"), "needs Snakemake"),
         (("--blocks", "2x1", "--blocks-profile", "slurm"), "needs Snakemake"),
-        (("--blocks", "2x1", "--exposure"), "blocks would not agree on it"),
-        (("--blocks", "2x1", "--refine-cameras"), "blocks would not agree on it"),
-        (("--blocks", "2x1", "--max-gaussians", "50"), "looks at all training photographs"),
-        (("--blocks-margin", "0.1"), "say --blocks 2x2 too"),
-        (("--blocks-jobs", "2"), "say --blocks 2x2 too"),
-        (("--blocks-rounds", "1"), "say --blocks 2x2 too"),
-        (("--blocks-round-steps", "10"), "say --blocks 2x2 too"),
+        (("--blocks", "2x1", "--exposure"), "blocks would not"),
+        (("--blocks", "2x1", "--refine-cameras"), "blocks would not"),
+        (("--blocks", "2x1", "--max-gaussians", "50"), "needs all training photographs"),
+        (("--blocks-margin", "0.1"), "add --blocks 2x2"),
+        (("--blocks-jobs", "2"), "add --blocks 2x2"),
+        (("--blocks-rounds", "1"), "add --blocks 2x2"),
+        (("--blocks-round-steps", "10"), "add --blocks 2x2"),
         (("--blocks", "2x1", "--blocks-rounds", "-1"), "must be from 0 to 100"),
         (("--blocks", "2x1", "--blocks-rounds", "101"), "must be from 0 to 100"),
         (("--blocks", "2x1", "--blocks-rounds", "1", "--blocks-round-steps", "0"), "must be 1 or more"),
@@ -633,7 +633,7 @@ def test_a_part_of_a_round_asks_for_what_comes_before_it(pop: Pop, rounds):
     round_0, round_1, result = (rounds / "blocks" / name for name in ("round_0", "round_1", "round_2/0_0/result"))
     refused("has no round 3, but rounds 0 to 2", "train", rounds, "0_0", "--round", "3")
     refused("has no round -1, but rounds 0 to 2", "merge", rounds, "--round", "-1")
-    refused("is of all rounds; leave --round out", "partition", rounds, "--round", "1")
+    refused("applies to all rounds; leave --round out", "partition", rounds, "--round", "1")
     (round_1 / "1_0" / "start.json").unlink()
     refused(f"run pop blocks train {rounds} 1_0 --round 1", "merge", rounds, "--round", "1")
     (round_1 / "0_0" / "start.json").write_text('{"own": 1}')

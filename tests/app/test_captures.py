@@ -218,7 +218,7 @@ def test_shrinking_averages_areas_or_takes_a_folder_of_shrunk_photographs_and_te
         write_photograph(root / "images_2" / f"{i:02d}.jpg", photograph(i + 10, 20, 15))
     exact = raw(root, factor=2)
     (note,) = exact.notes
-    assert note.startswith("the photographs of images_2/ are used, made smaller before")
+    assert note.startswith("the photographs of images_2/ are used, which were shrunk earlier")
     assert exact.views[0].image.shape == (15, 20, 3)
     assert not np.array_equal(exact.views[0].image, raw(root, factor=2, images="images").views[0].image)
     assert np.allclose(exact.views[0].K[:2], K[:2] / 2.0)
@@ -341,7 +341,7 @@ def test_photographs_without_a_mask_are_told_where_others_have_one(root: Path) -
     white = np.full((HEIGHT, WIDTH), 255, np.uint8)
     write_photograph(root / "masks" / "01.png", white)
     first = root / "images" / "00.png"
-    assert load_capture(root).notes == (f"3 of 4 photographs have no mask and count whole, first {first}",)
+    assert load_capture(root).notes == (f"3 of 4 photographs have no mask and count in full, first {first}",)
     for i in range(4):
         write_photograph(root / "masks" / f"{i:02d}.png", white)
     assert load_capture(root).notes == ()
@@ -407,7 +407,7 @@ def test_captures_of_pinholes_load_without_pycolmap_and_plyfile_and_a_lens_that_
         (tmp_path / "sparse" / f"{name}.txt").write_text(content)
     done = in_a_child(LOAD, tmp_path)
     assert done.status != 0
-    assert "CaptureError: pycolmap cannot be imported" in done.err
+    assert "CaptureError: pycolmap, which finds cameras" in done.err
     assert "pip install pycolmap" in done.err
 
 

@@ -244,7 +244,7 @@ def test_results_are_complete_before_the_report_and_whatever_becomes_of_it(
     assert "PSNR" in outcome.out
     (line,) = [line for line in outcome.err.splitlines() if line.startswith("pop: ")]
     assert words in line
-    assert f"the results in {folder} are complete, and pop report {folder} writes it" in line
+    assert f"the results in {folder} are complete; pop report {folder} writes the report" in line
     assert not (folder / "report.html").exists()
     pop.done("report", folder)
     pop.done("eval", folder)

@@ -226,7 +226,7 @@ def test_what_only_a_checkpoint_knows_is_not_guessed(pop: Pop, shared_capture: P
     result = tmp_path / "exposed"
     pop.done("train", shared_capture, "--out", result, *TRAIN, "--exposure", "--skip-sizes")
     small = ("--target-mb", "0.006", "--fine-tune-steps", "4", "--overwrite", "--out", tmp_path / "x.spz")
-    untuned = "not fine-tuned: what the run has learned of its photographs is in its checkpoints alone"
+    untuned = "not fine-tuned: only the checkpoints hold what the run learned of its photographs"
     assert untuned not in pop.done("export", result, *small).out
     lone = result / "ply" / "point_cloud_29.ply"
     assert untuned in pop.done("export", lone, "--capture", shared_capture, *small).out

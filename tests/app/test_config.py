@@ -632,7 +632,7 @@ def test_what_was_chosen_for_few_photographs_is_said_kept_reported_and_gone_on_w
         outcome = pop(*words)
     assert outcome.status == 130
     weight = DEPTH_LAMBDAS[0][1]
-    assert f"(--depth-lambda {weight:g}), as 7 photographs are few" in outcome.out
+    assert f"(--depth-lambda {weight:g}), because 7 photographs are few" in outcome.out
     assert "1 of 8 photographs are held out" in outcome.out
     assert "--test-every 0" in outcome.out
     assert pop(*words, "--resume").status == 0
@@ -642,14 +642,14 @@ def test_what_was_chosen_for_few_photographs_is_said_kept_reported_and_gone_on_w
     assert "as 7 photographs are few" in data.config["chosen by the run"]
     # an explicit number of held-out views is not reported again
     said = pop(*words, "--overwrite", "--test-every", "4", "--depth-lambda", "0")
-    assert "held out to measure by" not in said.out
+    assert "held out for measuring" not in said.out
     assert "--depth-lambda" not in said.out
 
 
 def test_depth_that_no_track_tells_is_warned_of(pop: Pop, capture: Path, tmp_path: Path) -> None:
     words = ("--max-steps", "2", "--out", tmp_path / "r", "--depth-lambda", "0.01", *QUICKLY)
     said = pop.done("train", with_tracks(capture, 0), *words).err
-    assert "depth_lambda is 0.01, and the term does nothing" in said
+    assert "depth_lambda is 0.01, but the term has no effect" in said
 
 
 def test_minutes_and_a_schedule_exclude_each_other(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:

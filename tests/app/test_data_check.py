@@ -110,7 +110,7 @@ def test_the_folder_of_the_photographs_can_be_named(pop: Pop, root: Path) -> Non
 def test_cameras_that_stand_farthest_from_the_nearest_other_are_named(check: Check, tmp_path: Path) -> None:
     whole = colmap_capture(tmp_path / "whole", count=36)
     found = finding(check(whole), "ok", "spacing")
-    assert "neighbours 9.5 degrees apart as the subject sees them (median)" in found
+    assert "neighbours 9.5 degrees apart as seen from the subject (median)" in found
     # every fourth of these cameras, and one more next to the first
     numbers = [0, 1, *range(4, 36, 4)]
     names = [f"{number:02d}.png" for number in numbers]
@@ -130,7 +130,7 @@ def test_every_problem_of_a_damaged_capture_is_listed_at_once(check: Check, capt
     assert said(lines, "1 of 8 listed are absent, first view_001.png", "view_002.png")
     assert said(lines, "view_003.png is 32x40 px, its camera 40x32: another shape")
     assert "1 files in images/ are not listed, first extra.png" in finding(lines, "LOOK", "pairing")
-    assert lines[-1] == "3 problems stand against training"
+    assert lines[-1] == "3 problems to fix before training"
 
 
 def test_photographs_of_half_the_size_are_fine_and_said_so(check: Check, capture: Path) -> None:
@@ -181,7 +181,7 @@ def test_tracks_that_colmap_refuses_are_told_with_the_models_folder(pop: Pop, tm
     (line,) = [line for line in outcome.out.splitlines() if " reprojection " in line]
     assert line.startswith("LOOK")
     assert f"{tmp_path / 'scene' / 'sparse' / '0'}: COLMAP cannot read its tracks" in line
-    assert line.endswith("training does without its tracks; write the model again to have them")
+    assert line.endswith("training ignores its tracks; write the model again to use them")
     assert pop("data", "check", HERE / "tracked").out.count("mean error") == 1
 
 
@@ -272,7 +272,7 @@ def test_photographs_that_no_cameras_can_be_found_for_are_refused_by_check_and_t
     make, words = HOPELESS[what]
     for i in range(4):
         write_photograph(tmp_path / "photos" / f"{i}.png", make(i))
-    assert said(check(tmp_path / "photos", 1), words, "1 problem stands against training")
+    assert said(check(tmp_path / "photos", 1), words, "1 problem to fix before training")
     monkeypatch.setattr(sfm, "find_cameras", lambda *_, **__: pytest.fail("the long work has begun"))
     says(pop("train", tmp_path / "photos", "--out", tmp_path / "out"), words, "no cameras could be found")
 
@@ -285,7 +285,7 @@ def test_photographs_that_overlap_are_not_called_unrelated(check: Check, tmp_pat
     check(tmp_path)
 
 
-WRONG = {"walk.mp4": "is no video", "photos.zip": "outside of its folder", "gone": "no such folder"}
+WRONG = {"walk.mp4": "is not a video", "photos.zip": "outside of its folder", "gone": "no such folder"}
 
 
 @pytest.mark.parametrize("name", WRONG)
@@ -423,7 +423,7 @@ def test_a_whole_install_is_found_whole(pop: Pop) -> None:
     out = pop.done("doctor").out
     for name in ("numpy", "torch", "pycolmap", "opencv-contrib-python-headless", "backend fast", "processor", "memory"):
         assert name in out
-    assert "everything that pop needs is here" in out
+    assert "everything that pop needs is installed" in out
 
 
 @pytest.mark.parametrize(

@@ -447,7 +447,7 @@ def test_the_command_line_shows_where_two_backends_part(
     row = next(row for row in rows if row["status"] == "blended" and row["falloff"] < 0.5)
     instead_of_cuda(fainter(row["id"], 0.99 * PAPER.alpha_floor, row["falloff"]))
     outcome = explain("--json", tmp_path / "why.json", "--diff", "fast", "cuda")
-    assert f"D5 falls otherwise first, at Gaussian {row['id']}" in outcome.out
+    assert f"D5 is the first decision that differs, at Gaussian {row['id']}" in outcome.out
     assert "fast | cuda, 40 x 32 px from (0, 0):" in outcome.out
     flip = json.loads((tmp_path / "why.json").read_text())["difference"]["flip"]
     assert (flip["decision"], flip["gaussian"]) == ("D5", row["id"])

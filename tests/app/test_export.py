@@ -121,7 +121,7 @@ def test_inria_s_layout_has_what_its_scripts_read(export: Said, psnr: Psnr, shar
 @pytest.mark.parametrize(
     ("words", "part"),
     [
-        ("", "nothing says what to write; give --out FILE or --to FORMAT"),
+        ("", "nothing to write; give --out FILE or --to FORMAT"),
         ("--out x.spz --to sog", "ends in .spz, which is not how files of sog end"),
         ("--out x.ply --to html", "a page ends in .html"),
         ("--out x.html --frame capture", "a page has no frame of its own"),
@@ -187,7 +187,7 @@ def test_an_export_never_replaces_what_it_reads(pop: Pop, capture: Path, result:
     lone = Path("inria/point_cloud/iteration_30/point_cloud.ply")
     again = ["export", lone, "--capture", capture, "--own-frame", "--overwrite"]
     says(pop(*again, "--layout", "inria", "--out", "inria"), "inria: holds", "point_cloud.ply, which is read")
-    says(pop(*again, "--out", lone), "point_cloud.ply: is the splat that is read; choose another --out")
+    says(pop(*again, "--out", lone), "point_cloud.ply: is the input file; choose another --out")
     assert contents(tmp_path) == before
 
 
@@ -254,7 +254,7 @@ def test_a_conversion_writes_a_page_and_what_its_name_promises(pop: Pop, export:
         ("a.ply b.obj", "must end in one of"),
         ("a.ply a.ply", "is the splat that is read"),
         ("a.ply there.spz", "exists; pass --overwrite"),
-        ("a.ply b.html --to sog", "a page ends in .html, and --to sog was asked for"),
+        ("a.ply b.html --to sog", "a page ends in .html, but --to is sog"),
         ("a.ply b.ksplat", "b.ksplat: is of a format that is read and not written"),
         ("a.ply meta.json", "meta.json: is of a format that is read and not written"),
         ("t.ply b.spz --crop 0 0 0 1 1 1", "t.ply: is in a training frame"),
@@ -318,7 +318,7 @@ def test_a_ply_that_says_nothing_is_taken_to_be_in_the_capture_s_frame_with_a_no
     save_ply("s.ply", load_ply("o.ply"))
     outcome = pop.done("eval", "s.ply", "--capture", shared_capture, "--json", "e.json")
     assert json.loads(Path("e.json").read_text())["psnr"] == trained
-    assert "s.ply: says nothing of its world, and is taken to be in the capture's own" in outcome.err
+    assert "s.ply: does not state its frame, and is taken to be in the capture's own world" in outcome.err
     assert "--training-frame" in outcome.err
     # an explicit frame brings no note
     psnr("s.ply", "--own-frame")
@@ -341,7 +341,7 @@ def test_a_ply_of_a_trainer_that_moves_the_world_is_read_as_the_command_says(
 def test_another_capture_than_the_one_trained_on_is_refused(pop: Pop, own: Path, capture: Path) -> None:
     (capture / "images" / "view_003.png").unlink()
     shutil.copy(own, "s.ply")
-    says(pop("eval", "s.ply", "--capture", capture, "--missing", "skip"), "normalizes otherwise than toy")
+    says(pop("eval", "s.ply", "--capture", capture, "--missing", "skip"), "normalizes differently from toy")
 
 
 @pytest.mark.parametrize(
@@ -404,7 +404,7 @@ def assert_shows_the_same(pop: Pop, file: Path, turned: Path, run: Path, name: s
     """Hold `eval`, `render` and `compare` of a file to the PSNR of its run."""
     own, about = stats(run)["psnr"], ("--capture", turned, *words)
     outcome = pop.done("eval", file, *about, "--json", "e.json")
-    assert ("says nothing of its world" in outcome.err) == (name == "splat" and not words)
+    assert ("does not state its frame" in outcome.err) == (name == "splat" and not words)
     measured = json.loads(Path("e.json").read_text())["psnr"]
     assert measured == pytest.approx(own, abs=LOSES[name])
     pop.done("render", file, *about, "--out", "views", "--overwrite")

@@ -544,7 +544,7 @@ DAMAGED: list[tuple[str, bytes, str]] = [
         "x: extension 0x1 of 2147483648 bytes",
     ),
     *(("spz-4", spz_4(id, end), "x: (is cut off|tocByteOffset is 32)") for end in (20, 32, 100, -1)),
-    ("sog", b"PK nothing", "x: is no readable ZIP file"),
+    ("sog", b"PK nothing", "x: is not a readable ZIP file"),
     ("sog", sog(lambda meta: meta.update(version=3)), "x: meta.json.version is 3"),
     ("sog", sog(lambda meta: meta.update(count=-1)), "x: meta.json.count is -1"),
     ("sog", sog(lambda meta: meta.update(count=10)), "x: "),
@@ -688,7 +688,7 @@ def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, pop: Pop) -> No
         assert re.search(r"would take [0-9,.]+ MB of memory to read, and the file has [0-9.]+ MB", line)
     assert sum(map(int, lines[1::2])) < 64, "MiB that all of them took over what importing took"
     told = pop("convert", tmp_path / "a.spz", tmp_path / "a.ply")
-    says(told, "a.spz", "numPoints of 2000000", "holds no such content")
+    says(told, "a.spz", "numPoints of 2000000", "too little for such content")
 
 
 def test_a_count_of_gaussians_and_arrays_of_a_run_are_held_against_their_file(tmp_path: Path) -> None:

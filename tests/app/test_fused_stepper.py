@@ -349,7 +349,7 @@ def test_the_fused_step_on_a_gpu_trains_batches_and_refuses_terms_that_it_does_n
 
 
 def test_a_strategy_of_somebody_else_takes_one_view_a_step() -> None:
-    with pytest.raises(PopError, match="batch_size is 2; it must be 1 with a strategy of somebody else"):
+    with pytest.raises(PopError, match="batch_size is 2; it must be 1 with a third-party strategy"):
         TrainingRun(tiny_config("x", batch_size=2), tiny_capture(), strategy=POPStrategy(), engine=torch_engine("fast"))
     with pytest.raises(PopError, match="batch_size is 0; it must be at least 1"):
         tiny_config("x", batch_size=0)

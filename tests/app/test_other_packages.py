@@ -160,7 +160,7 @@ def test_it_trains_saves_resumes_and_exports(site: Path, shared_capture: Path, t
     words = ("train", shared_capture, *own, "--method", "mine", "--backend", "mine", "--threads", "1")
     words = (*words, "--checkpoint-every", "5", "--skip-sizes", "--export", "numbers")
     out = call(site, "pop_fast.cli", *words, "--out", tmp_path / "whole")
-    assert "backend mine, as asked for" in out
+    assert "backend mine, as requested" in out
     config = json.loads((tmp_path / "whole" / "cfg.json").read_text())["resolved"]
     given = {"method": "mine", "backend": "mine", "photometric": "huber", "profile": "mine"}
     assert {name: config[name] for name in given} == given

@@ -64,7 +64,7 @@ def test_masks_are_found_under_all_usual_names_and_white_means_keep(tmp_path: Pa
 
 def test_masks_that_fit_no_photograph_or_hide_all_of_it_are_refused(root: Path) -> None:
     write_photograph(root / "masks" / "elsewhere.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
-    assert_one_line(lambda: raw(root), "masks", "no mask named as a photograph")
+    assert_one_line(lambda: raw(root), "masks", "no mask named like a photograph")
     write_photograph(root / "masks" / "02.png", np.zeros((HEIGHT, WIDTH), np.uint8))
     assert_one_line(lambda: raw(root), "02.png", "hides the whole photograph", "white means keep")
     write_photograph(root / "masks" / "02.png", np.full((WIDTH, HEIGHT), 255, np.uint8))
@@ -149,8 +149,8 @@ def test_reading_whole_and_bad_photographs_prints_nothing(tmp_path: Path, capfd:
     ("content", "word"),
     [
         (b"", "empty"),
-        (b"no picture at all", "is no image"),
-        (b"P5 2 2 255\n" + bytes(4), "is no image that states its size"),
+        (b"no picture at all", "is not an image"),
+        (b"P5 2 2 255\n" + bytes(4), "is not an image that states its size"),
         (b"\xff\xd8\xff", "truncated"),
     ],
 )
@@ -461,7 +461,7 @@ def test_what_is_no_video_is_one_line_and_leaves_nothing(clip: Path, tmp_path: P
             video.add(frame(2))
     out = tmp_path / "out"
     for name, message in (
-        *(("absent.mp4", "no such file"), ("text.mp4", "is no video that OpenCV can read")),
+        *(("absent.mp4", "no such file"), ("text.mp4", "is not a video that OpenCV can read")),
         *(("still.avi", "nothing moves in it"), ("cut.avi", "")),
     ):
         assert_one_line(lambda name=name: take_frames(tmp_path / name, out, count=4), str(tmp_path / name), message)

@@ -415,7 +415,7 @@ def test_floaters_are_left_out_of_a_file_by_their_places(
     many = len(params["means"])
     said = pop.done(*words, "--capture", shared_capture).out
     assert f"without floaters: {many:,} of {many + 1:,} Gaussians kept" in said
-    says(pop(*words, "--overwrite"), "floaters are found from the places of the photographs; give --capture")
+    says(pop(*words, "--overwrite"), "finding floaters needs the cameras; give --capture")
     # what points that were made up say of them is refused
     capture = replace(tiny_capture(), source="no points: 60 random ones (seed 0)")
     with pytest.raises(PopError, match="no sparse points of its own"):

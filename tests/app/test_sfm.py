@@ -362,7 +362,7 @@ def colors_at(view: View, points: np.ndarray) -> np.ndarray:
 
 def test_pictures_are_upright_and_every_point_keeps_its_pixel(pop: Pop, sideways: Path) -> None:
     outcome = pop("data", "check", sideways)
-    assert "3 are stored turned and shown upright" in outcome.out
+    assert "3 are stored rotated and shown upright" in outcome.out
     assert "LOOK  EXIF" not in outcome.out
     turned = {view.name: view for view in raw(sideways).views}
     (sideways / "sparse" / "upright.json").unlink()

@@ -54,7 +54,7 @@ def test_a_port_written_from_the_index_passes_in_npz_and_in_json(
     assert f"image         {drawn} of {drawn} vectors pass" in outcome.out
     assert "not there, not judged: depths, means2d, conics" in outcome.out
     assert "no result for, not judged: harmonics_of_degree_three, inria" in outcome.out
-    assert outcome.out.endswith("all that is there passes\n")
+    assert outcome.out.endswith("all arrays that are there pass\n")
     for path in port.iterdir():
         with np.load(path) as stored:
             text = json.dumps({name: stored[name].tolist() for name in stored.files})

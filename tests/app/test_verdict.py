@@ -49,14 +49,19 @@ def orbit(shares: list[float]) -> dict[str, float]:
         ("Overfitting", {}, "good", "training views 31.00 dB, held-out views 29.50 dB, 1.5 dB apart"),
         ("Overfitting", {"train_psnr": 34.0}, "look", "4.5 dB apart"),
         ("Overfitting", {"train_psnr": 34.5, "held_out_psnr": 24.5}, "bad", "10.0 dB apart"),
-        ("Overfitting", {"train_psnr": 39.5}, "look", "by heart and what lies in between less well, though close"),
-        ("Overfitting", {"train_psnr": 39.5, "steps": 9_000}, "look", "short already, 150 steps a photograph"),
+        (
+            "Overfitting",
+            {"train_psnr": 39.5},
+            "look",
+            "memorised its photographs and fits the views in between less well, though close",
+        ),
+        ("Overfitting", {"train_psnr": 39.5, "steps": 9_000}, "look", "already short, 150 steps a photograph"),
         ("Overfitting", {"held_out_psnr": None, "matched_psnr": None}, "look", "No view was held out"),
         ("Photographs", {}, "good", "60 trained on, neighbours 4.0 degrees apart"),
         ("Photographs", {"photographs": 11}, "look", "11 trained on"),
         ("Photographs", {"photographs": 11, "train_psnr": 30.0, "held_out_psnr": 24.0}, "bad", "too few"),
         ("Photographs", {"photographs": 11, "train_psnr": 36.0}, "look", "few"),
-        ("Photographs", {"train_psnr": 37.4, "held_out_psnr": 29.9}, "look", "not all that this subject takes"),
+        ("Photographs", {"train_psnr": 37.4, "held_out_psnr": 29.9}, "look", "not quite enough for this subject"),
         ("Photographs", {"neighbour_degrees": 25.0}, "look", "far apart"),
         ("Photographs", {"given": 66, "placed": 61}, "good", "60 trained on"),
         ("Photographs", {"given": 100, "placed": 68}, "look", "Cameras were found for 68 of 100 photographs. 60"),
@@ -77,12 +82,12 @@ def orbit(shares: list[float]) -> dict[str, float]:
         ("Fit", {"misfits": {"a": 0.02, "b": 0.05}}, "look", "3.5 % of a photograph is far from its render"),
         ("Fit", {"patches": {"a": 0.0, "b": 0.004}}, "good", "reach 31.00 dB"),
         ("Fit", {"patches": {"a": 0.0, "b": 0.006}}, "look", "0.3 % of a photograph has another colour"),
-        ("Fit", {"train_psnr": 21.0, "held_out_psnr": 19.0}, "look", "cameras that are wrong"),
+        ("Fit", {"train_psnr": 21.0, "held_out_psnr": 19.0}, "look", "or wrong cameras"),
         ("Fit", {"train_psnr": 18.09, "held_out_psnr": 17.0}, "bad", "contradict one another"),
         ("Fit", {"train_psnr": 18.09, "held_out_psnr": 17.0, "steps": 90}, "bad", "few steps"),
         ("Overfitting", {"train_psnr": 18.09, "held_out_psnr": 17.0}, "look", "both low"),
         # as close as these are, 6.2 dB say that they are not close enough
-        ("Photographs", SIX_APART, "bad", "not enough for what this subject takes, as the 6.2 dB"),
+        ("Photographs", SIX_APART, "bad", "not enough for this subject, as the gap of 6.2 dB"),
         # what few steps leave dark is no exposure yet
         ("Exposure", {"stops": {"a": 0.0, "b": 0.6}, "train_psnr": 20.0, "steps": 300}, "look", "Not to be told yet"),
         ("Exposure", {"stops": {"a": 0.0, "b": 0.6}, "train_psnr": 20.0, "steps": 3_000}, "look", "It drifts"),
@@ -191,7 +196,7 @@ def test_held_out_views_without_an_exposure_of_their_own_are_judged_after_scalin
     assert (kinds[0]["Quality"], kinds[0]["Overfitting"]) == ("bad", "bad")
     assert (kinds[1]["Quality"], kinds[1]["Overfitting"]) == ("good", "good")
     assert "25.50 dB on average. Each was scaled to its photograph's brightness" in learned[0].text
-    assert "16.50 dB as they are" in learned[0].text
+    assert "16.50 dB without scaling" in learned[0].text
     fell = ([700.0, 3000.0], [20.2, 16.7])
     told = [verdict({}, replace(GOOD, **measured, exposures_learned=on), fell) for on in (False, True)]
     assert ["Course" in {one.about for one in found} for found in told] == [True, False]

@@ -359,7 +359,7 @@ def test_what_bears_on_a_comparison_besides_the_method_stands_beside_it() -> Non
 def test_a_toy_is_said_to_tell_nothing_and_other_data_to_be_a_yardstick() -> None:
     runs = [*two("pop", n=40_000), *two("l2_blur")]
     for scale in ("toy", "shown"):
-        assert "Nothing here says anything of a method" in markdown(scale, runs)
+        assert "These numbers say nothing about a method" in markdown(scale, runs)
     assert telling() == ["paper", "full", "no_floor", "small"]
     text = markdown("small", runs)
     assert "NOT the paper's protocol" in text
@@ -412,7 +412,7 @@ def test_a_reading_is_judged_by_every_column_and_by_no_pair_of_rows_alone() -> N
     base = [whole("l2_blur", n=583, psnr=27.22, ssim=0.771), whole("reset", n=548, psnr=26.82, ssim=0.780)]
     told = a12([*base, whole("pop", **near), whole("pop_visible", **far)])
     assert told.says == (
-        "The runs speak for the default: of 6 columns 6 are nearer to the paper's under the default, 0 under "
+        "The runs favour the default: of 6 columns 6 are nearer to the paper's under the default, 0 under "
         "A12 visible, 0 alike, also without any one pair."
     )
     assert told.lines[0] == (
@@ -423,7 +423,7 @@ def test_a_reading_is_judged_by_every_column_and_by_no_pair_of_rows_alone() -> N
         *(("pop and reset", column) for column in ("N over N", "PSNR", "SSIM")),
     ]
     swapped = a12([*base, whole("pop", **far), whole("pop_visible", **near)])
-    assert swapped.says.startswith("The runs speak for A12 visible: of 6 columns 0 ")
+    assert swapped.says.startswith("The runs favour A12 visible: of 6 columns 0 ")
     # the pair that a claim rests on does not decide the reading under which that claim is judged
     alone = a12([base[0], whole("pop", **near), whole("pop_visible", **far)])
     assert alone.says.startswith("Not decided: of 3 columns 3 ")

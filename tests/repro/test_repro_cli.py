@@ -107,7 +107,7 @@ def test_a_row_that_was_killed_is_named_at_once(capsys, tmp_path, monkeypatch):
     words = ["--scale", "toy", "--rows", "l2_pop", "l1_div_100", "--results", tmp_path, "--work", tmp_path]
     told = call("queue", *words, status=1, capsys=capsys).splitlines()
     name = "l1_div_100 demo --scale toy --seed 42"
-    said = "was killed by SIGKILL; the queue, called again, continues with it"
+    said = "was killed by SIGKILL; the queue continues with it when it is run again"
     assert told[1:3] == [f"[1/2] {name}", f"[1/2] {name} {said}"]
     assert told[3].startswith("[2/2] ")
 

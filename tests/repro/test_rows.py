@@ -397,7 +397,7 @@ REFUSED: dict[str, tuple[Callable[[Path], object], dict[str, Any], str]] = {
     "another number of photographs": (
         lambda folder: None,
         {"n_images": VIEWS + 1},
-        "has 10 photographs with a camera where 11 are published (as is recalled;",
+        "has 10 photographs with a camera where 11 are published (recalled;",
     ),
     "no folder of shrunk photographs": (
         lambda folder: shutil.rmtree(folder / "images_2"),

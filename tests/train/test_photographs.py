@@ -298,11 +298,11 @@ def test_what_no_run_can_have_learned_is_refused_and_named(case: str, finished: 
 
 def test_the_line_about_the_backend_says_that_autograd_takes_the_steps(tmp_path: Path) -> None:
     asked = replace(tiny_config(tmp_path), backend="compiled")
-    assert choose_backend(asked)[1] == "backend compiled, as asked for"
+    assert choose_backend(asked)[1] == "backend compiled, as requested"
     said = choose_backend(replace(asked, refine_cameras=True))[1]
-    assert said == "backend compiled, as asked for; its fused step has no refine_cameras, so autograd takes the steps"
-    assert choose_backend(replace(asked, backend="fast", refine_cameras=True))[1] == "backend fast, as asked for"
-    assert choose_backend(replace(asked, exposure=True))[1] == "backend compiled, as asked for"
+    assert said == "backend compiled, as requested; its fused step has no refine_cameras, so autograd is used"
+    assert choose_backend(replace(asked, backend="fast", refine_cameras=True))[1] == "backend fast, as requested"
+    assert choose_backend(replace(asked, exposure=True))[1] == "backend compiled, as requested"
 
 
 # Coarse to fine: the laws judge what is seen at which step.

@@ -524,7 +524,7 @@ def test_a_class_is_graded_whatever_one_submission_does(tmp_path: Path, capsys: 
     assert "| anna | 6 |" in report
     assert "- bert: it runs for longer than 12 s; is there an endless loop?" in report
     assert "- cleo: it ended with status 7" in report
-    assert "- dora: what it prints cannot be told from a grade" in report
+    assert "- dora: its output cannot be distinguished from a grade" in report
     assert "- emil: it ended with status 1" in report
     assert "alpha.py, line 2: this is not Python yet" in report
     assert "notes" not in report

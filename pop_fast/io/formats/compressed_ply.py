@@ -121,7 +121,7 @@ def decode(data: bytes, path: Path) -> Cloud:
     """Read compressed PLY."""
     elements = _elements(data, path)
     if "chunk" not in elements or "vertex" not in elements:
-        raise PopError(f"{path}: has no element 'chunk' or 'vertex': it is no compressed PLY")
+        raise PopError(f"{path}: has no element 'chunk' or 'vertex': it is not a compressed PLY")
     chunks, words = elements["chunk"], elements["vertex"]
     n = len(words)
     if len(chunks) * _CHUNK < n:

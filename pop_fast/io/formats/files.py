@@ -43,7 +43,7 @@ def is_splat_file(path: Path) -> bool:
 
 
 def default_name(stem: str, name: str) -> str:
-    """Return the name of a file in a format, where nobody names it: no two formats share one."""
+    """Return the name of a file in a format, if it is not given: no two formats share one."""
     return f"{stem}.ply" if name == PLY else f"{stem}{FORMATS[name].mark}{FORMATS[name].suffix}"
 
 

@@ -227,7 +227,7 @@ def decode(data: bytes, path: Path) -> Cloud:
             check_members(path, archive, len(data), _WRITE_AGAIN)
             return _read(lambda name: _unzipped(archive, name, path), len(data), path)
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:
-        raise PopError(f"{path}: is no readable ZIP file ({error}); {_WRITE_AGAIN}") from error
+        raise PopError(f"{path}: is not a readable ZIP file ({error}); {_WRITE_AGAIN}") from error
 
 
 def decode_folder(path: Path) -> Cloud:

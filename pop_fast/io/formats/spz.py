@@ -258,7 +258,7 @@ def _checked_head(first: bytes, versions: Sequence[int], length: int, path: Path
     magic, *fields = _HEADER.unpack(first)
     head = _Head(*fields)
     if magic != MAGIC:
-        raise PopError(f"{path}: begins with {magic:#x}, not {MAGIC:#x}: it is no SPZ file")
+        raise PopError(f"{path}: begins with {magic:#x}, not {MAGIC:#x}: it is not an SPZ file")
     if head.version not in versions:
         raise PopError(f"{path}: version is {head.version}; write it as version 2, 3 or 4, which this program reads")
     if head.degree > 3:

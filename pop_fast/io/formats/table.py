@@ -29,7 +29,7 @@ class Format:
         encode: makes a file's bytes of Gaussians in the file's order.
         decode: reads them; the path is for errors.
         order: of the Gaussians in the file; None keeps theirs.
-        mark: what a file's name has before the suffix where nobody names it, so that no two formats share a name.
+        mark: what a file's name has before the suffix if it is not given, so that no two formats share a name.
         has_frame: whether it has room for the world that the splat is in.
         coarser: encoders that spend ever fewer bytes on view dependence, for files that have to be small.
     """

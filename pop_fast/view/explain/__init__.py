@@ -1,4 +1,4 @@
-"""Why a pixel looks as it does: what it is blended from, what the loss and POP do to it, where two renderers part."""
+"""Why a pixel looks as it does: what it is blended from, what the loss and POP do to it, where two renderers differ."""
 
 from __future__ import annotations
 

@@ -283,9 +283,9 @@ def _words(
         )
     if flip is None:
         far = max(abs(p - q) for p, q in zip(walks[0].pixel.color, walks[1].pixel.color, strict=True))
-        yield f"  every decision falls alike; the colours differ by {far:.1e}"
+        yield f"  every decision is the same; the colours differ by {far:.1e}"
         return
-    yield f"  {flip.decision} falls otherwise first, at Gaussian {flip.gaussian} (depth {flip.depth:.4g}):"
+    yield f"  {flip.decision} is the first decision that differs, at Gaussian {flip.gaussian} (depth {flip.depth:.4g}):"
     for side, words in zip(sides, (flip.first, flip.second), strict=True):
         yield f"  {side.name:{size}}  {words}"
     if flip.more:

@@ -101,7 +101,7 @@ _ZOOM = (21, 81)  # px, the smallest and the largest close-up
 
 
 def page(e: PixelExplanation, maps: Sequence[Map], differences: Sequence[str] = ()) -> str:
-    """Lay out the page, with maps of the same view, and lines that tell where two renderers part, if that was asked."""
+    """Lay out the page, with maps of the same view, and lines that tell where two renderers differ, if asked for."""
     pictures = {entry.name: entry.picture for entry in maps}
     drawn = sorted(e.blended, key=lambda row: -row.weight)[:_DRAWN]
     about = f"{e.width} x {e.height} px, profile {e.profile}, {e.n_gaussians:,} Gaussians; loss {e.objective}"
@@ -189,7 +189,7 @@ def _close_up(drawn: Sequence[Row]) -> int:
 def _light(e: PixelExplanation) -> str:
     return (
         "<h2>Where the light comes from</h2><p>Front to back: each splat takes its weight T alpha of the pixel, "
-        "in its own colour; hatched is the background, with what is left.</p>"
+        "in its own colour; the hatched part is the background, with the remaining light.</p>"
         f'<div class="lightbox">{light_bar(e)}</div><div class="ticks"><span>front, T = 1</span>'
         f"<span>T_final = {e.T_final:.5f}</span></div>"
     )

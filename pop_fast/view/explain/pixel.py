@@ -1,7 +1,7 @@
 """Explain one pixel: every entry of its tile's list, front to back, and a table of it for a terminal.
 
 The oracle walks the list and the transpose of that walk, for the few Gaussians of a large scene that can reach the
-pixel's tile; what POP adds stands beside it.
+pixel's tile; what POP adds stands next to it.
 """
 
 from __future__ import annotations
@@ -143,15 +143,15 @@ def explain_pixel(
         print(explanation)
 
     The numbers are the oracle's, in float64. Derivatives are of the photometric loss of the view, and those of the POP
-    term stand beside them.
+    term stand next to them.
 
     Args:
         scene: raw parameters, or what `explain_view` made of them; that is the dearer part when asked for many pixels.
         x: column, from 0 at the left.
         y: row, from 0 at the top.
         view: camera, photograph and mask; with raw parameters only.
-        config: as in `explain_view`, likewise.
-        sh_degree: as in `explain_view`, likewise.
+        config: as in `explain_view`.
+        sh_degree: as in `explain_view`.
 
     Raises:
         PopError: the pixel is outside the image, or raw parameters come without a view.
@@ -278,7 +278,7 @@ def _pop_note(scene: ExplainedView) -> str:
         return "this objective has no POP term"
     stop = scene.config.strategy.pop_stop_iter
     if scene.step is not None and scene.step >= stop:
-        return f"in this run the POP term ended with step {stop - 1}; shown is what it would do now"
+        return f"in this run the POP term ended with step {stop - 1}; the table shows what it would do now"
     return ""
 
 

@@ -222,7 +222,7 @@ def view_maps(scene: ExplainedView) -> list[Map]:
         scaled(
             "importance",
             "Important light",
-            "share of the pixel's weight that is of Gaussians that dominate a pixel somewhere in the view",
+            "share of the pixel's weight from Gaussians that dominate some pixel of the view",
             shares[0],
             "viridis",
             1.0,

@@ -92,7 +92,7 @@ def view_distances(cameras: Sequence[PageCamera], means: Tensor) -> list[float]:
 def first_view(cameras: Sequence[PageCamera]) -> int:
     """Return the camera that a page starts with: of those that have what all look at in the middle, the most typical.
 
-    The subject is the point that is nearest to all optical axes. In the middle is what lies within a quarter of the
+    The subject is the point that is nearest to all optical axes. In the middle is what is within a quarter of the
     image's size from its centre; where no camera has the subject there, all are asked. Of these, the half that stands
     farthest away, which cuts least of the subject, and of that half the one whose direction from the subject is nearest
     to those of all cameras: the largest sum of cosines, the first of equals. Of cameras that look at no one point, as

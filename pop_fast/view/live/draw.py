@@ -1,4 +1,4 @@
-"""What one browser shows: a camera, a size, a mode and what is left out, the picture of these, and the panel beside it.
+"""What one browser shows: a camera, a size, a mode and what is left out, their picture, and the panel next to it.
 
 The splat is at rest, or of a training between its steps. A recorded path of cameras is a JSON file, which
 `pop render --path FILE` takes.
@@ -269,9 +269,9 @@ def _camera(entry: Any, where: str) -> KeyCamera:
     except (TypeError, KeyError, ValueError, OverflowError) as error:
         raise PopError(f"{where}: needs viewmat and fov_y_degrees ({error}); {_FIX}") from error
     if viewmat.shape != (4, 4) or not np.allclose(viewmat[:3, :3] @ viewmat[:3, :3].T, np.eye(3), atol=1e-4):
-        raise PopError(f"{where}: viewmat is no rigid 4 x 4 matrix; {_FIX}")
+        raise PopError(f"{where}: viewmat is not a rigid 4 x 4 matrix; {_FIX}")
     if not np.isfinite(viewmat).all() or not np.array_equal(viewmat[3], [0.0, 0.0, 0.0, 1.0]):
-        raise PopError(f"{where}: viewmat is no rigid 4 x 4 matrix; {_FIX}")
+        raise PopError(f"{where}: viewmat is not a rigid 4 x 4 matrix; {_FIX}")
     if np.linalg.det(viewmat[:3, :3]) < 0.0:
         raise PopError(f"{where}: viewmat is mirrored, which no camera is; {_FIX}")
     if not 0.0 < degrees < 180.0:
@@ -343,7 +343,7 @@ class Panel:
             self._use(control, interval(control.min, control.max), self._update)
 
     def close(self) -> None:
-        """Forget the controls, which nobody can set any more."""
+        """Forget the controls, which can no longer be set."""
         for name in self._controls:
             self._rules.pop(name, None)
 

@@ -97,9 +97,9 @@ def _decoded(data: Any) -> dict[str, Any]:
         message = importlib.import_module("msgspec.msgpack").decode(data)
     # text instead of bytes, a broken message, one that is too deep
     except (TypeError, ValueError, RecursionError) as error:
-        raise PopError(f"a browser sent what is no message ({error})") from error
+        raise PopError(f"a browser sent something that is not a message ({error})") from error
     if not isinstance(message, dict):
-        raise PopError("a browser sent what is no message")
+        raise PopError("a browser sent something that is not a message")
     return message
 
 
@@ -141,7 +141,7 @@ def _check_update(message: dict[str, Any], rules: Mapping[str, Rule]) -> None:
     """Check a value that a control was set to."""
     control, updates = message.get("uuid"), message.get("updates")
     if message.keys() != {"uuid", "updates"} or not isinstance(control, str) or control not in rules:
-        raise PopError(f"a browser set {_short(control)}, which is no control of the viewer")
+        raise PopError(f"a browser set {_short(control)}, which is not a control of the viewer")
     # viser would set any field of the control that is named here
     if not isinstance(updates, dict) or updates.keys() != {"value"}:
         raise PopError("a browser set more of a control than its value")
@@ -261,7 +261,7 @@ class Guard:
         if not word or not hmac.compare_digest(word[0].encode(), self.token.encode()):
             return HTTPStatus.FORBIDDEN, "Open the whole address that was printed, with the word after the port.\n"
         if socket_asked and self._views >= MOST_VIEWS:
-            return HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_VIEWS} browsers are here already.\n"
+            return HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_VIEWS} browsers are already connected.\n"
         return None
 
     def _names(self, arrived_at: str) -> set[str]:
@@ -363,6 +363,6 @@ def _resolved(host: str) -> str:
     asking.join(0.9)
     if not found:
         raise PopError(
-            f"the viewer cannot listen on {host!r}, which is no address of this machine; give --host another"
+            f"the viewer cannot listen on {host!r}, which is not an address of this machine; give another --host"
         )
     return found[0]

@@ -164,7 +164,7 @@ class LiveViewer:
         self.host, self.port = host, int(listening.getsockname()[1])
         self._lines = 0
         self._guard = Guard(host, listening, self._tell)
-        # it prints a box of its own, whatever `verbose` is
+        # it prints its own box, whatever `verbose` is
         with self._guard.around_viser(), redirect_stdout(io.StringIO()):
             self._server = viser.ViserServer(host=host, port=self.port, label=title, verbose=False)
         self._forget_sharing()
@@ -261,7 +261,7 @@ class LiveViewer:
         """Print why a view was closed, a bounded number of times."""
         self._lines += 1
         if self._lines <= _MOST_LINES:
-            last = "; what follows of this kind is not shown" if self._lines == _MOST_LINES else ""
+            last = "; further notes of this kind are not shown" if self._lines == _MOST_LINES else ""
             print(f"note: the viewer closed a view: {why}{last}", file=sys.stderr, flush=True)
 
     def _forget_sharing(self) -> None:

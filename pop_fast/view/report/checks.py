@@ -213,7 +213,7 @@ def are_floaters(means: Tensor, capture: Capture, test_every: int) -> Tensor:
     cameras look too. Random points say nothing of where things are, and a PopError says so.
     """
     if _RANDOM in capture.source:
-        raise PopError(f"{capture.name}: has no sparse points of its own, without which floaters are not told from it")
+        raise PopError(f"{capture.name}: has no sparse points of its own, which are needed to find floaters")
     found = torch.zeros(len(means), dtype=torch.bool)
     for view in (*capture.views, *orbit_views(capture.train_views(test_every))):
         limit = near_limit(view, capture.points)

@@ -97,9 +97,9 @@ def _quality(psnr: float | None, checks: Checks | None) -> Iterator[Finding]:
     by_view, notes = {} if checks is None else checks.held_out, ""
     if checks is not None and checks.exposures_learned and checks.held_out_psnr is not None:
         notes += (
-            " Each was scaled to its photograph's brightness, as exposures were learned, of which these views have "
+            " Each was scaled to its photograph's brightness, because exposures were learned for training views only; "
         )
-        notes += f"none; {checks.held_out_psnr:.2f} dB as they are."
+        notes += f"{checks.held_out_psnr:.2f} dB without scaling."
     if len(by_view) > 1:
         worst = min(by_view, key=lambda name: by_view[name])
         rest = float(np.mean([value for name, value in by_view.items() if name != worst]))
@@ -131,7 +131,7 @@ def _course(held_out: tuple[Sequence[float], Sequence[float]] | None, fewer: flo
     best = int(np.argmax(values))
     text = (
         f"Held-out PSNR fell from {values[best]:.2f} dB after {steps[best]:,.0f} steps to {values[-1]:.2f} dB after "
-        f"{steps[-1]:,.0f}: what was learned since fits the training photographs alone. Fewer steps, or more "
+        f"{steps[-1]:,.0f}: later steps fit only the training photographs. Use fewer steps, or more "
         "photographs."
     )
     yield Finding("bad", "Course", text, ("train", "DATA", "--steps-scaler", f"{fewer:.2g}"))
@@ -139,15 +139,13 @@ def _course(held_out: tuple[Sequence[float], Sequence[float]] | None, fewer: flo
 
 def _unfitting(checks: Checks) -> Iterator[Finding]:
     """Judge whether the training views fit: what training could not reach there is no question of views in between."""
-    text = f"training views, which it has seen, reach {checks.train_psnr:.2f} dB"
+    text = f"training views reach {checks.train_psnr:.2f} dB"
     if checks.train_psnr >= _FITS:
         yield _parts(checks, text)
         return
     short = " The run had few steps for it." if _too_short(checks) else ""
     more = _MORE_STEPS if short else ("data", "check", "DATA")
-    why = (
-        f"{text}.{short} A subject or a light that moved, or cameras that are wrong, leave photographs that contradict "
-    )
+    why = f"{text}.{short} A subject or a light that moved, or wrong cameras, make photographs contradict "
     why += "one another"
     yield Finding("bad" if checks.train_psnr < _FITS_BADLY else "look", "Fit", f"They do not all fit: {why}.", more)
 
@@ -161,9 +159,9 @@ def _parts(checks: Checks, text: str) -> Finding:
             return Finding("good", "Fit", f"They fit together: {text}.")
     worst = max(shares, key=lambda name: shares[name])
     why = (
-        f"But for parts they fit: {text}; {100.0 * _mean(shares):.1f} % of a photograph {what}, most in {worst}, "
-        f"{100.0 * shares[worst]:.1f} %. Something moved, or mirrors what did. "
-        "A mask leaves it out: masks/NAME.png for photograph NAME, black where it moved, white elsewhere."
+        f"They fit except for parts: {text}; {100.0 * _mean(shares):.1f} % of a photograph {what}, most in {worst}, "
+        f"{100.0 * shares[worst]:.1f} %. Something moved, or reflects something that did. "
+        "A mask excludes it: masks/NAME.png for photograph NAME, black where it moved, white elsewhere."
     )
     return Finding("look", "Fit", why, ("data", "check", "DATA"))
 
@@ -188,7 +186,7 @@ def _is_close(checks: Checks) -> bool:
 
 def _overfitting(checks: Checks, fewer: float | None) -> Iterator[Finding]:
     if checks.held_out_psnr is None:
-        text = "No view was held out, so that nothing says how views between the photographs look."
+        text = "No view was held out, so nothing measures the views between the photographs."
         yield Finding("look", "Overfitting", text, ("train", "DATA", "--test-every", "8"))
         return
     gap = _gap(checks)
@@ -196,7 +194,7 @@ def _overfitting(checks: Checks, fewer: float | None) -> Iterator[Finding]:
     if gap < _SOME_OVERFITTING:
         if checks.train_psnr < _FITS:
             # little of it says nothing good where the training views are missed as well
-            text = f"Not the trouble here: {numbers}, {gap:.1f} dB apart, both low."
+            text = f"Not the problem here: {numbers}, {gap:.1f} dB apart, both low."
             yield Finding("look", "Overfitting", text, _MORE_STEPS if _too_short(checks) else ("data", "check", "DATA"))
             return
         yield Finding("good", "Overfitting", f"Little: {numbers}, {gap:.1f} dB apart.")
@@ -205,11 +203,11 @@ def _overfitting(checks: Checks, fewer: float | None) -> Iterator[Finding]:
     text = f"{'Some' if gap < _OVERFITTED else 'Much'}: {numbers}, {gap:.1f} dB apart."
     if gap >= _OVERFITTED:
         less = "less well, though close" if _is_close(checks) else "little"
-        text += f" The splat knows its photographs by heart and what lies in between {less}."
+        text += f" The splat has memorised its photographs and fits the views in between {less}."
     # no two findings send to schedules of two lengths
     steps = checks.steps or Recipe.max_steps
     if fewer is None and steps <= LOOKS * checks.photographs:
-        text += f" The schedule is short already, {steps / checks.photographs:.0f} steps a photograph."
+        text += f" The schedule is already short, {steps / checks.photographs:.0f} steps a photograph."
         yield Finding("look" if some else "bad", "Overfitting", text, ("data", "check", "DATA"))
         return
     scaler = fewer or max(steps / 2.0, LOOKS * checks.photographs) / Recipe.max_steps
@@ -222,7 +220,7 @@ def _photographs(checks: Checks) -> Iterator[Finding]:
     Photographs without a camera are none, and are said where they are a tenth of those that were given.
     """
     n, apart, gap = checks.photographs, checks.neighbour_degrees, _gap(checks)
-    spacing = "" if apart is None else f", neighbours {apart:.1f} degrees apart as the subject sees them (median)"
+    spacing = "" if apart is None else f", neighbours {apart:.1f} degrees apart as seen from the subject (median)"
     few, far = n < FEW, apart is not None and apart > FAR_APART
     missing = gap >= _OVERFITTED
     given, placed = checks.given or n, checks.placed or n
@@ -236,7 +234,7 @@ def _photographs(checks: Checks) -> Iterator[Finding]:
         return
     close = _is_close(checks)
     why = "few" if few else "far apart" if far else ""
-    why = why or f"{'not all that' if close else 'not enough for what'} this subject takes, as the {gap:.1f} dB show"
+    why = why or f"not {'quite ' if close else ''}enough for this subject, as the gap of {gap:.1f} dB shows"
     kind = "look"
     if gap >= _SOME_OVERFITTING and not close:
         kind, why = "bad", f"too {why}" if few or far else why
@@ -270,9 +268,9 @@ def _exposure(checks: Checks) -> Iterator[Finding]:
         text = f"Not to be told yet, as the run had few steps: {differ}{gain}"
         yield Finding("look", "Exposure", text, _MORE_STEPS)
         return
-    what = "It drifts" if spread >= _DRIFT or won >= _WON else "Even, but for some"
+    what = "It drifts" if spread >= _DRIFT or won >= _WON else "Even, except for some"
     text = f"{what}: {differ}{gain}"
-    text += " Lock exposure and white balance next time; for these photographs, learn each one's."
+    text += " Lock exposure and white balance next time; for these photographs, learn each exposure."
     yield Finding("bad" if spread > 2.0 * _DRIFT else "look", "Exposure", text, ("train", "DATA", "--exposure"))
 
 
@@ -293,15 +291,16 @@ def _floating(checks: Checks) -> Iterator[Finding]:
     judged, without = checks.judged_psnr, checks.without_floaters
     then = "" if judged is None or without is None else f"held-out views have {without:.2f} dB instead of {judged:.2f}"
     if judged is not None and without is not None and judged - without > _DEAR:
-        text += f" They stand for what photographs show, things that moved or light that changed: without them {then}."
+        text += " They represent something in the photographs, such as things that moved or light that changed: "
+        text += f"without them {then}."
         yield Finding("look", "Floaters", text, ("data", "check", "DATA"))
         return
     few = float(values.mean()) < _FLOATERS and values.max() < _VEIL
     covered = [name for name, share in checks.orbit_floaters.items() if share >= _VEIL]
     if covered:
         text += f" A veil hides much of {len(covered)} views between the photographs, as in {covered[0]}."
-    text += " Leaving out those whose centres stand there takes part of it away" + (f"; {then}." if then else ".")
-    text += " The command leaves out what reaches in from beside the pictures, too, and tunes the rest."
+    text += " Leaving out those whose centres are there removes part of it" + (f"; {then}." if then else ".")
+    text += " The command also removes Gaussians that reach in from outside the pictures, and tunes the rest."
     fix = ("export", "RESULT", "--to", "html", "--without-floaters")
     yield Finding("look" if few else "bad", "Floaters", text, fix)
 

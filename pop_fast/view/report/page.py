@@ -58,7 +58,7 @@ def page(data: ReportData) -> str:
             open_section(data.links),
             command_section(data.commands),
             _tables(data),
-            "<footer>Written by <code>pop</code> from the files beside it; nothing comes from the network.</footer>",
+            "<footer>Written by <code>pop</code> from the files next to it; nothing comes from the network.</footer>",
         ]
     )
     framed = viewer_script() if is_framed(data.viewer) else ""
@@ -94,7 +94,7 @@ def _curves(data: ReportData) -> str:
         key += f"<span>dashed: opacity reset at {', '.join(f'{step:g}' for step in data.resets)}</span>"
     return (
         "<h2>Training</h2>"
-        "<p>Against the iteration. The coloured bars above each plot are the stretches of the schedule.</p>"
+        "<p>Values over the iterations. The coloured bars above each plot are the phases of the schedule.</p>"
         f'<div class="legend key">{key}</div><div class="charts">{"".join(charts)}</div>'
     )
 
@@ -184,8 +184,8 @@ def _cell(value: Any) -> str:
 _LARGEST_FILM: Final = 8 * 2**20
 _SIGNS: Final = {"good": ("✓", "as it should be"), "look": ("!", "worth a look"), "bad": ("✗", "spoils the result")}
 _UNCHECKED: Final = (
-    "<p>Overfitting, exposure, floaters, depth and the orbit were not looked at; "
-    "<code>pop report RESULT --check</code> does it, where the capture is.</p>"
+    "<p>Overfitting, exposure, floaters, depth and the orbit were not checked; "
+    "<code>pop report RESULT --check</code> does it if the capture is there.</p>"
 )
 
 
@@ -208,8 +208,8 @@ def orbit_section(orbit: tuple[str, bytes] | None) -> str:
     if orbit is None:
         return ""
     path, data = orbit
-    about = "A turn about what the cameras look at, as far round as photographs were taken; where they look at no one "
-    about += "thing, as on a walk or in a room, a path through them."
+    about = "An orbit around what the cameras look at, as far round as photographs were taken. If they look at no one "
+    about += "thing, as on a walk or in a room, it is a path through them."
     if len(data) > _LARGEST_FILM:
         return f"<h2>The orbit</h2><p>{about} {_link(path, path)}, {len(data) / 1e6:.0f} MB.</p>"
     uri = f"data:video/webm;base64,{base64.b64encode(data).decode('ascii')}"
@@ -226,7 +226,7 @@ def open_section(links: Sequence[tuple[str, str, int]]) -> str:
         f"<tr><td>{escape(name)}</td><td>{_link(path, path)}</td><td class=n>{_size(size)}</td></tr>"
         for name, path, size in links
     )
-    return f'<h2>Beside this page</h2><div class="scroll"><table><tbody>{rows}</tbody></table></div>'
+    return f'<h2>Next to this page</h2><div class="scroll"><table><tbody>{rows}</tbody></table></div>'
 
 
 def command_section(commands: Sequence[tuple[str, str]]) -> str:
@@ -237,7 +237,7 @@ def command_section(commands: Sequence[tuple[str, str]]) -> str:
         for line, folder in commands
     )
     later = " The first began the run, the others resumed it." if len(commands) > 1 else ""
-    return f"<h2>The command</h2><p>What made this result.{later}</p>{lines}"
+    return f"<h2>The command</h2><p>This command made the result.{later}</p>{lines}"
 
 
 def _link(path: str, words: str) -> str:
@@ -269,7 +269,7 @@ def viewer_section(page: str | None) -> str:
     """Show the page that shows the splat, in a frame of its own; nothing where there is none."""
     if page is None:
         return ""
-    about = "Drag, pinch or use the arrows; it starts at a training camera. The same page lies beside this report as "
+    about = "Drag, pinch or use the arrows; it starts at a training camera. The same page is next to this report as "
     about += '<a href="viewer.html">viewer.html</a>.'
     if not is_framed(page):
         return f'<h2>The splat</h2><p>{len(page) / 1e6:.0f} MB, in <a href="viewer.html">viewer.html</a>.</p>'
@@ -294,7 +294,7 @@ def sizes_section(table: Sequence[Sequence[str]]) -> str:
     )
     return (
         "<h2>Files</h2><p>The splat in every format that <code>pop export --to FORMAT</code> writes, and the PSNR of "
-        "some held-out views when it is read back from there.</p>"
+        "some held-out views after reading the file back.</p>"
         f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
     )
 

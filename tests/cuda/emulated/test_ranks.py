@@ -287,7 +287,7 @@ def test_two_processes_on_a_machine_of_eight_gpus_train_on_two_of_them(gpu, tmp_
     words += ["--batch-size", "2", "--threads", "1", "--skip-sizes", "--skip-checks", "--max-renders", "1"]
     first, second = launched(["-c", OF_EIGHT, *words])
     assert (first.status, second.status) == (0, 0), (first.err, second.err)
-    assert "backend cuda: a GPU and the build are here\nnote: 2 of 8 GPUs are used; torchrun" in first.out
+    assert "backend cuda: there is a GPU, and the extension is built\nnote: 2 of 8 GPUs are used; torchrun" in first.out
     assert ("chosen [0]" in first.err, "chosen [1]" in second.err) == (True, True)
     stats = json.loads(next((tmp_path / "r" / "stats").glob("val_step*.json")).read_text())
     assert (stats["backend"], stats["stepper"]) == ("cuda", "cuda")
