@@ -38,7 +38,8 @@ _SMALLER = """## Smaller
 |---|---|
 | `--min-opacity A` | Gaussians with a lower opacity; below 1/255 no picture changes |
 | `--crop XMIN YMIN ZMIN XMAX YMAX ZMAX` | Gaussians with their centre outside a box in the capture's own world frame |
-| `--without-floaters` | Gaussians that float in front of a camera where nothing was photographed, and veils; the rest is tuned |
+| `--without-floaters` | Gaussians that float in front of a camera where nothing was photographed, and veils; \
+the rest is tuned |
 | `--final-prune SHARE` | the Gaussians that contribute least and together make up this share of all blending weights |
 | `--max-gaussians N` | all but the N Gaussians with the highest scores |
 | `--target-mb M` | whatever does not fit into M megabytes: Gaussians with the lowest scores, bands of the colours, \
