@@ -447,6 +447,7 @@ def test_it_is_compiled_once_older_versions_go_and_a_run_that_has_it_loaded_goes
     assert get_backend("compiled").why_not() is None
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_a_change_of_the_source_and_another_processor_ask_for_a_new_build_and_leave_the_first_ones(
     fresh: Path, monkeypatch: pytest.MonkeyPatch

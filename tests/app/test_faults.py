@@ -96,6 +96,7 @@ JOBS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("job", JOBS)
 @pytest.mark.parametrize("part", ["crashes", "writes"])
 def test_a_sudden_end_or_a_refused_change_leaves_sound_files(tried: dict[str, Any], part: str, job: str) -> None:
@@ -131,6 +132,7 @@ except RuntimeError as error:
 """
 
 
+@pytest.mark.slow
 def test_another_bit_and_another_stepper_are_noticed(tried: dict[str, Any]) -> None:
     if "skipped" in tried["crashes"]:
         pytest.skip(tried["crashes"]["skipped"]["skipped"])
@@ -139,6 +141,7 @@ def test_another_bit_and_another_stepper_are_noticed(tried: dict[str, Any]) -> N
     assert outcome.out.splitlines() == ["the bits differ", "native step: status 0, steps by torch"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("check", [*sanitizers.CHECKS, sanitizers.EMULATION])
 def test_the_units_of_cpp_are_clean_under_sanitizers(tried: dict[str, Any], check: str) -> None:
     found = tried["sanitizers"]["checks"][check]

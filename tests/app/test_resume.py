@@ -228,6 +228,7 @@ def test_two_processes_train_to_the_bits_of_one(together: Path, tmp_path: Path, 
     assert sorted(path.name for path in theirs.iterdir()) == sorted(path.name for path in alone.iterdir())
 
 
+@pytest.mark.slow
 @needs_gloo
 def test_one_process_continues_what_two_began(together: Path) -> None:
     train(together / "left", "fast", "pop", resume=True)

@@ -44,6 +44,7 @@ def port(shared_vectors: Path, made_once: Callable[..., Path]) -> Path:
     return made_once("port", make) / "results"
 
 
+@pytest.mark.slow
 def test_a_port_written_from_the_index_passes_in_npz_and_in_json(
     pop: Pop, shared_vectors: Path, port: Path, tmp_path: Path
 ) -> None:

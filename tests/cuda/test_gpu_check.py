@@ -187,6 +187,7 @@ def test_a_commit_is_known_without_git(tmp_path, monkeypatch):
     assert first_line(["printf", "one\ntwo\n"]) == "one"
 
 
+@pytest.mark.slow
 def test_a_training_is_reported_with_its_loading_apart(tmp_path):
     assert pop(["demo", str(tmp_path / "toy"), "--views", "8", "--width", "40", "--height", "32"]) == 0
     one = train_one(check(tmp_path, steps_scaler=0.001), tmp_path / "toy", 120.0, backend="fast")

@@ -339,6 +339,7 @@ PACKED = STRANGER.replace("absgrad=False,", "sparse_grad=False, absgrad=False,")
 )
 
 
+@pytest.mark.slow
 def test_one_cause_that_breaks_several_laws_is_told_once_with_where_it_was_raised(
     stranger: Judged, tmp_path: Path
 ) -> None:
@@ -630,6 +631,7 @@ def test_every_profile_but_explore_ignores_seeds_and_what_earlier_runs_kept(prof
     assert kept.max_examples == EXAMPLES[profile]
 
 
+@pytest.mark.slow
 def test_exploring_draws_by_the_seed(tmp_path: Path) -> None:
     test = tmp_path / "test_drawn.py"
     test.write_text(

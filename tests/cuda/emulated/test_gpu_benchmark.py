@@ -96,6 +96,7 @@ def test_gsplat_is_measured_beside_the_same_case(bench, monkeypatch, tmp_path):
     assert found["kernel_ratios"]["step"] == kernels
 
 
+@pytest.mark.slow
 def test_what_fails_is_told_and_takes_nothing_from_the_rest(bench, monkeypatch, tmp_path):
     """A part, a case and a scene that cannot be: each is told, and what comes after it is measured."""
 

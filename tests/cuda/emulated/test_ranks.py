@@ -279,6 +279,7 @@ sys.exit(status)
 """
 
 
+@pytest.mark.slow
 @needs_gloo
 def test_two_processes_on_a_machine_of_eight_gpus_train_on_two_of_them(gpu, tmp_path: Path) -> None:
     folder = tmp_path / "toy"
