@@ -263,7 +263,7 @@ def _leave_out_floaters(left: Limited, limits: LimitOptions, shown: Shown) -> No
     Of what a veil leaves out photographs show a little, which the rest has to learn.
     """
     if shown.photographed is None:
-        raise PopError("floaters are found from the places of the photographs; give --capture DIR")
+        raise PopError("finding floaters needs the cameras; give --capture DIR")
     from pop_fast.train import compact
     from pop_fast.train.engines import renderer
     from pop_fast.view.report.checks import are_floaters, are_veils

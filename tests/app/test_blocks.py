@@ -279,7 +279,7 @@ def test_processes_that_train_together_and_the_viewer_are_refused(train: Train, 
 
 
 def test_parts_ask_for_what_comes_before_them(pop: Pop, result, blocks):
-    assert "is no run in blocks" in pop("blocks", "merge", result).err
+    assert "is not a run in blocks" in pop("blocks", "merge", result).err
     assert "its blocks are 0_0, 1_0" in pop("blocks", "train", blocks, "7_7").err
     assert "its blocks are 0_0, 1_0" in pop("blocks", "train", blocks).err
     assert "leave 0_0 out" in pop("blocks", "merge", blocks, "0_0").err

@@ -416,4 +416,4 @@ def test_no_child_of_a_training_in_blocks_does(planted: tuple[Path, Path], share
     said = call(folder, [("pop", words)], ENDED)
     assert not marker.exists(), f"{marker.read_text()}\n{said}"
     # said by the child itself
-    assert "out: is no run in blocks" in said, said
+    assert "out: is not a run in blocks" in said, said

@@ -131,7 +131,7 @@ def test_parts_are_done_by_name_and_a_run_without_a_coarse_model_has_none(pop: P
         (("--blocks", "2x1", "--blocks-coarse", "1"), "--blocks-coarse is 1; it must be from 2 to 16"),
         (("--blocks", "2x1", "--blocks-coarse", "17"), "it must be from 2 to 16"),
         (("--blocks", "2x1", "--blocks-coarse", "2", "--blocks-rounds", "0"), "needs rounds"),
-        (("--blocks-coarse", "2"), "say --blocks 2x2 too"),
+        (("--blocks-coarse", "2"), "add --blocks 2x2"),
     ],
 )
 def test_what_cannot_be_is_said_in_a_line(train: Train, tmp_path, words, said):

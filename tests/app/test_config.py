@@ -639,7 +639,7 @@ def test_what_was_chosen_for_few_photographs_is_said_kept_reported_and_gone_on_w
     resolved = json.loads((tmp_path / "r" / "cfg.json").read_text())["resolved"]
     assert resolved["depth_lambda"] == weight
     data = read_result(tmp_path / "r")
-    assert "as 7 photographs are few" in data.config["chosen by the run"]
+    assert "because 7 photographs are few" in data.config["chosen by the run"]
     # an explicit number of held-out views is not reported again
     said = pop(*words, "--overwrite", "--test-every", "4", "--depth-lambda", "0")
     assert "held out for measuring" not in said.out

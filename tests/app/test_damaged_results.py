@@ -176,7 +176,7 @@ def test_every_defect_of_a_checkpoint_is_named_with_its_tensor_before_it_is_expo
 def test_an_unsaved_result_and_an_absent_capture_are_named(pop: Pop, capture: Path, result: Path) -> None:
     gone, path = capture.parent / "gone", result / SETTINGS
     path.write_bytes(under("data", str(gone), "resolved")(path.read_bytes()))
-    says(pop("eval", result), str(gone), "not there", "--capture DIR")
+    says(pop("eval", result), str(gone), "which is missing", "--capture DIR")
     pop.done("eval", result, "--capture", capture)
     for path in [*(result / "ckpts").iterdir(), *(result / "ply").iterdir()]:
         path.unlink()

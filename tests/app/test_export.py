@@ -252,7 +252,7 @@ def test_a_conversion_writes_a_page_and_what_its_name_promises(pop: Pop, export:
         ("gone.ply b.spz", "gone.ply: the PLY file is absent"),
         ("gone.sog b.spz", "gone.sog: the file is absent"),
         ("a.ply b.obj", "must end in one of"),
-        ("a.ply a.ply", "is the splat that is read"),
+        ("a.ply a.ply", "is the input file"),
         ("a.ply there.spz", "exists; pass --overwrite"),
         ("a.ply b.html --to sog", "a page ends in .html, but --to is sog"),
         ("a.ply b.ksplat", "b.ksplat: is of a format that is read and not written"),
