@@ -108,7 +108,7 @@ class Job:
         if self.coarse and not 2 <= self.coarse <= _MOST_COARSE:
             raise PopError(f"--blocks-coarse is {self.coarse}; it must be from 2 to {_MOST_COARSE}, or 0 for none")
         if self.coarse and self.rounds == 0:
-            raise PopError("--blocks-coarse needs rounds, in which blocks are trained; say --blocks-rounds 2 too")
+            raise PopError("--blocks-coarse needs rounds, in which blocks are trained; add --blocks-rounds 2")
 
     @property
     def trained_first(self) -> list[str]:

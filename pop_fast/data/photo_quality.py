@@ -73,7 +73,7 @@ class Shown:
     exif: Exif = field(default_factory=Exif)  # what its camera noted
     digest: str = ""  # of the file's bytes
     sharpness: float = 0.0  # variance of the Laplacian, gray
-    # of what is not transparent, where a photograph has alpha
+    # of the pixels that are not transparent
     brightness: float = 0.0  # mean gray, 0 to 255
     dark: float = 0.0  # share of pixels under 4
     bright: float = 0.0  # share of pixels over 251
@@ -97,7 +97,7 @@ def measure(path: Path, image: np.ndarray, name: str) -> Shown:
     height, width = image.shape[:2]
     gray = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_RGB2GRAY)
     small = _shrunk(gray)
-    # what is cut out of its background tells nothing of the exposure there
+    # transparent pixels say nothing about the exposure
     shown = small if image.shape[2] == 3 else small[_shrunk(np.ascontiguousarray(image[:, :, 3])) > 127]
     if not shown.size:
         shown = small
