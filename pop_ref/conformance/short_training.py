@@ -244,11 +244,10 @@ def clear_watch(first_seed: int, **asks: Any) -> Watch:
 
 def _clear(watch: Watch, view: int) -> bool:
     scene = watch.scene(view, watch.steps)
-    if not np.all(clear_of_extents(scene, np.float32)):
-        return False
     bounds = pixel_error_bounds(scene, np.float32)
     decided = watch.masked or bool(np.all(bounds.smooth & bounds.decided))
-    return decided and not np.any(bounds.screen.kinked)
+    # pixels first: they rule out most scenes
+    return decided and not np.any(bounds.screen.kinked) and bool(np.all(clear_of_extents(scene, np.float32)))
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import copy
+import functools
 import importlib
 import importlib.abc
 import importlib.util
@@ -20,7 +21,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.machinery import ModuleSpec
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import Any, Final
 
 import numpy as np
@@ -245,7 +246,19 @@ def tried_on(function: Callable[..., Any], truth: Callable[..., Any], given: tup
 
 def _written_to(kept: tuple[Any, ...], after: tuple[Any, ...]) -> tuple[Any, ...]:
     # what is added to once more later must not change what is kept here
-    return tuple(copy.deepcopy(a) for b, a in zip(kept[0], after, strict=True) if repr(b) != repr(a))
+    return tuple(copy.deepcopy(a) for b, a in zip(kept[0], after, strict=True) if not _is_still(b, a))
+
+
+def _is_still(before: Any, after: Any) -> bool:
+    if isinstance(before, np.ndarray):
+        return np.array_equal(before, after, equal_nan=before.dtype.kind == "f")
+    if isinstance(before, list | tuple):
+        return len(before) == len(after) and all(map(_is_still, before, after))
+    if hasattr(before, "__dataclass_fields__"):
+        return all(_is_still(getattr(before, name), getattr(after, name)) for name in before.__dataclass_fields__)
+    if isinstance(before, dict):
+        return before.keys() == after.keys() and all(_is_still(value, after[key]) for key, value in before.items())
+    return bool(before == after) or before != before
 
 
 def _run(path: Path) -> ModuleType:
@@ -297,8 +310,14 @@ class _Copies(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     def exec_module(self, module: ModuleType) -> None:
         """Run the oracle's text; the package itself is empty."""
         if module.__name__ != PACKAGE:
-            text = _file(module.__name__).read_text(encoding="utf-8").replace("pop_ref", PACKAGE)
-            exec(compile(text, f"<{module.__name__}>", "exec"), module.__dict__)
+            exec(_code(module.__name__), module.__dict__)
+
+
+@functools.cache
+def _code(fullname: str) -> CodeType:
+    # a copy is made of every module for every stage that is judged
+    text = _file(fullname).read_text(encoding="utf-8").replace("pop_ref", PACKAGE)
+    return compile(text, f"<{fullname}>", "exec")
 
 
 def _file(fullname: str) -> Path:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 import json
 import re
+import shutil
 import tomllib
 from functools import partial
 from pathlib import Path
@@ -64,11 +65,16 @@ def write(folder: Path, name: str, *changes: tuple[str, str]) -> Path:
     return path
 
 
-@pytest.fixture
-def mine(tmp_path: Path) -> Path:
-    folder = tmp_path / "mine"
+@pytest.fixture(scope="module")
+def started(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("learn") / "started"
     stubs.start(folder)
     return folder
+
+
+@pytest.fixture
+def mine(started: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(started, tmp_path / "mine")
 
 
 def test_the_stubs_are_thirteen_modules_with_the_oracles_names_signatures_and_no_bodies(mine: Path) -> None:
