@@ -9,7 +9,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -44,9 +44,14 @@ def _tree(path: Path) -> ast.Module:
 
 
 @cache
+def _nodes(path: Path) -> tuple[ast.AST, ...]:
+    return tuple(ast.walk(_tree(path)))
+
+
+@cache
 def _imports(path: Path) -> tuple[str, ...]:
     found: list[str] = []
-    for node in ast.walk(_tree(path)):
+    for node in _nodes(path):
         if isinstance(node, ast.Import):
             found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
@@ -261,9 +266,9 @@ NAMES_THE_PYTHON = {
 STARTS_PYTHON = re.compile(r"^python[\d.]*$")
 
 
-def _starts_python(tree: ast.Module) -> Iterator[int]:
+def _starts_python(nodes: Iterable[ast.AST]) -> Iterator[int]:
     """List the lines of a module that start a Python: by `sys.executable`, by its name, or without a command."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Attribute) and node.attr in ("executable", "_base_executable"):
             yield node.lineno
         if isinstance(node, ast.List | ast.Tuple) and node.elts and isinstance(first := node.elts[0], ast.Constant):
@@ -278,7 +283,7 @@ def test_one_place_makes_the_commands_of_child_pythons() -> None:
     for path in FILES:
         if path.parts[len(ROOT.parts)] == "tests" or _name(path) == "pop_fast/children.py":
             continue
-        lines = list(_starts_python(_tree(path)))
+        lines = list(_starts_python(_nodes(path)))
         fix = "take python_command or module_command of pop_fast.children, which leave the current folder out"
         assert len(lines) == NAMES_THE_PYTHON.get(_name(path), 0), f"{_name(path)} starts a Python at {lines}: {fix}"
     for workflow in (ROOT / "pop_fast/blocks/Snakefile", ROOT / "paper_repro/Snakefile"):
@@ -291,7 +296,7 @@ def test_one_place_makes_the_commands_of_child_pythons() -> None:
     "line", ["run([sys.executable, '-m', 'x'])", "run(['python3', '-m', 'x'])", "from multiprocessing import Pool"]
 )
 def test_a_python_that_is_started_elsewhere_is_seen(line: str) -> None:
-    assert list(_starts_python(ast.parse(line)))
+    assert list(_starts_python(ast.walk(ast.parse(line))))
 
 
 def _too_long(path: Path) -> Iterator[str]:
@@ -303,7 +308,7 @@ def _too_long(path: Path) -> Iterator[str]:
     limit = 1_200 if path.parent.name == "mutants" else 800 if path.name.startswith("test_") else 600
     if lines > limit:
         yield f"{_name(path)} has {lines} lines; split it by what it is about"
-    for node in ast.walk(_tree(path)):
+    for node in _nodes(path):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             body = node.body[1:] if ast.get_docstring(node) else node.body
             length = (node.end_lineno or 0) - body[0].lineno + 1 if body else 0
@@ -504,13 +509,15 @@ def _statements(node: ast.AST) -> Iterator[ast.stmt]:
             continue
         if isinstance(child, ast.stmt):
             yield child
-        yield from _statements(child)
+        # no expression holds a statement
+        if isinstance(child, ast.stmt | ast.excepthandler | ast.match_case):
+            yield from _statements(child)
 
 
-def imports(text: str, known: Mapping[str, object], package: str = "") -> set[str]:
+def imports(tree: ast.Module, nodes: Iterable[ast.AST], known: Mapping[str, object], package: str = "") -> set[str]:
     """Return which of the known modules a source imports."""
     found: set[str] = set()
-    for statement in _statements(ast.parse(text)):
+    for statement in _statements(tree):
         if isinstance(statement, ast.Import):
             found |= {alias.name for alias in statement.names}
         elif isinstance(statement, ast.ImportFrom):
@@ -518,16 +525,16 @@ def imports(text: str, known: Mapping[str, object], package: str = "") -> set[st
             module = ".".join(filter(None, (base, statement.module)))
             names = {f"{module}.{alias.name}" for alias in statement.names}
             found |= {name if name in known else module for name in names}
-    return (found | set(_named(text, known))) & known.keys()
+    return (found | set(_named(nodes, known))) & known.keys()
 
 
 # a string that is imported: "a.module", or "a.module:attribute" as entry points are written
 IMPORTED = re.compile(r"([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)+)(:[A-Za-z_]\w*)?")
 
 
-def _named(text: str, known: Mapping[str, object]) -> Iterator[str]:
+def _named(nodes: Iterable[ast.AST], known: Mapping[str, object]) -> Iterator[str]:
     """Give what whole strings of a source name as a module, or as an attribute of one."""
-    for node in ast.walk(ast.parse(text)):
+    for node in nodes:
         match = (
             IMPORTED.fullmatch(node.value) if isinstance(node, ast.Constant) and isinstance(node.value, str) else None
         )
@@ -567,7 +574,7 @@ def cycles(graph: Mapping[str, set[str]]) -> list[list[str]]:
 def test_there_is_no_import_cycle() -> None:
     modules = _modules()
     assert len(modules) > 300
-    graph = {name: imports(path.read_text(encoding="utf-8"), modules, f"{name}.x") for name, path in modules.items()}
+    graph = {name: imports(_tree(path), _nodes(path), modules, f"{name}.x") for name, path in modules.items()}
     # a package's own file names its modules only to hand on what they give
     graph = {name: found - {name} for name, found in graph.items()}
     assert cycles(graph) == []
@@ -586,4 +593,5 @@ def test_there_is_no_import_cycle() -> None:
     ids=["in a function", "for type checkers", "from a package", "off to the side", "in strings", "in prose"],
 )
 def test_a_cycle_is_found_wherever_it_hides(sources: dict[str, str], expected: list[list[str]]) -> None:
-    assert cycles({name: imports(text, sources) for name, text in sources.items()}) == expected
+    trees = {name: ast.parse(text) for name, text in sources.items()}
+    assert cycles({name: imports(tree, ast.walk(tree), sources) for name, tree in trees.items()}) == expected
