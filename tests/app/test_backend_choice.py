@@ -467,6 +467,7 @@ def test_a_change_of_the_source_and_another_processor_ask_for_a_new_build_and_le
 
 
 @needs_compiler
+@pytest.mark.slow  # it compiles
 def test_a_processor_that_nothing_is_known_of_gets_code_for_any(
     fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -348,6 +348,7 @@ def test_a_block_none_of_whose_photographs_has_a_mask_is_read_and_one_with_masks
 
 
 @pytest.mark.processes
+@pytest.mark.slow  # processes that train
 def test_parts_are_processes_of_their_own_and_are_stopped_by_sigterm(shared_capture, tmp_path):
     folder = tmp_path / "out"
     long = ("--checkpoint-every", "100", "--max-steps", "200000", "--eval-steps", "--save-steps")

@@ -155,6 +155,7 @@ def test_the_help_lists_all_that_another_package_adds(site: Path) -> None:
         assert said in text, said
 
 
+@pytest.mark.slow  # three programs that train
 def test_it_trains_saves_resumes_and_exports(site: Path, shared_capture: Path, tmp_path: Path) -> None:
     own = [str(word).replace("--pop.", "--mine.") for word in TRAIN]
     words = ("train", shared_capture, *own, "--method", "mine", "--backend", "mine", "--threads", "1")

@@ -235,6 +235,7 @@ def test_one_process_continues_what_two_began(together: Path) -> None:
     assert_same_run(together / "left", together / "pop")
 
 
+@pytest.mark.slow  # four trainings by two processes
 @needs_gloo
 def test_sums_do_not_depend_on_who_adds_and_a_process_whose_fellow_has_ended_says_so(together: Path) -> None:
     alone = ALONE.total(torch.tensor([1e8, 1.0, -1e8]) * (place + 1.0) / 3.0 for place in range(SIZE))
@@ -316,7 +317,12 @@ def test_sigkill_at_random_moments_changes_nothing(tmp_path):
 
 @posix
 @pytest.mark.parametrize(
-    ("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGKILL, -signal.SIGKILL)]
+    ("number", "status"),
+    [
+        pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),
+        (signal.SIGTERM, 143),
+        pytest.param(signal.SIGKILL, -signal.SIGKILL, marks=pytest.mark.slow),
+    ],
 )
 def test_the_search_for_cameras_is_left_at_once_and_leaves_nothing(
     tmp_path: Path, number: signal.Signals, status: int

@@ -257,7 +257,6 @@ def test_the_loop_that_the_docstring_shows_trains_with_the_prior_and_is_not_warn
 
 
 BASELINES = ("3dgs", "3dgs-2023", "pup", "mini-splatting", "taming", "speedy-splat")
-ENGINES = ("fast", "compiled")
 
 
 def plan_of(method: str) -> DensityControl:
@@ -347,7 +346,7 @@ def engine_or_skip(backend: str) -> None:
         pytest.skip(reason)
 
 
-@pytest.mark.parametrize("backend", ENGINES)
+@pytest.mark.parametrize("backend", [pytest.param("fast", marks=pytest.mark.slow), "compiled"])
 @pytest.mark.parametrize("method", BASELINES)
 def test_a_run_that_is_stopped_anywhere_goes_on_to_the_same_bits(method: str, backend: str, tmp_path: Any) -> None:
     engine_or_skip(backend)

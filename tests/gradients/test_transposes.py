@@ -303,7 +303,7 @@ def loss_of(params: dict[str, np.ndarray], recipe: Recipe) -> float:
     return objective(render(gaussians, CAMERA), gaussians, PHOTO, start(params), recipe)[0]
 
 
-@pytest.mark.parametrize("name", ["POP", "3DGS"])
+@pytest.mark.parametrize("name", ["POP", pytest.param("3DGS", marks=pytest.mark.slow)])
 def test_gradient_by_raw_parameters_matches_differences(name: str) -> None:
     gaussians = gaussians_from_params(PARAMS)
     recipe = RECIPES[name]

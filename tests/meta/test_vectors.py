@@ -52,9 +52,8 @@ def index(folder: Path) -> dict[str, Any]:
     return json.loads((folder / "index.json").read_text())
 
 
-@pytest.mark.parametrize(
-    "name", [name if name == "fast64" else pytest.param(name, marks=pytest.mark.slow) for name in SHIPPED]
-)
+@pytest.mark.slow  # hundreds of vectors
+@pytest.mark.parametrize("name", SHIPPED)
 def test_a_sound_port_passes_every_vector(folder: Path, tmp_path: Path, name: str) -> None:
     backend = shipped(name)
     unanswered = answer(folder, tmp_path / "results", backend)
@@ -219,7 +218,13 @@ def test_the_answers_are_the_oracles(name: str) -> None:
             assert np.all(np.abs(kept[key] - value) <= close), key
 
 
-@pytest.mark.parametrize("name", sorted(set(PLANS) - {*QUICK, *LARGE}))
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.slow) if PLANS[name].n > 4_000 else name
+        for name in sorted(set(PLANS) - {*QUICK, *LARGE})
+    ],
+)
 def test_the_images_of_the_answers_are_the_oracles(name: str) -> None:
     kept, scene = answers(name), corpus_scene(name)
     drawn = drawn_of(name)
@@ -238,6 +243,7 @@ def test_two_windows_of_the_answers_are_the_oracles(name: str) -> None:
             assert np.array_equal(getattr(error_bounds, key), answers(name)[key][place])
 
 
+@pytest.mark.slow  # the oracle draws large scenes
 def test_the_corpus_has_long_lists_wide_splats_many_tiles_many_entries_and_cut_tiles() -> None:
     longest, tiles, entries, blended, widest = [], [], [], [], []
     for name, plan in PLANS.items():

@@ -108,9 +108,15 @@ def test_losses_density_control_adam_and_calls_with_several_cameras_cross_a_pipe
     ("broken", "stage", "law"),
     [
         ("losses", "losses", "test_l2_is_the_oracles"),
-        ("density", "density", "the_small_are_cloned_and_the_large_are_split"),
-        ("cameras", "signature", "several_cameras_in_one_call_see_what_each_sees_alone"),
-        ("depth", "signature", "the_accumulated_depth_is_the_oracles"),
+        *(
+            # one of them here, the others for `make test-all`
+            pytest.param(*broken, marks=pytest.mark.slow)
+            for broken in (
+                ("density", "density", "the_small_are_cloned_and_the_large_are_split"),
+                ("cameras", "signature", "several_cameras_in_one_call_see_what_each_sees_alone"),
+                ("depth", "signature", "the_accumulated_depth_is_the_oracles"),
+            )
+        ),
     ],
 )
 def test_a_program_with_one_wrong_function_breaks_a_law_about_it(

@@ -261,6 +261,7 @@ def test_a_result_that_was_altered_and_agrees_with_itself_is_not_confirmed(train
     assert f"step 10: psnr is {was}, and the result has {was + 0.1}" in told
 
 
+@pytest.mark.slow  # a row is trained again
 def test_another_kind_of_machine_is_held_to_the_tolerances(trained, tmp_path, capsys):
     curve = [{**point, "psnr": 1.0} for point in find("toy", "pop", "demo", 42, trained / "results").curve]
     altered(trained, tmp_path, cpu="another kind", curve=tuple(curve))

@@ -191,6 +191,7 @@ def test_a_queue_stops_at_sigterm_with_a_checkpoint(queued):
     assert left
 
 
+@pytest.mark.slow  # a queue that trains
 def test_a_queue_that_is_called_again_goes_on_to_the_end(queued):
     folder, (_, (text, status)), _ = queued
     assert status == 0, text
@@ -199,6 +200,7 @@ def test_a_queue_that_is_called_again_goes_on_to_the_end(queued):
     assert text.splitlines()[-1] == "2 rows trained"
 
 
+@pytest.mark.slow  # a queue that trains
 def test_status_counts_what_is_done_and_begun(queued, capsys, tmp_path):
     folder = queued[0]
     where = ["--results", folder / "results", "--work", tmp_path]
@@ -213,6 +215,7 @@ def test_status_counts_what_is_done_and_begun(queued, capsys, tmp_path):
     assert "step 150, to do" in text
 
 
+@pytest.mark.slow  # a queue that trains
 def test_a_table_is_printed_or_written_in_three_formats(queued, capsys, tmp_path):
     where = ["--scale", "toy", "--results", queued[0] / "results"]
     printed = call("table", "3", *where, capsys=capsys)
@@ -222,6 +225,7 @@ def test_a_table_is_printed_or_written_in_three_formats(queued, capsys, tmp_path
     assert (tmp_path / "table_3.md").read_text().strip() == printed.strip()
 
 
+@pytest.mark.slow  # a queue that trains
 def test_claims_are_judged(queued, capsys):
     assert "claim" in call("claims", "--scale", "toy", "--results", queued[0] / "results", capsys=capsys)
 
@@ -235,6 +239,7 @@ def new_repository(folder):
         git(folder, *words)
 
 
+@pytest.mark.slow  # a queue that trains
 def test_results_are_committed_where_that_is_asked_for(queued):
     committed = {
         git(queued[0], "show", "--format=%s", "--name-only", place).replace("\n\n", "\n").strip()

@@ -139,6 +139,7 @@ def test_a_finished_row_is_not_trained_again_and_leaves_no_bulk(made, monkeypatc
     assert toy("pop").file(how.results).read_bytes() == text
 
 
+@pytest.mark.slow  # it trains
 def test_a_row_that_was_interrupted_ends_with_the_same_result(made, tmp_path):
     how = options(tmp_path, work=made[0].work.parent / "again")
     with interrupted(at=150):
@@ -351,6 +352,7 @@ def test_a_checkpoint_stays_as_long_as_a_row_waits_for_it(tmp_path):
     assert not kept.exists()
 
 
+@pytest.mark.slow  # it trains
 def test_a_base_of_another_kind_is_not_begun_from(tmp_path):
     how, job = options(tmp_path, keep_checkpoints=True), toy("pup", steps_scaler=0.001)
     train_row(base_of(job), how)

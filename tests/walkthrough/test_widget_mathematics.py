@@ -555,6 +555,7 @@ def test_a_stack_tells_weights_and_gradients_with_a_wall_in_the_middle_and_in_fr
     assert any("stop: T would" in text for text in shown["texts"]) == (len(pixel.ids) < pixel.n_traversed)
 
 
+@pytest.mark.slow  # two trainings
 def test_a_prior_ten_times_as_heavy_empties_the_middle_and_costs_quality() -> None:
     """Run the widget's worker as its page does, 150 steps with each weight."""
     assert "ten times as heavy" in WIDGETS["train"].prompt
