@@ -519,6 +519,7 @@ def test_a_wheel_brings_the_highest_level_that_the_processor_has(
 
 
 @needs_compiler
+@pytest.mark.slow  # it compiles
 def test_a_library_that_no_longer_loads_is_compiled_again(fresh: Path, pop: Pop) -> None:
     building.library_path().write_bytes(b"of a system that is gone")
     assert "compile them again: `pop build-cpu`" in (compiled.why_not() or "")

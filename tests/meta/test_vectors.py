@@ -235,7 +235,10 @@ def test_the_images_of_the_answers_are_the_oracles(name: str) -> None:
     assert np.array_equal(weighted_blocks(drawn.dominant_ids, kept["decided"]), kept["winners"])
 
 
-@pytest.mark.parametrize("name", sorted(set(PLANS) - set(QUICK)))
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.slow) if n in LARGE else n for n in sorted(set(PLANS) - set(QUICK))],
+)
 def test_two_windows_of_the_answers_are_the_oracles(name: str) -> None:
     windows = slice(40, 42) if name in LARGE else slice(1, 3)
     for place, error_bounds in bounded_windows(corpus_scene(name), windows):

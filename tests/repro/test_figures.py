@@ -562,6 +562,7 @@ def artifacts(tmp_path_factory):
         return params, first, made, save(made, folder / "figure_3")
 
 
+@pytest.mark.slow  # it trains
 def test_the_run_behind_the_artifacts_raises_every_opacity(artifacts):
     params, found, *_ = artifacts
     before = 1.0 / (1.0 + np.exp(-params["opacities"].numpy()))

@@ -250,6 +250,7 @@ def altered(folder: Path, to: Path, **changes) -> Result:
     return result
 
 
+@pytest.mark.slow  # a row is trained again
 def test_a_result_that_was_altered_and_agrees_with_itself_is_not_confirmed(trained, tmp_path, capsys):
     curve = list(find("toy", "pop", "demo", 42, trained / "results").curve)
     was = curve[1]["psnr"]

@@ -402,6 +402,7 @@ def points(run: ProbedRun) -> dict:
     return json.loads((run._results.path / PROBE).read_text())
 
 
+@pytest.mark.slow  # it trains
 def test_a_probed_training_is_the_same_training(short):
     config, capture = short
     plain = TrainingRun(config("plain"), capture)
