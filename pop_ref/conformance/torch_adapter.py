@@ -5,7 +5,6 @@ torch is imported when an adapter is made, never when the kit is.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import importlib
 import inspect
@@ -37,6 +36,26 @@ from pop_ref.constants import PAPER, Profile
 
 # arguments at the values by which a rasterizer that lacks them draws
 NEUTRAL: Final = {"packed": False, "near_plane": 0.01, "eps2d": 0.3}
+
+
+class _CountedWhenRead(View):
+    """A view whose tallies come from a second render, made when a law first reads them: most laws never do."""
+
+    @classmethod
+    def of(cls, drawn: View, again: Callable[[], View]) -> View:
+        view = cls(**vars(drawn))
+        vars(view)["again"] = again
+        return view
+
+    @functools.cached_property
+    def _counted(self) -> View:
+        again: Callable[[], View] = vars(self)["again"]
+        return again()
+
+    def __getattribute__(self, name: str) -> Any:
+        if name in ("n_blended", "n_traversed"):
+            return getattr(self._counted, name)
+        return super().__getattribute__(name)
 
 
 class TorchAdapter(Adapter):
@@ -217,8 +236,7 @@ class TorchAdapter(Adapter):
         drawn = self._drawn(scene, dominance=True, counts=False)
         if "counts" not in self._instruments:
             return drawn
-        counted = self._drawn(scene, dominance=True, counts=True)
-        return dataclasses.replace(drawn, n_blended=counted.n_blended, n_traversed=counted.n_traversed)
+        return _CountedWhenRead.of(drawn, lambda: self._drawn(scene, dominance=True, counts=True))
 
     def otherwise(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, tuple[View, dict[str, np.ndarray]]]:
         """Return, by what is asked for, the render and the gradients of every choice; the first is to ask for nothing
