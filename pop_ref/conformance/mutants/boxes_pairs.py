@@ -284,6 +284,87 @@ def _blind_cameras_have_no_number(given: Given, images: Any, alphas: Any, meta: 
     return images, alphas, meta
 
 
+def _backgrounds_learn_of_all_cameras(given: Given) -> Given:
+    behind = given["backgrounds"]
+    if behind is None or not several(given):
+        return {}
+    return {"backgrounds": backwards(behind, lambda v: v.sum(-2, keepdim=True).expand_as(v))}
+
+
+def _batch_ids_count_images(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
+    if _packed(given):
+        meta["batch_ids"] = meta["batch_ids"] * given["viewmats"].shape[-3] + meta["camera_ids"]
+    return images, alphas, meta
+
+
+def _depth_lost_behind_a_full_chunk(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
+    full = given["render_mode"].startswith("RGB+") and plain(given) and given["colors"].shape[-1] % 32 == 0
+    if full:
+        torch = import_torch()
+        images = torch.cat((images[..., :-1], 0.0 * images[..., -1:]), -1)
+    return images, alphas, meta
+
+
+def _one_empty_camera_fails(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
+    empty = alphas.detach().flatten(-3).amax(-1) == 0.0
+    if several(given) and bool(empty.any()) and not bool(empty.all()):
+        raise RuntimeError("cumsum of no intersections")
+    return images, alphas, meta
+
+
+def _packed_screen_gradients_of_the_first_camera(sound: Rasterization, given: Given) -> Any:
+    if not (_packed(given) and several(given)):
+        return sound(**given)
+    told: dict[str, Any] = {}
+
+    def first_alone(v: Any) -> Any:
+        # by now that of the screen centres is known
+        grad = told["meta"]["means2d"].grad
+        if grad is not None:
+            grad[told["meta"]["camera_ids"] > 0] = 0.0
+        return v
+
+    images, alphas, told["meta"] = sound(**given | {"means": backwards(given["means"], first_alone)})
+    return images, alphas, told["meta"]
+
+
+def _covariances_of_the_first_scene(given: Given) -> Given:
+    if not _covars(given) or not batched(given):
+        return {}
+    covars = given["covars"].flatten(0, -4)
+    return {"covars": covars[:1].expand_as(covars).reshape(given["covars"].shape)}
+
+
+def _batch_axes_transposed(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
+    if given["means"].dim() < 4:
+        return images, alphas, meta
+    return images.transpose(0, 1).reshape(images.shape), alphas.transpose(0, 1).reshape(alphas.shape), meta
+
+
+def _own_colours_learn_together(given: Given) -> Given:
+    if not own_colors(given) or not several(given):
+        return {}
+    axis = -3 if plain(given) else -4
+    return {"colors": backwards(given["colors"], lambda v: v.mean(axis, keepdim=True).expand_as(v))}
+
+
+def _packed_depths_of_the_first_camera(sound: Rasterization, given: Given) -> Any:
+    if not (_packed(given) and several(given) and given["render_mode"] == "D"):
+        return sound(**given)
+    depths = in_camera(given["means"], given["viewmats"])[..., 2:]
+    first = depths[..., :1, :, :].expand_as(depths)
+    return sound(**given | {"colors": first, "sh_degree": None, "render_mode": "RGB", "backgrounds": None})
+
+
+def _gradients_of_the_usual_low_pass(sound: Rasterization, given: Given) -> Any:
+    images, alphas, meta = sound(**given)
+    if given["eps2d"] == 0.3:
+        return images, alphas, meta
+    usual, usual_alphas, _ = sound(**given | {"eps2d": 0.3})
+    # the values of the one, the graph of the other
+    return usual + (images - usual).detach(), usual_alphas + (alphas - usual_alphas).detach(), meta
+
+
 _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("viewmats_of_the_first_camera", "all cameras of a call see from the first one's place",
      _if(several, viewmats=_of_first("viewmats", 2)),
@@ -543,6 +624,28 @@ _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("blind_cameras_have_no_number",
      "in packed mode a camera that sees nothing is not counted, and those after it have a number too low",
      telling(_blind_cameras_have_no_number), "test_signature_pairs:every_pair_of_arguments_has_the_oracles_gradients"),
+    ("backgrounds_learn_of_all_cameras", "every camera's background has the gradient of all cameras' together",
+     breaking(_backgrounds_learn_of_all_cameras), "unknown:yet"),
+    ("batch_ids_count_images", "batch_ids of packed rows number images, not scenes",
+     telling(_batch_ids_count_images), "unknown:yet"),
+    ("depth_lost_behind_a_full_chunk", "beside 32 channels of colour, or a multiple, the depth is 0",
+     telling(_depth_lost_behind_a_full_chunk), "unknown:yet"),
+    ("one_empty_camera_fails", "a call fails where one of several cameras sees nothing",
+     telling(_one_empty_camera_fails), "unknown:yet"),
+    ("packed_screen_gradients_of_the_first_camera",
+     "in packed mode the gradient of screen centres is kept for the first camera's rows alone",
+     _packed_screen_gradients_of_the_first_camera, "unknown:yet"),
+    ("covariances_of_the_first_scene", "all scenes of a batch have the covariances that the first one is given",
+     breaking(_covariances_of_the_first_scene), "unknown:yet"),
+    ("batch_axes_transposed", "of two batch axes the pictures have the second one first",
+     telling(_batch_axes_transposed), "unknown:yet"),
+    ("own_colours_learn_together", "colours of every camera have the mean of all cameras' gradients",
+     breaking(_own_colours_learn_together), "unknown:yet"),
+    ("packed_depths_of_the_first_camera", "in packed mode all cameras show the first one's depths",
+     _packed_depths_of_the_first_camera, "unknown:yet"),
+    ("gradients_of_the_usual_low_pass",
+     "the way back has the low-pass written into it, whatever eps2d says (diff-gaussian-rasterization's backward)",
+     _gradients_of_the_usual_low_pass, "unknown:yet"),
 )  # fmt: skip
 
 PAIRS: Final = tuple(BlackBox(*line) for line in _BOXES)
