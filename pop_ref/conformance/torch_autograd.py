@@ -31,10 +31,10 @@ class Ask:
             without memory for the others, or "expanded", the first number everywhere likewise.
         outputs: which of "image" and "alpha" have a cotangent.
         before: what else is done: "nothing", "no_grad" and "inference_mode" draw under torch's mode of that name first,
-            "another" draws another scene between the forward and the backward pass, "twice" goes back twice with another
-            scene drawn in between, "present" leaves ones as gradients from before, "edited" changes the arguments in
-            place between the passes, "written" the outputs, "moved" draws the same tensors with other numbers first, and
-            "autocast" draws where torch would like matrix products in half precision.
+            "another" draws another scene between the forward and the backward pass, "twice" goes back twice and draws
+            another scene in between, "present" leaves ones as gradients from before, "edited" changes the arguments in
+            place between the passes, "written" the outputs, "moved" draws the same tensors with other numbers first,
+            and "autocast" draws where torch would have matrix products in half precision.
     """
 
     wanted: tuple[str, ...] = NAMES
@@ -124,7 +124,9 @@ def differentiated(
 
     def other() -> Any:
         smaller = scene.rows(np.arange(len(scene.gaussians) // 2))
-        return draw(smaller, leaves(smaller, True))
+        fainter = scene.with_overrides(opacities=0.5 * scene.gaussians.opacities)
+        # memory of any size that the scene itself takes is taken by one or the other
+        return [draw(each, leaves(each, True)) for each in (fainter, smaller)]
 
     H, W = scene.camera.height, scene.camera.width
     v_image, v_alpha = cotangents[0].reshape(1, H, W, -1), -cotangents[1].reshape(1, H, W, 1)
@@ -156,7 +158,7 @@ def _differentiate(
     Args:
         draw: given the arguments by name, an image and alphas.
         values: tensors by name, without gradients.
-        other: draws another scene, with gradients.
+        other: draws other scenes, with gradients.
         v_image, v_alpha: cotangents, in the outputs' shapes.
         ask: how.
     """

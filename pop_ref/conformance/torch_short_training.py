@@ -24,7 +24,7 @@ KEPT = ("grad2d", "count", "views", "dominant_sum", "blurred", "radii", "sh_rest
 STILL = LearningRates(means=0.0, scales=0.0, quats=0.0, opacities=0.0, sh0=0.0, sh_rest=0.0)
 
 
-class _Interrupted(Exception):
+class _InterruptedError(Exception):
     """Raised in the middle of a run."""
 
 
@@ -165,12 +165,12 @@ class Trainee:
 
         def interrupt(run: Any) -> None:
             if run.step == after:
-                raise _Interrupted
+                raise _InterruptedError
 
         broken._watch = interrupt
         del whole.draws, broken.draws
         whole.run()
-        with suppress(_Interrupted):
+        with suppress(_InterruptedError):
             broken.run()
         again = single._run(short, f"{folder}/broken", resume=True, **saved)
         del again.draws

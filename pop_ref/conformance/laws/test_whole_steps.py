@@ -38,7 +38,12 @@ ORDER = (0, 1, 0, 1, 0)
 
 PRIOR = ShortTraining("pop", {**STILL, **FIRST}, {**SHORT, **HALVED, "lr": SLOW}, ORDER, seed=125, scene_scale=4.0)
 ENTROPY = ShortTraining(
-    "pop", {**STILL, **SECOND}, {**SHORT, "pixel_scale": 0.25, "l2_stop_iter": 3, "lr": SLOW}, ORDER, 16, antialiased=True
+    "pop",
+    {**STILL, **SECOND},
+    {**SHORT, "pixel_scale": 0.25, "l2_stop_iter": 3, "lr": SLOW},
+    ORDER,
+    seed=16,
+    antialiased=True,
 )
 MASKED = ShortTraining(
     "pop",
@@ -348,19 +353,23 @@ def test_a_run_to_its_end_takes_the_steps_that_can_be_asked_for_one_by_one(backe
         assert_same_bits(key, found, last[key])
 
 
-# of a change, of the waiting bands, of an epoch of three views: all are under way where the run is interrupted
-UNDER_WAY = {"refine_every": 3, "refine_stop_iter": 100, "sh_rest_every": 4, "pop_views": "window"}
-UNDER_WAY |= {"blur_window": "any_view", "blur_stop_iter": 100, "blur_min_pixels": 14.0, "refine_scale2d_stop_iter": 100}
+# windows of every kind, an epoch of three views, and gradients that wait are under way where the run is interrupted
+UNDER_WAY = {"refine_start_iter": 0, "refine_stop_iter": 100, "refine_every": 3, "reset_every": 0, "sh_rest_every": 4}
+UNDER_WAY |= {"grow_grad2d": 0.0125, "grow_scale3d": 0.3, "prune_opa": 0.05, "pop_views": "window"}
+UNDER_WAY |= {"blur_start_iter": 0, "blur_stop_iter": 100, "blur_window": "any_view", "blur_min_pixels": 14.0}
+UNDER_WAY |= {"refine_scale2d_stop_iter": 100, "grow_scale2d": 0.5, "prune_scale2d": 3.0}
 
 
 @law("training", "resumed_run")
 def test_a_run_that_is_interrupted_within_a_window_goes_on_to_the_same_bits(backend):
-    settings = {**CHANGES, "reset_every": 0, "blur_start_iter": 0, **UNDER_WAY}
-    short = ShortTraining("pop", settings, {"max_steps": 6, "sh_interval": 1}, (0,) * 6, seed=36, views=3, degree=3)
+    options = {"max_steps": 6, "sh_interval": 1}
+    short = ShortTraining("pop", UNDER_WAY, options, (0,) * 6, seed=36, views=3, degree=3)
     with TemporaryDirectory() as folder:
         given = short, folder, 5
         whole, resumed = backend.stage("resumed_run")(*given, exposure=True, refine_cameras=True, max_renders=0)
     assert len(whole["means"]) != short.count, "no change was before the interruption"
+    for name in ("grad2d", "count", "views", "dominant_sum", "blurred", "radii", "sh_rest_sum"):
+        assert np.any(whole[name]), f"{name} is of nothing, which anybody would go on from"
     assert sorted(resumed) == sorted(whole), f"{sorted(set(resumed) ^ set(whole))} are known to one run alone"
     for name, expected in whole.items():
         assert_same_bits(name, resumed[name], expected)

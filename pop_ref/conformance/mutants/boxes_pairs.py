@@ -284,13 +284,6 @@ def _blind_cameras_have_no_number(given: Given, images: Any, alphas: Any, meta: 
     return images, alphas, meta
 
 
-def _backgrounds_learn_of_all_cameras(given: Given) -> Given:
-    behind = given["backgrounds"]
-    if behind is None or not several(given):
-        return {}
-    return {"backgrounds": backwards(behind, lambda v: v.sum(-2, keepdim=True).expand_as(v))}
-
-
 def _batch_ids_count_images(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
     if _packed(given):
         meta["batch_ids"] = meta["batch_ids"] * given["viewmats"].shape[-3] + meta["camera_ids"]
@@ -328,24 +321,10 @@ def _packed_screen_gradients_of_the_first_camera(sound: Rasterization, given: Gi
     return images, alphas, told["meta"]
 
 
-def _covariances_of_the_first_scene(given: Given) -> Given:
-    if not _covars(given) or not batched(given):
-        return {}
-    covars = given["covars"].flatten(0, -4)
-    return {"covars": covars[:1].expand_as(covars).reshape(given["covars"].shape)}
-
-
 def _batch_axes_transposed(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
     if given["means"].dim() < 4:
         return images, alphas, meta
     return images.transpose(0, 1).reshape(images.shape), alphas.transpose(0, 1).reshape(alphas.shape), meta
-
-
-def _own_colours_learn_together(given: Given) -> Given:
-    if not own_colors(given) or not several(given):
-        return {}
-    axis = -3 if plain(given) else -4
-    return {"colors": backwards(given["colors"], lambda v: v.mean(axis, keepdim=True).expand_as(v))}
 
 
 def _packed_depths_of_the_first_camera(sound: Rasterization, given: Given) -> Any:
@@ -624,28 +603,25 @@ _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("blind_cameras_have_no_number",
      "in packed mode a camera that sees nothing is not counted, and those after it have a number too low",
      telling(_blind_cameras_have_no_number), "test_signature_pairs:every_pair_of_arguments_has_the_oracles_gradients"),
-    ("backgrounds_learn_of_all_cameras", "every camera's background has the gradient of all cameras' together",
-     breaking(_backgrounds_learn_of_all_cameras), "unknown:yet"),
     ("batch_ids_count_images", "batch_ids of packed rows number images, not scenes",
-     telling(_batch_ids_count_images), "unknown:yet"),
+     telling(_batch_ids_count_images),
+     "test_signature_arguments:packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same"),
     ("depth_lost_behind_a_full_chunk", "beside 32 channels of colour, or a multiple, the depth is 0",
-     telling(_depth_lost_behind_a_full_chunk), "unknown:yet"),
+     telling(_depth_lost_behind_a_full_chunk),
+     "test_signature_arguments:depth_follows_plain_colours_of_several_cameras"),
     ("one_empty_camera_fails", "a call fails where one of several cameras sees nothing",
-     telling(_one_empty_camera_fails), "unknown:yet"),
+     telling(_one_empty_camera_fails), "test_signature_pairs:arguments_that_are_taken_alone_are_taken_together"),
     ("packed_screen_gradients_of_the_first_camera",
      "in packed mode the gradient of screen centres is kept for the first camera's rows alone",
-     _packed_screen_gradients_of_the_first_camera, "unknown:yet"),
-    ("covariances_of_the_first_scene", "all scenes of a batch have the covariances that the first one is given",
-     breaking(_covariances_of_the_first_scene), "unknown:yet"),
+     _packed_screen_gradients_of_the_first_camera,
+     "test_signature_arguments:packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same"),
     ("batch_axes_transposed", "of two batch axes the pictures have the second one first",
-     telling(_batch_axes_transposed), "unknown:yet"),
-    ("own_colours_learn_together", "colours of every camera have the mean of all cameras' gradients",
-     breaking(_own_colours_learn_together), "unknown:yet"),
+     telling(_batch_axes_transposed), "test_signature_arguments:batch_entries_do_not_know_of_each_other"),
     ("packed_depths_of_the_first_camera", "in packed mode all cameras show the first one's depths",
-     _packed_depths_of_the_first_camera, "unknown:yet"),
+     _packed_depths_of_the_first_camera, "test_signature_pairs:every_pair_of_arguments_draws_what_the_oracle_draws"),
     ("gradients_of_the_usual_low_pass",
      "the way back has the low-pass written into it, whatever eps2d says (diff-gaussian-rasterization's backward)",
-     _gradients_of_the_usual_low_pass, "unknown:yet"),
+     _gradients_of_the_usual_low_pass, "test_signature_arguments:the_low_pass_is_as_wide_as_the_call_says"),
 )  # fmt: skip
 
 PAIRS: Final = tuple(BlackBox(*line) for line in _BOXES)

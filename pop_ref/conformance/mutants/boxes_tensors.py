@@ -575,9 +575,9 @@ _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("cotangents_in_half_precision", "the gradient by the picture goes back in 16 bits (mixed precision)",
      _cotangents_read(lambda v: v.half().to(v.dtype)), "test_autograd:cotangents_are_read_to_their_last_digit"),
     ("nothing_where_transparent", "the gradient of an opacity of exactly 0 is no number: its moment is divided by it",
-     breaking(_nothing_where_transparent), "unknown:yet"),
+     breaking(_nothing_where_transparent), "test_footprint:an_opacity_of_zero_has_no_gradient"),
     ("halved_by_autocast", "under autocast centres have 16 bits, as what is drawn is not kept out of it",
-     breaking(_halved_by_autocast), "unknown:yet"),
+     breaking(_halved_by_autocast), "test_autograd:under_autocast_the_same_image_is_drawn_and_has_the_same_gradients"),
 )  # fmt: skip
 
 

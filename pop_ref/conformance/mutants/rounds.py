@@ -140,17 +140,15 @@ _NAMES: Final = {
         pose_kept_with_its_tensor cotangents_in_half_precision
     """,
     "blind sixth": """
-        left_clamp_pulls_like_the_right limits_about_the_given_centre factor_pulled_by_compensated_opacities
-        children_are_never_pruned opacities_stop_a_step_late gradients_over_black gradients_of_classic_splats
-        reset_before_the_change prior_a_step_too_long l1_objective_pulls_by_whole_windows scale_ends_with_l2
-        resets_keep_what_is_fainter_moving duplicate_rows_are_added_once cameras_share_their_gradients
+        left_clamp_pulls_like_the_right limits_about_the_given_centre children_are_never_pruned
+        gradients_over_black gradients_of_classic_splats reset_before_the_change prior_a_step_too_long
+        l1_objective_pulls_by_whole_windows scale_ends_with_l2 resets_keep_what_is_fainter_moving
         blur_unseen_at_its_last_step rewinds_to_an_unscaled_step logits_end_at_seven
         blur_without_a_prior_ignores_the_mask epoch_begins_anew_on_resume resets_replace_updates_too
-        window_lost_on_resume batches_blur_by_all_pixels batches_are_summed foreign_draws_repeat
+        window_lost_on_resume batches_blur_by_all_pixels foreign_draws_repeat
         second_compaction_counts_from_the_first second_way_back_reads_used_buffers green_screens_are_black
-        defaults_overrule_the_profile backgrounds_learn_of_all_cameras batch_ids_count_images
-        depth_lost_behind_a_full_chunk one_empty_camera_fails packed_screen_gradients_of_the_first_camera
-        covariances_of_the_first_scene batch_axes_transposed own_colours_learn_together
+        defaults_overrule_the_profile batch_ids_count_images depth_lost_behind_a_full_chunk
+        one_empty_camera_fails packed_screen_gradients_of_the_first_camera batch_axes_transposed
         packed_depths_of_the_first_camera gradients_of_the_usual_low_pass nothing_where_transparent
         halved_by_autocast
     """,
