@@ -164,7 +164,9 @@ def rasterization(
     settings = ProjectionSettings(Ks, width, height, chosen, rasterize_mode == "antialiased", radius_clip)
     options = (tile_size, sh_degree, render_mode, packed, absgrad)
     frame = RasterizationCall(scene, (*batch, n_cameras), settings, *options, drawing.stages())
-    return frame.render(backgrounds, dominance, counts)
+    # where others train in mixed precision, cameras and centres keep their digits
+    with torch.autocast(means.device.type, enabled=False):
+        return frame.render(backgrounds, dominance, counts)
 
 
 _GATHERED = ("means2d", "depths", "conics", "opacities", "radii")

@@ -31,9 +31,10 @@ class Ask:
             without memory for the others, or "expanded", the first number everywhere likewise.
         outputs: which of "image" and "alpha" have a cotangent.
         before: what else is done: "nothing", "no_grad" and "inference_mode" draw under torch's mode of that name first,
-            "another" draws another scene between the forward and the backward pass, "twice" goes back twice, "present"
-            leaves ones as gradients from before, "edited" changes the arguments in place between the passes,
-            "written" the outputs, and "moved" draws the same tensors with other numbers first.
+            "another" draws another scene between the forward and the backward pass, "twice" goes back twice and draws
+            another scene in between, "present" leaves ones as gradients from before, "edited" changes the arguments in
+            place between the passes, "written" the outputs, "moved" draws the same tensors with other numbers first,
+            and "autocast" draws where torch would have matrix products in half precision.
     """
 
     wanted: tuple[str, ...] = NAMES
@@ -123,7 +124,9 @@ def differentiated(
 
     def other() -> Any:
         smaller = scene.rows(np.arange(len(scene.gaussians) // 2))
-        return draw(smaller, leaves(smaller, True))
+        fainter = scene.with_overrides(opacities=0.5 * scene.gaussians.opacities)
+        # memory of any size that the scene itself takes is taken by one or the other
+        return [draw(each, leaves(each, True)) for each in (fainter, smaller)]
 
     H, W = scene.camera.height, scene.camera.width
     v_image, v_alpha = cotangents[0].reshape(1, H, W, -1), -cotangents[1].reshape(1, H, W, 1)
@@ -155,7 +158,7 @@ def _differentiate(
     Args:
         draw: given the arguments by name, an image and alphas.
         values: tensors by name, without gradients.
-        other: draws another scene, with gradients.
+        other: draws other scenes, with gradients.
         v_image, v_alpha: cotangents, in the outputs' shapes.
         ask: how.
     """
@@ -168,7 +171,8 @@ def _differentiate(
         # a state that no seed leaves
         torch.rand(1)
         settings = _settings_of_torch()
-        found = draw(arguments)
+        with torch.autocast(v_image.device.type, enabled=ask.before == "autocast"):
+            found = draw(arguments)
         unsettled.update(name for name, value in _settings_of_torch().items() if value != settings[name])
         return found
 
@@ -187,7 +191,7 @@ def _differentiate(
     if ask.before == "present":
         for name in ask.wanted:
             laid[name].base.grad = torch.ones_like(laid[name].base)
-    refused = _went_back(outputs, {"image": v_image, "alpha": v_alpha}, laid, ask)
+    refused = _went_back(outputs, {"image": v_image, "alpha": v_alpha}, laid, other, ask)
     kept = () if ask.before == "edited" else tuple(laid)
     return Differentiated(
         gradients={name: None if laid[name].gradient is None else laid[name].gradient.clone() for name in ask.wanted},
@@ -225,7 +229,9 @@ def _settings_of_torch() -> dict[str, Any]:
     }
 
 
-def _went_back(outputs: dict[str, Any], cotangents: dict[str, Any], laid: dict[str, Laid], ask: Ask) -> str:
+def _went_back(
+    outputs: dict[str, Any], cotangents: dict[str, Any], laid: dict[str, Laid], other: Callable[[], Any], ask: Ask
+) -> str:
     """Hold the backward pass, and return why not, or an empty text."""
     torch = importlib.import_module("torch")
     # alphas do not follow a background; where nothing else reaches them, gradients lack a part
@@ -242,6 +248,8 @@ def _went_back(outputs: dict[str, Any], cotangents: dict[str, Any], laid: dict[s
                     each.detach().mul_(0.5)
         if ask.before == "twice":
             torch.autograd.backward(chosen, given, retain_graph=True)
+            # which may write where the first pass has read
+            other()
         torch.autograd.backward(chosen, given)
     except RuntimeError as error:
         return str(error)

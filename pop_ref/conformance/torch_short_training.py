@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import fields, replace
 from typing import Any
 
@@ -21,6 +22,32 @@ _NAMES = {"pixelwise": "photometric", "padding": "ssim_padding"}
 # what a strategy keeps of a window
 KEPT = ("grad2d", "count", "views", "dominant_sum", "blurred", "radii", "sh_rest_sum")
 STILL = LearningRates(means=0.0, scales=0.0, quats=0.0, opacities=0.0, sh0=0.0, sh_rest=0.0)
+
+
+class _InterruptedError(Exception):
+    """Raised in the middle of a run."""
+
+
+class _Drawing:
+    """A strategy by gsplat's protocol that changes nothing, and draws a number with torch's own generator at a step."""
+
+    def __init__(self, rand: Callable[[int], Any]) -> None:
+        self._rand = rand
+        self.drawn: list[float] = []
+
+    def check_sanity(self, params: Any, optimizers: Any) -> None:
+        """Take any parameters."""
+
+    def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
+        """Remember nothing."""
+        return {}
+
+    def step_pre_backward(self, *given: Any) -> None:
+        """Ask for no gradient."""
+
+    def step_post_backward(self, *given: Any, packed: bool = False) -> None:
+        """Draw a number."""
+        self.drawn.append(float(self._rand(1)))
 
 
 class Trainee:
@@ -70,6 +97,18 @@ class Trainee:
         run = self._run(short, foreign=True)
         return [self._taken(run, step) for step in range(short.steps)]
 
+    def foreign_draws(self, short: ShortTraining) -> tuple[list[float], bool]:
+        """Let somebody else's strategy draw a random number after every step.
+
+        Returns:
+            The numbers, and whether those that everybody draws are left as they were.
+        """
+        strategy = _Drawing(self._torch.rand)
+        run, before = self._run(short, foreign=strategy), self._torch.get_rng_state()
+        for step in range(short.steps):
+            self._step(run, step)
+        return strategy.drawn, bool(self._torch.equal(self._torch.get_rng_state(), before))
+
     def corrected_steps(self, short: ShortTraining, corrections: np.ndarray) -> tuple[list[dict[str, Any]], np.ndarray]:
         """Take steps with cameras that are corrected and stay so; return them, and the cameras from which they saw.
 
@@ -110,6 +149,34 @@ class Trainee:
         run.run()
         return [_array(run.params[key]) for key in KEYS]
 
+    def resumed_run(self, short: ShortTraining, folder: str, after: int, **more: Any) -> list[dict[str, np.ndarray]]:
+        """Return what a run leaves by name that goes to its end at once, and one that is interrupted and resumed.
+
+        Both are in single precision, which checkpoints hold, and draw their random numbers themselves.
+
+        Args:
+            short: what is trained.
+            folder: where both are written.
+            after: so many steps the second is interrupted.
+            more: further settings of a run.
+        """
+        single, saved = Trainee(self._package, self._backend, "float32"), {"save_steps": (after,), **more}
+        whole, broken = (single._run(short, f"{folder}/{name}", **saved) for name in ("whole", "broken"))
+
+        def interrupt(run: Any) -> None:
+            if run.step == after:
+                raise _InterruptedError
+
+        broken._watch = interrupt
+        del whole.draws, broken.draws
+        whole.run()
+        with suppress(_InterruptedError):
+            broken.run()
+        again = single._run(short, f"{folder}/broken", resume=True, **saved)
+        del again.draws
+        again.run()
+        return [_left_by(run) for run in (whole, again)]
+
     def _views_of(self, run: Any) -> list[Any]:
         of = self._module("train.views").ViewTensors.of
         return [of(view, self._float) for view in run._capture.train_views(run.config.test_every)]
@@ -133,14 +200,17 @@ class Trainee:
             "v": {key: _array(moments[key]["exp_avg_sq"]) for key in KEYS},
         }
 
-    def _run(self, short: ShortTraining, folder: str = "", foreign: bool = False, **more: Any) -> Any:
+    def _run(
+        self, short: ShortTraining, folder: str = "", foreign: Any = None, resume: bool = False, **more: Any
+    ) -> Any:
         """Return a run of the short training; the engine is the one that its settings have."""
         initial = {key: self._torch.as_tensor(value).to(self._float) for key, value in short.params.items()}
         config = self._config(short, folder, more)
         # in single precision a run chooses its engine itself
         engine = None if self._float == self._torch.float32 else self._engine(config)
         TrainingRun = self._module("train.training_run").TrainingRun
-        given = {"initial": initial, "engine": engine, "strategy": config.strategy if foreign else None}
+        strategy = config.strategy if foreign is True else foreign
+        given = {"initial": initial, "engine": engine, "strategy": strategy, "resume": resume}
         run = TrainingRun(config, self._capture(short), **given)
         drawn, Draws = short.draws(), self._module("density.protocol").Draws
         run.draws = Draws(
@@ -326,6 +396,18 @@ def _array(value: Any) -> Any:
         return value
     array = value.detach().cpu().numpy().copy()
     return array.astype(np.float64) if array.dtype.kind == "f" else array
+
+
+def _left_by(run: Any) -> dict[str, np.ndarray]:
+    """Return all numbers that a run would go on from, by name."""
+    found: dict[str, Any] = {name: run.state.get(name) for name in KEPT}
+    found |= {"generator": run.state["generator"].get_state(), "order": run._order.ahead(2 * len(run._train))}
+    for key in KEYS:
+        moments = run.optimizers[key].state[run.params[key]]
+        found |= {key: run.params[key], **{f"{name} of {key}": value for name, value in moments.items()}}
+    for key, learned in run.appearance.state_dict().items():
+        found |= {f"{name} of {key}": value for name, value in learned.items()}
+    return {name: np.asarray(_array(value)) for name, value in found.items() if value is not None}
 
 
 def _arrays(params: dict[str, Any]) -> dict[str, np.ndarray]:

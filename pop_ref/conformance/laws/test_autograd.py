@@ -117,6 +117,13 @@ def test_nothing_follows_where_no_argument_requires_a_gradient(backend):
 
 
 @law("autograd", GRADIENTS, "differentiate")
+def test_under_autocast_the_same_image_is_drawn_and_has_the_same_gradients(backend):
+    # where a loss of others trains in mixed precision; the way back lies outside, as torch asks for
+    plain, mixed = (_assert_gradients(backend, Ask(before=before)).image[0] for before in ("nothing", "autocast"))
+    assert_close("autograd.image", mixed, plain, np.abs(plain) + 1.0, backend.dtype)
+
+
+@law("autograd", GRADIENTS, "differentiate")
 def test_a_second_forward_pass_does_not_change_the_first_ones_gradients(backend):
     _assert_gradients(backend, Ask(before="another"))
 

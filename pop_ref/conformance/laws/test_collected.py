@@ -83,8 +83,10 @@ def test_a_training_sums_the_pixels_that_each_gaussian_dominates_in_the_window(b
 
 @law("training", "collected_statistics")
 def test_pixels_that_a_mask_leaves_out_are_not_collected(backend):
-    for window in ("own_view", "sum"):
-        pairs = list(_assert_collected(backend, 0, masked=True, blur_window=window, theta_blur=0.08))
+    # also where no prior asks what is dominated
+    for window, weight in (("own_view", 1e-3), ("sum", 0.0)):
+        asks = {"blur_window": window, "lambda_pop": weight}
+        pairs = list(_assert_collected(backend, 0, masked=True, theta_blur=0.08, **asks))
         _assert_flags(pairs)
         if window == "sum":
             for got, wanted in pairs:

@@ -9,6 +9,7 @@ import dataclasses
 
 import numpy as np
 
+from pop_ref.conformance.assertions import assert_same_bits
 from pop_ref.conformance.calls import Call, Frame
 from pop_ref.conformance.capabilities import (
     BATCHES,
@@ -22,6 +23,7 @@ from pop_ref.conformance.capabilities import (
     NO_BACKGROUND,
     PACKED,
     PLANES,
+    PROFILES,
     RADIUS_CLIP,
     SIGNATURE,
     SPARSE_GRAD,
@@ -115,6 +117,20 @@ def test_the_low_pass_is_as_wide_as_the_call_says(backend):
         assert_call_is_the_oracles(backend, call)
 
 
+@law("signature", SIGNATURE, PLANES, PROFILES)
+def test_a_profile_has_its_own_planes_and_low_pass_where_a_call_is_at_the_defaults(backend):
+    # as Inria's near plane is 0.2, and gsplat's signature says 0.01 by itself
+    (frame,) = frames(backend, 5)
+    own = {"near_plane": 2.0, "far_plane": 4.5, "eps2d": 1.0}
+    scene = backend.sees(frame.scene.with_overrides(profile=dataclasses.replace(frame.scene.profile, **own)))
+    call = Call(((Frame(scene, None),),), planes=own)
+    usual = {"near_plane": 0.01, "far_plane": 1e10, "eps2d": 0.3}
+    _assert_it_matters(backend, call, planes=usual)
+    # what has no argument for a profile reads the planes that it is given
+    unsaid = dataclasses.replace(call, planes=usual if backend.takes("profile") else {})
+    assert_same_bits("image", backend.call(unsaid).images, backend.call(call).images)
+
+
 def _in_units(frame, unit):
     """Return a frame of the same world, whose lengths are told in a unit: its picture is the same."""
     scene = frame.scene
@@ -192,6 +208,9 @@ def test_batch_entries_do_not_know_of_each_other(backend):
     assert_call_is_the_oracles(backend, Call(rows, batch=(2,)))
     plain = tuple(frames(backend, 4 + entry, 2, channels=3, camera_colors=True, entry=entry) for entry in range(2))
     assert_call_is_the_oracles(backend, Call(plain, batch=(2,), camera_colors=True))
+    # in the order of the first axis, then of the second
+    squared = tuple(frames(backend, 4 + entry, entry=entry) for entry in range(4))
+    assert_call_is_the_oracles(backend, Call(squared, batch=(2, 2)))
 
 
 @law("signature", SIGNATURE, PACKED, CAMERAS)
@@ -226,8 +245,9 @@ def test_the_expected_depth_is_the_accumulated_one_over_the_opacity(backend):
 
 @law("signature", SIGNATURE, DEPTH, COLORS, CAMERAS)
 def test_depth_follows_plain_colours_of_several_cameras(backend):
-    # kernels pad channels to the next number that they are compiled for, and depth comes after those that there are
-    for channels, mode in ((3, "RGB+D"), (3, "RGB+ED"), (4, "RGB+D"), (2, "RGB+ED"), (6, "RGB+D")):
+    # kernels pad channels to the next number that they are compiled for, or take 32 at a time, and depth comes after
+    # those that there are
+    for channels, mode in ((3, "RGB+ED"), (4, "RGB+D"), (2, "RGB+ED"), (6, "RGB+D"), (31, "RGB+D"), (32, "RGB+ED")):
         assert_call_is_the_oracles(backend, Call((frames(backend, 9, 2, channels=channels),), render_mode=mode))
 
 

@@ -107,6 +107,31 @@ def test_tiles_of_a_number_beyond_16_bits_are_drawn(backend):
         assert_close("whole.tiles", getattr(view, name), getattr(whole, name), 16.0, backend.dtype)
 
 
+GREY, RED, BLUE = ((0.0, 0.0, 0.0),), ((2.0, -1.0, -1.0),), ((-1.0, -1.0, 2.0),)
+
+
+@law("whole", RENDER, EXTENTS)
+def test_tiles_whose_light_ends_one_after_the_other_show_what_ended_it(backend):
+    # four tiles of 8 px in a row, each behind 32 more faint splats than the one before it; lists get shorter, so that
+    # whatever is done for several tiles at a time goes on without the first, then without the second
+    camera = Camera(np.eye(4), np.array([[16.0, 0.0, 16.0], [0.0, 16.0, 4.0], [0.0, 0.0, 1.0]]), 32, 8)
+    records, size = [], (3.5, 3.5, 3.5)
+    for tile in range(4):
+        x, kinds = 8.0 * tile + 4.0, ((32 * tile, 0.0078125, GREY), (24, 0.984375, BLUE), (96 - 32 * tile, 0.5, RED))
+        for depth, (count, opacity, sh) in enumerate(kinds, 1):
+            depths = (depth + np.arange(count) / 256.0).tolist()
+            records += [Record(x=x, y=4.0, depth=d, size=size, opacity=opacity, sh=sh) for d in depths]
+    scene = backend.sees(Scene(pack(records, camera), camera, (1.0, 1.0, 1.0), tile_size=8))
+    view = backend.plainly(scene)
+    whole = backend.plainly(scene.with_overrides(tile_size=16))
+    assert np.max(np.abs(view.image - whole.image)) < 0.03125, "tiles of 8 px show another picture than one of 16"
+    for tile in range(4):
+        at = np.s_[2:6, 8 * tile + 2 : 8 * tile + 6]
+        light, color = view.T_final[at], view.image[at]
+        shown = np.max(light) < 0.0078125 and np.min(color[..., 2]) > 1.5 * np.max(color[..., 0])
+        assert shown, f"tile {tile} does not show the splats that take its light"
+
+
 @law("whole", RENDER, scene=plain, seed=st.randoms(use_true_random=False))
 def test_permuting_gaussians_permutes_ids_only(backend, scene, seed):
     # depths are made distinct: memory order decides ties (D4)

@@ -284,6 +284,66 @@ def _blind_cameras_have_no_number(given: Given, images: Any, alphas: Any, meta: 
     return images, alphas, meta
 
 
+def _batch_ids_count_images(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
+    if _packed(given):
+        meta["batch_ids"] = meta["batch_ids"] * given["viewmats"].shape[-3] + meta["camera_ids"]
+    return images, alphas, meta
+
+
+def _depth_lost_behind_a_full_chunk(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
+    full = given["render_mode"].startswith("RGB+") and plain(given) and given["colors"].shape[-1] % 32 == 0
+    if full:
+        torch = import_torch()
+        images = torch.cat((images[..., :-1], 0.0 * images[..., -1:]), -1)
+    return images, alphas, meta
+
+
+def _one_empty_camera_fails(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
+    empty = alphas.detach().flatten(-3).amax(-1) == 0.0
+    if several(given) and bool(empty.any()) and not bool(empty.all()):
+        raise RuntimeError("cumsum of no intersections")
+    return images, alphas, meta
+
+
+def _packed_screen_gradients_of_the_first_camera(sound: Rasterization, given: Given) -> Any:
+    if not (_packed(given) and several(given)):
+        return sound(**given)
+    told: dict[str, Any] = {}
+
+    def first_alone(v: Any) -> Any:
+        # by now that of the screen centres is known
+        grad = told["meta"]["means2d"].grad
+        if grad is not None:
+            grad[told["meta"]["camera_ids"] > 0] = 0.0
+        return v
+
+    images, alphas, told["meta"] = sound(**given | {"means": backwards(given["means"], first_alone)})
+    return images, alphas, told["meta"]
+
+
+def _batch_axes_transposed(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
+    if given["means"].dim() < 4:
+        return images, alphas, meta
+    return images.transpose(0, 1).reshape(images.shape), alphas.transpose(0, 1).reshape(alphas.shape), meta
+
+
+def _packed_depths_of_the_first_camera(sound: Rasterization, given: Given) -> Any:
+    if not (_packed(given) and several(given) and given["render_mode"] == "D"):
+        return sound(**given)
+    depths = in_camera(given["means"], given["viewmats"])[..., 2:]
+    first = depths[..., :1, :, :].expand_as(depths)
+    return sound(**given | {"colors": first, "sh_degree": None, "render_mode": "RGB", "backgrounds": None})
+
+
+def _gradients_of_the_usual_low_pass(sound: Rasterization, given: Given) -> Any:
+    images, alphas, meta = sound(**given)
+    if given["eps2d"] == 0.3:
+        return images, alphas, meta
+    usual, usual_alphas, _ = sound(**given | {"eps2d": 0.3})
+    # the values of the one, the graph of the other
+    return usual + (images - usual).detach(), usual_alphas + (alphas - usual_alphas).detach(), meta
+
+
 _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("viewmats_of_the_first_camera", "all cameras of a call see from the first one's place",
      _if(several, viewmats=_of_first("viewmats", 2)),
@@ -543,6 +603,25 @@ _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("blind_cameras_have_no_number",
      "in packed mode a camera that sees nothing is not counted, and those after it have a number too low",
      telling(_blind_cameras_have_no_number), "test_signature_pairs:every_pair_of_arguments_has_the_oracles_gradients"),
+    ("batch_ids_count_images", "batch_ids of packed rows number images, not scenes",
+     telling(_batch_ids_count_images),
+     "test_signature_arguments:packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same"),
+    ("depth_lost_behind_a_full_chunk", "beside 32 channels of colour, or a multiple, the depth is 0",
+     telling(_depth_lost_behind_a_full_chunk),
+     "test_signature_arguments:depth_follows_plain_colours_of_several_cameras"),
+    ("one_empty_camera_fails", "a call fails where one of several cameras sees nothing",
+     telling(_one_empty_camera_fails), "test_signature_pairs:arguments_that_are_taken_alone_are_taken_together"),
+    ("packed_screen_gradients_of_the_first_camera",
+     "in packed mode the gradient of screen centres is kept for the first camera's rows alone",
+     _packed_screen_gradients_of_the_first_camera,
+     "test_signature_arguments:packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same"),
+    ("batch_axes_transposed", "of two batch axes the pictures have the second one first",
+     telling(_batch_axes_transposed), "test_signature_arguments:batch_entries_do_not_know_of_each_other"),
+    ("packed_depths_of_the_first_camera", "in packed mode all cameras show the first one's depths",
+     _packed_depths_of_the_first_camera, "test_signature_pairs:every_pair_of_arguments_draws_what_the_oracle_draws"),
+    ("gradients_of_the_usual_low_pass",
+     "the way back has the low-pass written into it, whatever eps2d says (diff-gaussian-rasterization's backward)",
+     _gradients_of_the_usual_low_pass, "test_signature_arguments:the_low_pass_is_as_wide_as_the_call_says"),
 )  # fmt: skip
 
 PAIRS: Final = tuple(BlackBox(*line) for line in _BOXES)

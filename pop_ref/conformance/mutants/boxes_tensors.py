@@ -15,6 +15,7 @@ from pop_ref.conformance.mutants.black_box import (
     Breaks,
     Given,
     Rasterization,
+    backwards,
     breaking,
     import_torch,
     telling,
@@ -446,6 +447,19 @@ def _pose_kept_with_its_tensor(given: Given) -> Given:
     return {"viewmats": viewmats + (kept - viewmats).detach()}
 
 
+def _nothing_where_transparent(given: Given) -> Given:
+    opacities = given["opacities"]
+    nothing = opacities.detach() == 0.0
+    return {"opacities": backwards(opacities, lambda v: v.masked_fill(nothing, float("nan")))}
+
+
+def _halved_by_autocast(given: Given) -> Given:
+    torch = import_torch()
+    if not torch.is_autocast_enabled("cpu"):
+        return {}
+    return {"means": given["means"].to(torch.bfloat16).to(given["means"].dtype)}
+
+
 _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("gradients_if_all_are_asked_for", "unless every array requires a gradient, none has one",
      breaking(_nowhere_unless(ROWS, ROWS)),
@@ -560,6 +574,10 @@ _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
      "test_autograd:tensors_that_have_been_drawn_before_are_drawn_with_the_numbers_that_they_have_now"),
     ("cotangents_in_half_precision", "the gradient by the picture goes back in 16 bits (mixed precision)",
      _cotangents_read(lambda v: v.half().to(v.dtype)), "test_autograd:cotangents_are_read_to_their_last_digit"),
+    ("nothing_where_transparent", "the gradient of an opacity of exactly 0 is no number: its moment is divided by it",
+     breaking(_nothing_where_transparent), "test_footprint:an_opacity_of_zero_has_no_gradient"),
+    ("halved_by_autocast", "under autocast centres have 16 bits, as what is drawn is not kept out of it",
+     breaking(_halved_by_autocast), "test_autograd:under_autocast_the_same_image_is_drawn_and_has_the_same_gradients"),
 )  # fmt: skip
 
 

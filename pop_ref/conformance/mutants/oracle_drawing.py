@@ -143,6 +143,17 @@ _LINES: Final[Lines] = {
          "the frustum's horizontal margin is a share of the whole width, not of its half (limits as in gsplat PR#305)",
          "margin_x = profile.frustum_margin * 0.5 * width / fx", "margin_x = profile.frustum_margin * width / fx",
          "test_agreement:projection_jacobians_is_the_oracles"),
+        ("left_clamp_pulls_like_the_right",
+         "the depth's gradient where a slope is clamped has the sign of the right edge on the left one too",
+         "return 0.0, fx * tx / (z * z * z) * v_offset", "return 0.0, fx * abs(tx) / (z * z * z) * v_offset",
+         "test_whole_steps:every_step_is_the_oracles_under_every_setting"),
+        ("limits_about_the_given_centre",
+         "where the principal point is centred the clamp still lies about the one that is given",
+         "fx, fy, cx, cy = _intrinsics(K, width, height, profile)\n"
+         "    margin_x",
+         "fx, fy, cx, cy = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))\n"
+         "    margin_x",
+         "test_whole_steps:what_a_method_prunes_by_is_of_all_photographs"),
     ),
     "footprint.py": (
         ("conic_off_diagonal_twice",

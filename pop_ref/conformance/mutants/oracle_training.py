@@ -25,6 +25,13 @@ _LINES: Final[Lines] = {
          "(height * width if mask is None else int(np.sum(mask))) * channels",
          "height * width * channels if mask is None else int(np.sum(mask))",
          "test_losses:pixelwise_losses_of_what_a_mask_keeps_are_the_oracles"),
+        ("l1_objective_pulls_by_whole_windows",
+         "beside L1 the gradient of D-SSIM is of whole windows, whatever the padding",
+         "v_pixelwise = l1_vjp(image, target, v_loss * (1.0 - lambda_ssim) * l1_scale, mask)\n"
+         "    return v_pixelwise + d_ssim_vjp(image, target, v_loss * lambda_ssim, padding, mask, halved)",
+         "v_pixelwise = l1_vjp(image, target, v_loss * (1.0 - lambda_ssim) * l1_scale, mask)\n"
+         '    return v_pixelwise + d_ssim_vjp(image, target, v_loss * lambda_ssim, "valid", mask, halved)',
+         "test_whole_steps:every_step_is_the_oracles_under_every_setting"),
     ),
     "ssim.py": (
         ("halved_d_ssim", "(1 - SSIM) / 2 for 1 - SSIM (A11)",
@@ -145,6 +152,11 @@ _LINES: Final[Lines] = {
          "if config.reset_every > 0 and step % config.reset_every < config.pause_refine_after_reset:",
          "if 0 < config.reset_every <= step and step % config.reset_every < config.pause_refine_after_reset:",
          "test_density:the_gaussians_change_every_hundred_steps_and_opacities_are_reset_where_that_is_asked_for"),
+        ("children_are_never_pruned", "what has just been split off is spared by the prune of the same change",
+         "rows = prune_rows(rows, prune_mask(opacities, scales, scene_scale, step, config))",
+         "old = np.arange(len(rows)) < len(rows) - 2 * int(np.sum(split))\n"
+         "    rows = prune_rows(rows, prune_mask(opacities, scales, scene_scale, step, config) & old)",
+         "test_whole_steps:every_step_is_the_oracles_while_the_gaussians_change"),
     ),
     "density_rows.py": (
         ("moments_left_behind",
@@ -172,6 +184,10 @@ _LINES: Final[Lines] = {
          "test_density:a_reset_lowers_opacities_to_the_ceiling_and_forgets_their_moments_only"),
         ("reset_raises_the_faint", "a reset of opacities sets all of them to the ceiling, also those that lie under it",
          'np.minimum(rows.params["opacities"], logit)', 'np.full_like(rows.params["opacities"], logit)',
+         "test_strategies:a_training_by_gsplat_is_the_oracles_at_every_step"),
+        ("resets_keep_what_is_fainter_moving",
+         "a reset forgets the first moments of those opacities alone that it lowers", '{**rows.m, "opacities": zeros},',
+         '{**rows.m, "opacities": np.where(rows.params["opacities"] > logit, 0.0, rows.m["opacities"])},',
          "test_strategies:a_training_by_gsplat_is_the_oracles_at_every_step"),
     ),
     "optimizer.py": (
@@ -257,6 +273,10 @@ _LINES: Final[Lines] = {
         ("eps_of_the_usual_size", "eps is 1e-8, Adam's usual one: gradients under it take small steps",
          "EPS: Final = 1e-15", "EPS: Final = 1e-8",
          "test_optimizer:gradients_of_any_smallness_take_whole_steps"),
+        ("scale_ends_with_l2", "where L1 takes over, the factor on the pixelwise term is forgotten",
+         'return replace(self, pixelwise="l1", lambda_ssim=LAMBDA_SSIM_3DGS)',
+         'return replace(self, pixelwise="l1", lambda_ssim=LAMBDA_SSIM_3DGS, pixel_scale=1.0)',
+         "test_whole_steps:every_step_is_the_oracles_under_every_setting"),
     ),
     "selection.py": (
         ("share_of_the_number", "the threshold is at a share of N, not of N - 1",
@@ -680,6 +700,29 @@ _LINES: Final[Lines] = {
         ("visible_is_what_dominates", "a prior on the visible takes part in what dominates a pixel alone",
          'visible = view.splats.visible if recipe.pop_over == "visible" else None',
          'visible = counts > 0 if recipe.pop_over == "visible" else None',
+         "test_whole_steps:every_step_is_the_oracles_under_every_setting"),
+        ("gradients_over_black", "a step draws over its background and goes back over black",
+         "gradients = render_vjp(gaussians, camera, v_image, **options)",
+         'gradients = render_vjp(gaussians, camera, v_image, **options | {"background": None})',
+         "test_whole_steps:every_step_is_the_oracles_under_every_setting"),
+        ("gradients_of_classic_splats", "a step draws with the antialiasing factor and goes back without",
+         "gradients = render_vjp(gaussians, camera, v_image, **options)",
+         'gradients = render_vjp(gaussians, camera, v_image, **options | {"antialiased": False})',
+         "test_whole_steps:every_step_is_the_oracles_under_every_setting"),
+        ("reset_before_the_change",
+         "where a step both changes and resets, opacities are lowered first, and children halve what is left",
+         "    if densifies_at(step, config):\n"
+         "        rows, statistics = densify_and_prune(rows, statistics, scene_scale, step, normals, config)\n"
+         "    if resets_at(step, config):\n"
+         "        rows = reset_opacities(rows, config.reset_opa)\n",
+         "    if resets_at(step, config):\n"
+         "        rows = reset_opacities(rows, config.reset_opa)\n"
+         "    if densifies_at(step, config):\n"
+         "        rows, statistics = densify_and_prune(rows, statistics, scene_scale, step, normals, config)\n",
+         "test_whole_steps:every_step_is_the_oracles_while_the_gaussians_change"),
+        ("prior_a_step_too_long", "the prior on opacities still pulls at the first step without it",
+         "if not recipe.pop_start_iter <= state.step < recipe.pop_stop_iter:",
+         "if not recipe.pop_start_iter <= state.step <= recipe.pop_stop_iter:",
          "test_whole_steps:every_step_is_the_oracles_under_every_setting"),
     ),
     "regularizers.py": (

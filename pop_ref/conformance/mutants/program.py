@@ -253,6 +253,21 @@ _LINES: Final[Lines] = {
          "torch.logit(opacities.reshape(-1), eps=torch.finfo(opacities.dtype).eps)",
          "torch.logit(opacities.reshape(-1), eps=1e-2)",
          "test_strategies:a_training_is_the_oracles_under_every_reading"),
+        ("blur_unseen_at_its_last_step", "flags of blur are not collected at the last step that reads them",
+         "return self.collects(step) and step <= self.blur_stop_iter",
+         "return self.collects(step) and step < self.blur_stop_iter",
+         "test_strategies:a_training_by_pop_is_the_oracles_at_every_step"),
+        ("rewinds_to_an_unscaled_step", "a shorter schedule rewinds the positions' rate to a step of the whole one",
+         '*("means_rewind_iter", "means_rewind_to", ', '*("means_rewind_iter", ',
+         "test_collected:a_shorter_schedule_changes_the_gaussians_less_often_and_resets_no_sooner"),
+        ("logits_end_at_seven", "the entropy reads logits between -7 and 7 alone: what is further out is not pulled",
+         "eps=torch.finfo(opacities.dtype).eps", "eps=1e-3",
+         "test_strategies:a_training_is_the_oracles_under_every_reading"),
+        ("blur_without_a_prior_ignores_the_mask",
+         "a method without a prior asks for no dominance, so that blur counts pixels that the mask leaves out",
+         "return prior or self.collects_blur(step) or self.collects_window(step)",
+         "return prior or self.collects_window(step)",
+         "test_collected:pixels_that_a_mask_leaves_out_are_not_collected"),
     ),
     "stages/density.py": (
         ("parent_opacity_for_children", "the children's opacity is revised twice",
@@ -372,6 +387,13 @@ _LINES: Final[Lines] = {
         ("rounds_without_a_start_decay_too", "a method that prunes in no rounds has their decay from the first step on",
          "torch.where((steps >= start) & (start > 0), factor, 1.0)", "torch.where(steps >= start, factor, 1.0)",
          "test_optimizer:every_other_rate_stays_as_it_is"),
+        ("epoch_begins_anew_on_resume", "a run that is resumed within an epoch shows its first views again",
+         'self._position = int(state["position"])', "self._position = 0",
+         "test_whole_steps:a_run_that_is_interrupted_within_a_window_goes_on_to_the_same_bits"),
+        ("resets_replace_updates_too",
+         "in a loop whose changes replace the update, a step that only resets opacities moves nothing",
+         "if strategy.is_refine_step(step)]", "if strategy.changes_after(step)]",
+         "test_strategies:a_training_by_speedy_splat_is_the_oracles_at_every_step"),
     ),
     "stages/tiles.py": (
         ("ellipse_misses_its_tile",
@@ -478,6 +500,10 @@ _LINES: Final[Lines] = {
          "with every step through a list the places of dominant entries are counted from 0 again",
          "code.add_(float((first + start) // EIGHT * 2**EIGHT))", "code.add_(float(start // EIGHT * 2**EIGHT))",
          "test_collected:pixels_that_a_mask_leaves_out_are_not_collected"),
+        ("second_compaction_counts_from_the_first",
+         "of tiles that were chosen already the next choice is taken as if of all",
+         "self.select(keep if self.rows is None else self.rows[keep])", "self.select(keep)",
+         "test_whole:tiles_whose_light_ends_one_after_the_other_show_what_ended_it"),
     ),
     "stages/tile_groups.py": (
         ("lists_of_thirty_two", "a tile blends the first 32 entries of its list",
@@ -501,6 +527,11 @@ _LINES: Final[Lines] = {
          "gradients.add(group, blend, tiles.index_select(0, group.tiles))",
          "del blend.steps[32:]; gradients.add(group, blend, tiles.index_select(0, group.tiles))",
          "test_scale:the_gradients_of_a_thousand_in_a_tile_are_the_oracles"),
+        ("second_way_back_reads_used_buffers",
+         "a graph that is kept goes back a second time through light whose memory has been given away",
+         "blend, saved.blends[i] = saved.blends[i] or saved.blender.blend(group), None",
+         "blend = saved.blends[i] or saved.blender.blend(group)",
+         "test_autograd:a_second_backward_pass_adds_the_same_again"),
     ),
     "density/methods.py": (
         ("opacities_set_anew_as_logits", "Mini-Splatting's new points have the activated opacity as a logit",
@@ -658,6 +689,9 @@ _LINES: Final[Lines] = {
         ("others_have_no_term", "a strategy of somebody else is not asked for its term of the loss",
          "return None if term is None else term(", "return None if term is not None else term(",
          "test_whole_steps:every_step_is_the_oracles_by_a_strategy_of_somebody_else"),
+        ("foreign_draws_repeat", "a strategy of somebody else draws the same numbers at every change",
+         "        generator.set_state(torch.get_rng_state())\n", "        torch.get_rng_state()\n",
+         "test_whole_steps:a_strategy_of_somebody_else_draws_other_numbers_at_every_step_and_the_same_in_every_run"),
     ),
     "stages/projection.py": (
         ("depth_clamped_not_slope", "the frustum clamp is of z, not of x / z (GaussianSplattingMlx PR#28)",
@@ -799,6 +833,9 @@ _LINES: Final[Lines] = {
          "another size: LichtFeld-Studio PR#2129)",
          "        return shrunk(view, factor // 2)\n", "        mask = None\n",
          "test_whole_steps:a_thin_mask_keeps_a_photograph_from_being_so_coarse_that_nothing_counts"),
+        ("green_screens_are_black", "a background without red is taken for black",
+         "if background is None and any(config.background):", "if background is None and config.background[0]:",
+         "test_whole_steps:every_step_is_the_oracles_under_every_setting"),
     ),
     "train/torch_stepper.py": (
         ("all_bands_from_the_first_step", "a step draws with all bands, also with those whose turn has not come",
@@ -849,6 +886,10 @@ _LINES: Final[Lines] = {
          "return self._kept.setdefault(\n                index, target_moments(view.target_over(background, "
          "self._background), self._config.ssim_padding)\n            )",
          "test_collected:where_nothing_is_drawn_and_a_photograph_is_clear_both_are_the_same_background"),
+        ("batches_blur_by_all_pixels",
+         "in a step of several views the blur rule takes its share of all pixels, though the mask's count",
+         '                info["kept_pixels"] = view.kept_pixels\n', "                pass\n",
+         "test_collected:views_of_one_step_are_collected_at_their_own_sizes"),
     ),
     "density/passes.py": (
         ("passes_count_masked_pixels", "a pass over a photograph counts dominated pixels that its mask leaves out",
@@ -992,6 +1033,22 @@ _LINES: Final[Lines] = {
         ("always_the_usual_rates", "a method with rates of its own is trained at the usual ones",
          '"lr": recipe.lr,', '"lr": LearningRates(),',
          "test_whole_steps:every_step_of_every_method_is_the_oracles"),
+    ),
+    "train/checkpoint.py": (
+        ("window_lost_on_resume",
+         "a run that is resumed within a window has forgotten what was collected: what is None at the start stays so",
+         "        else:\n"
+         "            state[key] = value\n",
+         "        elif state.get(key) is not None:\n"
+         "            state[key] = value\n",
+         "test_whole_steps:a_run_that_is_interrupted_within_a_window_goes_on_to_the_same_bits"),
+    ),
+    "api/checks.py": (
+        ("defaults_overrule_the_profile",
+         "planes and low-pass of the signature's defaults overrule those of the profile",
+         "changed = {name: value for name, value in given.items() if value != getattr(GSPLAT_1_5, name)}",
+         "changed = {name: value for name, value in given.items() if value != getattr(chosen, name)}",
+         "test_signature_arguments:a_profile_has_its_own_planes_and_low_pass_where_a_call_is_at_the_defaults"),
     ),
 }  # fmt: skip
 

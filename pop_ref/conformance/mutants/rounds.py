@@ -139,6 +139,19 @@ _NAMES: Final = {
         scales_in_half_precision rows_counted_in_a_byte too_many_intersections_draw_nothing
         pose_kept_with_its_tensor cotangents_in_half_precision
     """,
+    "blind sixth": """
+        left_clamp_pulls_like_the_right limits_about_the_given_centre children_are_never_pruned
+        gradients_over_black gradients_of_classic_splats reset_before_the_change prior_a_step_too_long
+        l1_objective_pulls_by_whole_windows scale_ends_with_l2 resets_keep_what_is_fainter_moving
+        blur_unseen_at_its_last_step rewinds_to_an_unscaled_step logits_end_at_seven
+        blur_without_a_prior_ignores_the_mask epoch_begins_anew_on_resume resets_replace_updates_too
+        window_lost_on_resume batches_blur_by_all_pixels foreign_draws_repeat
+        second_compaction_counts_from_the_first second_way_back_reads_used_buffers green_screens_are_black
+        defaults_overrule_the_profile batch_ids_count_images depth_lost_behind_a_full_chunk
+        one_empty_camera_fails packed_screen_gradients_of_the_first_camera batch_axes_transposed
+        packed_depths_of_the_first_camera gradients_of_the_usual_low_pass nothing_where_transparent
+        halved_by_autocast
+    """,
     "drawn": """
         extents_that_hardly_overlap_are_culled last_start_a_step_early passes_count_too_few_bands
         wide_turns_times_their_angle whole_background_in_passes others_have_no_term series_without_signs
