@@ -344,7 +344,7 @@ def _sizes(folder: Path, splat: Splat, capture: Capture, params: dict[str, Tenso
     from pop_fast.train.environment import reproducible
     from pop_fast.train.evaluate import measure_encodings
     from pop_fast.train.views import ViewTensors
-    from pop_fast.view.report.source import encoding_heads, encoding_rows
+    from pop_fast.view.report.source import encoding_table
 
     config = splat.config
     views = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
@@ -352,7 +352,7 @@ def _sizes(folder: Path, splat: Splat, capture: Capture, params: dict[str, Tenso
     with reproducible(config.threads):
         found = measure_encodings(backend, params, views, config, splat.sh_degree, capture.world_transform)
         entries = [encoding.entry() for encoding in found]
-    for line in table_lines([encoding_heads(entries), *encoding_rows(entries)]):
+    for line in table_lines(encoding_table(entries)):
         print(line)
     results = ResultFolder(folder)
     before = results.read_stats("val", splat.step) if splat.step is not None else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sized
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -284,15 +284,22 @@ def _leave_out_floaters(left: Limited, limits: LimitOptions, shown: Shown) -> No
         tuner = compact.Tuner(left.params, shown.sh_degree, config, capture, learned, steps, report)
         left.params = compact.tuned_to_the_end(tuner)
     views = tuner.held_out
-    where = f"{len(views)} held-out views" if views else "training views"
+    where = _named(views)
     after, had = (tuner.psnr(params, views) for params in (left.params, before))
     left.said.append(f"tuned for {steps} steps: PSNR in {where} {after:.2f} dB, with all Gaussians {had:.2f} dB")
+
+
+def _named(held_out: Sized) -> str:
+    """Name the views that are measured: those that are held out, or the training views where none is."""
+    from pop_fast.view.report.source import held_out_views
+
+    return held_out_views(len(held_out)) if held_out else "training views"
 
 
 def _quality(tuner: Tuner, found: Compact, output: Output) -> str:
     """Say how well a file shows the held-out views, or the training views where none is held out."""
     views = tuner.held_out
-    where = f"{len(views)} held-out views" if views else "training views"
+    where = _named(views)
     before, after = (tuner.psnr(params, views) for params in (tuner.whole, output.shown(found.params, found.level)))
     return f"PSNR of the file in {where}: {after:.2f} dB, of the whole splat {before:.2f} dB"
 

@@ -149,6 +149,15 @@ def test_eval_repeats_the_numbers_of_training(
     assert json.loads(written.read_text())["psnr"] == pytest.approx(trained["psnr"], abs=1e-3)
 
 
+def test_a_run_that_holds_out_no_view_has_no_numbers_of_any(pop: Pop, capture: Path, tmp_path: Path) -> None:
+    words = ("train", capture, "--out", tmp_path / "run", "--max-steps", "2", "--test-every", "0", "--skip-checks")
+    head = next(line for line in pop.done(*words).out.splitlines() if line.startswith("format"))
+    assert head.split() == ["format", "MB", "B/Gaussian", "of", "the", "PLY"]
+    assert "0.0 / 0.0" not in pop.done("compare", tmp_path / "run").out
+    assert "0.0 traversed" not in (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    says(pop("eval", tmp_path / "run"), "no view is held out")
+
+
 def test_eval_of_a_result_updates_its_stats_and_report(pop: Pop, result: Path) -> None:
     before = json.loads((result / STATS).read_text())
     (result / STATS).write_text(json.dumps({**before, "psnr": 1.0}))

@@ -136,6 +136,23 @@ def test_every_held_out_view_is_shown_as_render_photo_and_error(html: str) -> No
     assert "depth of" not in html
 
 
+@pytest.mark.parametrize(("views", "said"), [(0, None), (1, "1 held-out view"), (4, "4 held-out views")])
+def test_nothing_is_said_of_held_out_views_where_there_are_none(tmp_path: Path, views: int, said: str | None) -> None:
+    psnr = [30.0, 29.5] if views else [None, None]
+    entries = [
+        {"format": name, "bytes": 24_800 // (k + 1), "num_gaussians": 100, "psnr": psnr[k], "views": views}
+        for k, name in enumerate(("ply", "spz"))
+    ]
+    found = read_result(write_result(tmp_path / "r", views=views, psnr=psnr[0], encodings=entries))
+    heads, whole, small = found.files
+    assert heads[:4] == ("format", "MB", "B/Gaussian", "of the PLY")
+    assert heads[4:] == (() if said is None else (f"PSNR of {said}",))
+    assert whole == ("ply", "0.02", "248.0", "1/1.0", *(() if said is None else ("30.00 dB",)))
+    assert small == ("spz", "0.01", "124.0", "1/2.0", *(() if said is None else ("29.50 dB (-0.50)",)))
+    assert ("held-out" in found.subtitle) == (said is not None)
+    assert said is None or found.subtitle.split(" · ")[2] == said
+
+
 def test_the_report_reads_only_the_result_folder_and_that_of_a_run_that_was_killed_early(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -164,6 +164,30 @@ def test_views_that_few_steps_left_as_they_are_ask_for_more_steps(train: float, 
         assert found["Fit"].next == found["Overfitting"].next == found["Quality"].next
 
 
+@pytest.mark.parametrize(
+    ("photographs", "steps", "seconds", "words"),
+    [
+        # three minutes of the fox, of a terrace, of a capture with almost enough
+        (43, 300, 180.0, ("--minutes", "15")),
+        (302, 330, 190.0, ("--minutes", "90")),
+        (43, 1_289, 180.0, ("--minutes", "10")),
+        # a few seconds; what a night takes
+        (43, 300, 4.0, ("--minutes", "1")),
+        (900, 9_000, 30_000.0, ("--minutes", "1500")),
+        # minutes never choose more than the paper's 30,000 steps, and are not known of every run
+        (1_200, 30_000, 7_200.0, ("--steps-scaler", "3")),
+        (43, 300, None, ("--steps-scaler", "0.043")),
+    ],
+)
+def test_a_run_of_few_steps_is_sent_to_one_that_is_several_times_as_long(
+    photographs: int, steps: int, seconds: float | None, words: tuple[str, ...]
+) -> None:
+    checks = replace(GOOD, photographs=photographs, train_psnr=18.0, held_out_psnr=17.0, steps=steps)
+    stats = {} if seconds is None else {"seconds_total": seconds}
+    told = {one.about: one.next for one in verdict(stats, checks, None)}
+    assert told["Quality"] == told["Fit"] == ("train", "DATA", *words)
+
+
 def test_a_view_that_spoils_the_mean_is_named() -> None:
     for edge, mean, named in ((8.05, 15.95, True), (19.5, 19.77, False)):
         views = {"edge": edge, "a": 19.8, "b": 20.0}
@@ -305,7 +329,7 @@ def test_more_steps_help_where_few_left_all_views_far_off_and_fewer_where_it_lea
     noisy = edited(demo, tmp_path / "noisy", lambda _, image: image + draw.normal(0.0, 25.0, image.shape))
     short, told = trained(pop, ["train", noisy, "--out", tmp_path / "run", "--steps-scaler", "0.002"])
     assert {told["Quality"].kind, told["Fit"].kind} == {"bad"}
-    assert told["Quality"].next[:4] == told["Fit"].next[:4] == ("train", str(noisy), "--minutes", "240")
+    assert told["Quality"].next[:4] == told["Fit"].next[:4] == ("train", str(noisy), "--minutes", "1")
     long, told = trained(pop, told["Quality"].next)
     assert long.judged_psnr > short.judged_psnr + 1.0
     assert long.train_psnr > short.train_psnr + 3.0

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
@@ -36,8 +37,9 @@ _PARTS: Final = 0.006  # of a training view, on average: what does not fit where
 _PARTS_BY_COLOUR: Final = 0.0025  # the same of patches that have another mean colour
 _EPOCHS: Final = 30  # how often each photograph is to be seen
 _LOST: Final = 0.1  # of the photographs, without a camera
-
-_MORE_STEPS: Final = ("train", "DATA", "--minutes", "240")
+# a run of too few steps is asked for again so many times as long at least, and so long that these are not few any more
+_LONGER: Final = 3.0
+_USUAL_MINUTES: Final = (1, 2, 3, 5, 10, 15, 20, 30, 45, 60, 90, 120, 180, 240, 360, 480, 720, 1440)
 
 Kind = Literal["good", "look", "bad"]
 
@@ -75,23 +77,41 @@ def verdict(
     """
     # what was measured last: of a run that was stopped, statistics are of an earlier step
     psnr = stats.get("psnr") if checks is None else checks.judged_psnr
-    found = list(_quality(psnr, checks))
+    more = () if checks is None else _more_steps(stats, checks)
+    found = list(_quality(psnr, checks, more))
     # while exposures are learned, measurements without them fall for another reason
     course = None if checks is not None and checks.exposures_learned else held_out
     fewer = _fewer_steps(course)
     found += _course(course, fewer)
     if checks is not None:
         found += [
-            *_unfitting(checks),
-            *_overfitting(checks, fewer),
+            *_unfitting(checks, more),
+            *_overfitting(checks, fewer, more),
             *_photographs(checks),
-            *_exposure(checks),
+            *_exposure(checks, more),
             *_floating(checks),
         ]
     return found
 
 
-def _quality(psnr: float | None, checks: Checks | None) -> Iterator[Finding]:
+def _more_steps(stats: Mapping[str, Any], checks: Checks) -> tuple[str, ...]:
+    """Return the command for a longer training where a run took few steps; empty where it did not.
+
+    It says minutes where those of the run are known and the paper's schedule, which they never exceed, has more steps;
+    else steps.
+    """
+    steps, enough = checks.steps or 0, _EPOCHS * checks.photographs
+    if not 0 < steps < enough:
+        return ()
+    longer, taken = max(_LONGER, enough / steps), stats.get("seconds_total")
+    if not taken or longer * steps > Recipe.max_steps:
+        return ("train", "DATA", "--steps-scaler", f"{longer * steps / Recipe.max_steps:.2g}")
+    minutes = longer * taken / 60.0
+    usual = next((usual for usual in _USUAL_MINUTES if usual >= minutes), 60 * math.ceil(minutes / 60.0))
+    return ("train", "DATA", "--minutes", str(usual))
+
+
+def _quality(psnr: float | None, checks: Checks | None, more: tuple[str, ...]) -> Iterator[Finding]:
     if psnr is None:
         return
     by_view, notes = {} if checks is None else checks.held_out, ""
@@ -108,9 +128,9 @@ def _quality(psnr: float | None, checks: Checks | None) -> Iterator[Finding]:
     _, kind, words = next(grade for grade in _GRADES if psnr >= grade[0])
     next_: tuple[str, ...] = () if kind == "good" else ("data", "check", "DATA")
     # where the training views are hardly better, photographs are not what is missing
-    if kind != "good" and checks is not None and _too_short(checks) and _gap(checks) < _SOME_OVERFITTING:
+    if kind != "good" and checks is not None and more and _gap(checks) < _SOME_OVERFITTING:
         notes += f" The run had few steps, {(checks.steps or 0) / checks.photographs:.0f} a photograph."
-        next_ = _MORE_STEPS
+        next_ = more
     text = f"Views that training never saw are {words}: {psnr:.2f} dB on average.{notes}"
     yield Finding(kind, "Quality", text, next_)
 
@@ -137,17 +157,17 @@ def _course(held_out: tuple[Sequence[float], Sequence[float]] | None, fewer: flo
     yield Finding("bad", "Course", text, ("train", "DATA", "--steps-scaler", f"{fewer:.2g}"))
 
 
-def _unfitting(checks: Checks) -> Iterator[Finding]:
+def _unfitting(checks: Checks, more: tuple[str, ...]) -> Iterator[Finding]:
     """Judge whether the training views fit: what training could not reach there is no question of views in between."""
     text = f"training views reach {checks.train_psnr:.2f} dB"
     if checks.train_psnr >= _FITS:
         yield _parts(checks, text)
         return
-    short = " The run had few steps for it." if _too_short(checks) else ""
-    more = _MORE_STEPS if short else ("data", "check", "DATA")
+    short = " The run had few steps for it." if more else ""
+    next_ = more or ("data", "check", "DATA")
     why = f"{text}.{short} A subject or a light that moved, or wrong cameras, make photographs contradict "
     why += "one another"
-    yield Finding("bad" if checks.train_psnr < _FITS_BADLY else "look", "Fit", f"They do not all fit: {why}.", more)
+    yield Finding("bad" if checks.train_psnr < _FITS_BADLY else "look", "Fit", f"They do not all fit: {why}.", next_)
 
 
 def _parts(checks: Checks, text: str) -> Finding:
@@ -170,11 +190,6 @@ def _mean(by_view: Mapping[str, float]) -> float:
     return float(np.mean(list(by_view.values()))) if by_view else 0.0
 
 
-def _too_short(checks: Checks) -> bool:
-    """Tell whether a training view was seen less than a few dozen times."""
-    return checks.steps is not None and checks.steps < _EPOCHS * checks.photographs
-
-
 def _gap(checks: Checks) -> float:
     return 0.0 if checks.judged_psnr is None else checks.train_psnr - checks.judged_psnr
 
@@ -184,7 +199,7 @@ def _is_close(checks: Checks) -> bool:
     return checks.judged_psnr is not None and checks.judged_psnr >= _CLOSE
 
 
-def _overfitting(checks: Checks, fewer: float | None) -> Iterator[Finding]:
+def _overfitting(checks: Checks, fewer: float | None, more: tuple[str, ...]) -> Iterator[Finding]:
     if checks.held_out_psnr is None:
         text = "No view was held out, so nothing measures the views between the photographs."
         yield Finding("look", "Overfitting", text, ("train", "DATA", "--test-every", "8"))
@@ -195,7 +210,7 @@ def _overfitting(checks: Checks, fewer: float | None) -> Iterator[Finding]:
         if checks.train_psnr < _FITS:
             # little of it says nothing good where the training views are missed as well
             text = f"Not the problem here: {numbers}, {gap:.1f} dB apart, both low."
-            yield Finding("look", "Overfitting", text, _MORE_STEPS if _too_short(checks) else ("data", "check", "DATA"))
+            yield Finding("look", "Overfitting", text, more or ("data", "check", "DATA"))
             return
         yield Finding("good", "Overfitting", f"Little: {numbers}, {gap:.1f} dB apart.")
         return
@@ -242,7 +257,7 @@ def _photographs(checks: Checks) -> Iterator[Finding]:
     yield Finding(kind, "Photographs", text, ("data", "check", "DATA"))
 
 
-def _exposure(checks: Checks) -> Iterator[Finding]:
+def _exposure(checks: Checks, more: tuple[str, ...]) -> Iterator[Finding]:
     if len(checks.stops) < 2:
         return
     names, values = list(checks.stops), np.array(list(checks.stops.values()))
@@ -263,10 +278,10 @@ def _exposure(checks: Checks) -> Iterator[Finding]:
         text = f"Learned for each training photograph: {differ}{gain}"
         yield Finding("good", "Exposure", text)
         return
-    if _too_short(checks) and checks.train_psnr < _FITS:
+    if more and checks.train_psnr < _FITS:
         # a render without its detail is as far from a photograph's brightness as another exposure would be
         text = f"Not to be told yet, as the run had few steps: {differ}{gain}"
-        yield Finding("look", "Exposure", text, _MORE_STEPS)
+        yield Finding("look", "Exposure", text, more)
         return
     what = "It drifts" if spread >= _DRIFT or won >= _WON else "Even, except for some"
     text = f"{what}: {differ}{gain}"
