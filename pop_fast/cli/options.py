@@ -60,9 +60,9 @@ class LimitOptions:
             whatever loses least in the training views.
         fine_tune_steps: after max_gaussians, target_mb or without_floaters, train what is left for so many steps on the
             photographs, if they are at hand; 0 leaves it as it is.
-        score: what `max-gaussians` and `target-mb` go by: Speedy-Splat's sensitivity, the blending weights
-            (contributions) or the pixels dominated (dominance), each over all training views, or opacity and size alone
-            (visibility); "auto" is sensitivity where a capture is known, otherwise visibility.
+        score: what `max-gaussians` and `target-mb` go by: "sensitivity" is Speedy-Splat's, "contributions" the blending
+            weights, "dominance" the pixels dominated, each over all training views; "visibility" is opacity and size
+            alone; "auto" is sensitivity where a capture is known, otherwise visibility.
     """
 
     min_opacity: float | None = None

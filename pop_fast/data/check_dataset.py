@@ -310,7 +310,8 @@ def about_bare(root: Path, shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     for one in shown:
         if one.problem:
             yield bad("photographs", one.problem)
-    yield from about_number(len(sound))
+    if enough:
+        yield from about_number(len(sound))
     yield from about_use(sound)
     mixed = about_mixed_sizes(sound)
     if mixed is not None:

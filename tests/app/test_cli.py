@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -46,6 +47,16 @@ def test_every_subcommand_explains_itself(pop: Pop, name: str) -> None:
     outcome = pop.done(*name.split(), "--help")
     assert outcome.out.startswith(f"usage: pop {name}")
     assert "Attributes:" not in outcome.out
+
+
+@pytest.mark.parametrize("name", ["train", "eval", "render", "view", "explain", "export", "compare", "convert", "sfm"])
+def test_no_line_of_help_breaks_off_where_the_window_has_room(
+    pop: Pop, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setenv("COLUMNS", "1500")
+    about = re.findall(r"^│? {6,}(\S.*?) *│?$", pop.done(name, "--help").out, re.MULTILINE)
+    assert about
+    assert [line for line in about if not line.endswith((")", "exit"))] == []
 
 
 def test_help_shows_what_matters_first_and_help_all_all(pop: Pop) -> None:
