@@ -202,6 +202,24 @@ def test_compare_puts_results_side_by_side(pop: Pop, shared_result: Path) -> Non
     assert pop("compare", shared_result, "--markdown").out.splitlines()[1].startswith("| --- | --- | ---: |")
 
 
+def test_a_file_is_measured_at_the_size_that_the_results_beside_it_were_trained_on(
+    pop: Pop, capture: Path, tmp_path: Path
+) -> None:
+    run, lone = tmp_path / "run", tmp_path / "lone.ply"
+    pop.done("train", capture, "--out", run, "--factor", "2", "--max-steps", "2", "--skip-checks", "--skip-sizes")
+    pop.done("export", run, "--out", lone)
+
+    def psnr(*words: str) -> list[str]:
+        table = pop.done("compare", run, lone, "--capture", capture, "--markdown", *words).out.splitlines()
+        at = table[0].split("|").index(" PSNR ")
+        return [line.split("|")[at] for line in table[2:]]
+
+    beside, asked, whole = psnr(), psnr("--factor", "2"), psnr("--factor", "1")
+    assert beside == asked
+    assert beside[0] == beside[1]
+    assert whole[0] != whole[1]
+
+
 def test_sfm_says_how_well_it_went(pop: Pop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = SfmResult(tmp_path / "scene", 7, 8, 1234, 0.75)
     monkeypatch.setattr("pop_fast.data.sfm.run_sfm", lambda *_, **__: found)

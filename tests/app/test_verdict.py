@@ -75,7 +75,9 @@ def orbit(shares: list[float]) -> dict[str, float]:
         ("Floaters", {"floaters": {"a": 0.1, "b": 0.3}}, "bad", "20.0 % of the pixels"),
         # frames of the orbit vanish, and no photograph's view shows anything
         ("Floaters", {"orbit_floaters": orbit(53 * [0.0] + 7 * [0.8])}, "bad", "hides much of 7 views"),
+        ("Floaters", {"orbit_floaters": orbit(59 * [0.0] + [0.8])}, "bad", "hides much of one view between the"),
         ("Floaters", {"orbit_floaters": orbit(60 * [0.001])}, "good", "2 photographs' views and 60"),
+        ("Floaters", {"floaters": {"a": 0.0}}, "good", "looked for in one photograph's view and 0"),
         ("Floaters", {"floaters": ONE, "without_floaters": 29.45}, "bad", "29.45 dB instead of 29.50"),
         ("Floaters", {"floaters": ONE, "without_floaters": 28.0}, "look", "without them held-out views have 28.00"),
         ("Fit", {}, "good", "reach 31.00 dB"),

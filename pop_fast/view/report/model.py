@@ -297,7 +297,9 @@ def _floating(checks: Checks) -> Iterator[Finding]:
     names, values = list(shares), np.array(list(shares.values()))
     worst = int(values.argmax())
     what = "of the pixels show floaters, Gaussians nearer to the camera than half the distance of its nearest points"
-    looked = f" (looked for in {len(checks.floaters)} photographs' views and {len(checks.orbit_floaters)} of the orbit)"
+    n = len(checks.floaters)
+    where = "one photograph's view" if n == 1 else f"{n} photographs' views"
+    looked = f" (looked for in {where} and {len(checks.orbit_floaters)} of the orbit)"
     if values.max() < _FLOATERS:
         text = f"{100.0 * values.mean():.2f} % {what}; at most {100.0 * values[worst]:.2f} % of a view{looked}."
         yield Finding("good", "Floaters", text)
@@ -313,7 +315,10 @@ def _floating(checks: Checks) -> Iterator[Finding]:
     few = float(values.mean()) < _FLOATERS and values.max() < _VEIL
     covered = [name for name, share in checks.orbit_floaters.items() if share >= _VEIL]
     if covered:
-        text += f" A veil hides much of {len(covered)} views between the photographs, as in {covered[0]}."
+        hidden = f"one view between the photographs, {covered[0]}"
+        if len(covered) > 1:
+            hidden = f"{len(covered)} views between the photographs, as in {covered[0]}"
+        text += f" A veil hides much of {hidden}."
     text += " Leaving out those whose centres are there removes part of it" + (f"; {then}." if then else ".")
     text += " The command also removes Gaussians that reach in from outside the pictures, and tunes the rest."
     fix = ("export", "RESULT", "--to", "html", "--without-floaters")
