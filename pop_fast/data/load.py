@@ -237,7 +237,8 @@ def _check_root(root: Path) -> None:
     if root.is_dir():
         return
     if not root.exists():
-        raise CaptureError(f"{root}: no such folder; give the folder that holds the photographs")
+        what = "file" if root.suffix.lower() in (*VIDEO_SUFFIXES, ".zip") else "folder"
+        raise CaptureError(f"{root}: no such {what}; give the folder that holds the photographs")
     if root.suffix.lower() in VIDEO_SUFFIXES:
         raise CaptureError(f"{root}: is a video; take photographs out of it first: pop frames {root}")
     if is_zipfile(root):
