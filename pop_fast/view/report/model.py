@@ -306,7 +306,10 @@ def _floating(checks: Checks) -> Iterator[Finding]:
         return
     text = f"{100.0 * values.mean():.1f} % {what}; worst {names[worst]}, {100.0 * values[worst]:.1f} %{looked}."
     judged, without = checks.judged_psnr, checks.without_floaters
-    then = "" if judged is None or without is None else f"held-out views have {without:.2f} dB instead of {judged:.2f}"
+    then = ""
+    if judged is not None and without is not None:
+        then = f"held-out views have {without:.2f} dB instead of {judged:.2f}"
+        then = then if abs(judged - without) >= 0.005 else f"held-out views keep their {judged:.2f} dB"
     if judged is not None and without is not None and judged - without > _DEAR:
         text += " They represent something in the photographs, such as things that moved or light that changed: "
         text += f"without them {then}."
