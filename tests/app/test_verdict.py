@@ -47,6 +47,12 @@ def orbit(shares: list[float]) -> dict[str, float]:
     ("about", "changes", "kind", "words"),
     [
         ("Overfitting", {}, "good", "training views 31.00 dB, held-out views 29.50 dB, 1.5 dB apart"),
+        (
+            "Overfitting",
+            {"train_psnr": 29.46},
+            "good",
+            "training views 29.46 dB, held-out views 29.50 dB, 0.0 dB apart.",
+        ),
         ("Overfitting", {"train_psnr": 34.0}, "look", "4.5 dB apart"),
         ("Overfitting", {"train_psnr": 34.5, "held_out_psnr": 24.5}, "bad", "10.0 dB apart"),
         (
@@ -58,7 +64,7 @@ def orbit(shares: list[float]) -> dict[str, float]:
         ("Overfitting", {"train_psnr": 39.5, "steps": 9_000}, "look", "already short, 150 steps a photograph"),
         ("Overfitting", {"held_out_psnr": None, "matched_psnr": None}, "look", "No view was held out"),
         ("Photographs", {}, "good", "60 trained on, neighbours 4.0 degrees apart"),
-        ("Photographs", {"photographs": 11}, "look", "11 trained on"),
+        ("Photographs", {"photographs": 11}, "look", "few. More photographs, also from other sides, would help"),
         ("Photographs", {"photographs": 11, "train_psnr": 30.0, "held_out_psnr": 24.0}, "bad", "too few"),
         ("Photographs", {"photographs": 11, "train_psnr": 36.0}, "look", "few"),
         ("Photographs", {"train_psnr": 37.4, "held_out_psnr": 29.9}, "look", "not quite enough for this subject"),

@@ -206,16 +206,17 @@ def _overfitting(checks: Checks, fewer: float | None, more: tuple[str, ...]) -> 
         return
     gap = _gap(checks)
     numbers = f"training views {checks.train_psnr:.2f} dB, held-out views {checks.judged_psnr:.2f} dB"
+    numbers += f", {abs(gap):.1f} dB apart"
     if gap < _SOME_OVERFITTING:
         if checks.train_psnr < _FITS:
             # little of it says nothing good where the training views are missed as well
-            text = f"Not the problem here: {numbers}, {gap:.1f} dB apart, both low."
+            text = f"Not the problem here: {numbers}, both low."
             yield Finding("look", "Overfitting", text, more or ("data", "check", "DATA"))
             return
-        yield Finding("good", "Overfitting", f"Little: {numbers}, {gap:.1f} dB apart.")
+        yield Finding("good", "Overfitting", f"Little: {numbers}.")
         return
     some = gap < _OVERFITTED or _is_close(checks)
-    text = f"{'Some' if gap < _OVERFITTED else 'Much'}: {numbers}, {gap:.1f} dB apart."
+    text = f"{'Some' if gap < _OVERFITTED else 'Much'}: {numbers}."
     if gap >= _OVERFITTED:
         less = "less well, though close" if _is_close(checks) else "little"
         text += f" The splat has memorised its photographs and fits the views in between {less}."
@@ -253,7 +254,9 @@ def _photographs(checks: Checks) -> Iterator[Finding]:
     kind = "look"
     if gap >= _SOME_OVERFITTING and not close:
         kind, why = "bad", f"too {why}" if few or far else why
-    text = f"{found}{n} trained on{spacing}: {why}. Photographs between these would help most."
+    # where few stand close together, what is missing is not between them
+    wanted = "Photographs between these" if far or missing else "More photographs, also from other sides,"
+    text = f"{found}{n} trained on{spacing}: {why}. {wanted} would help most."
     yield Finding(kind, "Photographs", text, ("data", "check", "DATA"))
 
 
