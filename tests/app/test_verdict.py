@@ -161,14 +161,18 @@ def test_the_verdict_says_how_close_the_renders_are(psnr: float, kind: str, word
 
 
 @pytest.mark.parametrize(
-    ("train", "steps", "sent"), [(25.7, 300, "train"), (25.7, 3_000, "data"), (33.0, 300, "data"), (18.0, 300, "train")]
+    ("train", "steps", "sent"),
+    [
+        *((25.7, 300, "train"), (25.7, 1_935, "train"), (25.7, 3_000, "data")),
+        *((33.0, 300, "data"), (18.0, 300, "train"), (21.0, 1_935, "data")),
+    ],
 )
 def test_views_that_few_steps_left_as_they_are_ask_for_more_steps(train: float, steps: int, sent: str) -> None:
     # 43 photographs of fox: 24.65 dB after 300 steps, training views 25.66; 31.09 dB after 3,120
     checks = replace(GOOD, photographs=43, train_psnr=train, held_out_psnr=min(train, 25.7) - 1.0, steps=steps)
     found = {one.about: one for one in verdict({}, checks, None)}
     assert found["Quality"].next[0] == sent
-    assert ("7 a photograph" in found["Quality"].text) == (sent == "train")
+    assert (f"few steps, {steps / 43:.0f} a photograph" in found["Quality"].text) == (sent == "train")
     if train < 22.0:
         assert found["Fit"].next == found["Overfitting"].next == found["Quality"].next
 
@@ -209,6 +213,11 @@ def test_a_run_whose_held_out_views_got_worse_is_told_when_that_began() -> None:
     fell = verdict({}, None, ([700.0, 3000.0], [20.2, 16.7]))
     assert [f.kind for f in fell] == ["bad"]
     assert "fell from 20.20 dB after 700 steps to 16.70 dB after 3,000" in fell[0].text
+    # and is not sent to more steps by another sentence
+    checks = replace(GOOD, train_psnr=18.0, held_out_psnr=16.7, steps=900)
+    told = {one.about: one.next for one in verdict({}, checks, ([700.0, 900.0], [20.2, 16.7]))}
+    assert told["Course"][2:] == ("--steps-scaler", "0.023")
+    assert told["Quality"] == told["Fit"] == ("data", "check", "DATA")
     assert verdict({}, None, ([700.0, 3000.0], [16.7, 20.2])) == []
 
 
