@@ -260,7 +260,8 @@ def _told() -> Iterator[Callable[[int, int, float | None], None]]:
 def _leave_out_floaters(left: Limited, limits: LimitOptions, shown: Shown) -> None:
     """Leave out what stands where floaters do, and where the rest is tuned on the photographs, what veils the orbit.
 
-    Of what a veil leaves out photographs show a little, which the rest has to learn.
+    Of what a veil leaves out photographs show a little, which the rest has to learn. What grows in front of a camera
+    meanwhile is left out at the end.
     """
     if shown.photographed is None:
         raise PopError("finding floaters needs the cameras; give --capture DIR")
@@ -270,19 +271,24 @@ def _leave_out_floaters(left: Limited, limits: LimitOptions, shown: Shown) -> No
 
     steps = limits.fine_tune_steps
     capture, config, learned = _photographs(shown, left, limits.crop is not None)
+    degree, backend = shown.sh_degree, renderer(config.backend)[0]
     before, near = left.params, are_floaters(left.params["means"], capture, config.test_every)
     left.keep(~near, "without floaters")
     if learned is None:
         left.said.append(_NOT_TUNED)
     if learned is None or not steps:
         return
-    veils = are_veils(before, capture, config, shown.sh_degree, renderer(config.backend)[0])[~near]
+    veils = are_veils(before, capture, config, degree, backend)[~near]
     if not veils.any():
         return
     left.keep(~veils, "without veils")
     with _told() as report:
-        tuner = compact.Tuner(left.params, shown.sh_degree, config, capture, learned, steps, report)
+        tuner = compact.Tuner(left.params, degree, config, capture, learned, steps, report)
         left.params = compact.tuned_to_the_end(tuner)
+    grown = are_floaters(left.params["means"], capture, config.test_every)
+    grown |= are_veils(left.params, capture, config, degree, backend)
+    if grown.any():
+        left.keep(~grown, "without what grew meanwhile")
     views = tuner.held_out
     where = _named(views)
     after, had = (tuner.psnr(params, views) for params in (left.params, before))
