@@ -5,7 +5,8 @@
     python benchmarks/ab_benchmark.py /tmp/before --only blend --repeats 40
 
 Each repeat runs one checkout and then the other, in changing order, and gives one ratio, this / other; what is reported
-is the median of the ratios and their quartiles. Nothing is timed unless the two render the same image.
+is the median of the ratios and their quartiles. Nothing is timed unless the two render the same image. A checkout from
+before modules were moved is refused: what is timed is called by this checkout's names.
 """
 
 from __future__ import annotations
@@ -40,13 +41,17 @@ class Checkout:
         """Import from a checkout.
 
         Raises:
-            SystemExit: there is no package in the folder.
+            SystemExit: there is no package in the folder, or its modules stand elsewhere than this checkout's.
         """
         if not (root / "pop_fast" / "__init__.py").exists():
             raise SystemExit(f"{root} has no pop_fast/__init__.py; give the root of a checkout")
         self.root, self._modules = root, dict[str, ModuleType]()
         with self.imports():
-            self.run: Any = importlib.import_module("run")
+            try:
+                self.run: Any = importlib.import_module("run")
+            except ImportError as error:
+                why = f"{error}; this benchmark times checkouts whose modules stand where its own do"
+                raise SystemExit(f"{root} cannot be timed from here: {why}, so give a later commit") from error
             found = Path(str(importlib.import_module("pop_fast").__file__)).resolve()
         if root.resolve() not in found.parents:
             raise SystemExit(f"asked for pop_fast of {root}, but Python found {found}")

@@ -310,8 +310,9 @@ def with_sections_of(names: list[str], text: str) -> str:
 
 _HEAD = """# Every command
 
-One run of each on the demo capture, with what it printed; `pop COMMAND --help` has its options. What to do in which
-order is in [the guide](guide.md). `photos` holds the demo's photographs alone, without their cameras.
+One run of each on the demo capture, with what it printed, next to other programs, so that times are longer than they
+need be; `pop COMMAND --help` has its options. What to do in which order is in [the guide](guide.md). `photos` holds the
+demo's photographs alone, without their cameras.
 `python docs/commands.py --write` makes this page."""
 
 

@@ -175,14 +175,14 @@ def _overview() -> str:
         [
             "usage: pop COMMAND ...",
             "",
-            "3D Gaussian Splatting with the Polarized Opacity Prior, on a CPU.",
+            "3D Gaussian Splatting with the Polarized Opacity Prior, on an ordinary CPU.",
             "",
             "commands:",
             *lines,
             "",
             "start here:",
             "  pop demo scene && pop train scene --minutes 2",
-            "  pop train my_photos --factor 4 --out out/mine",
+            "  pop train my_photos --minutes 10",
             "",
             "'pop COMMAND --help' explains one. --debug (or POP_DEBUG=1) shows the traceback of an error.",
         ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -27,7 +27,7 @@ class Args(CaptureArguments):
     """Put several results side by side: quality, Gaussians, Gaussians per pixel, opacities, seconds.
 
     Of a result folder these are the numbers that its training left. The file of a splat is measured; the options say on
-    which photographs.
+    which photographs, by default of the size that the results beside it were trained on.
     """
 
     results: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|FILE [RESULT|FILE ...]")]
@@ -42,6 +42,7 @@ def run(argv: Sequence[str]) -> int:
         raise PopError("nothing to compare; name one or more result folders")
     from pop_fast.view.report.source import markdown, plain, row
 
+    args = replace(args, factor=_factor(args))
     found = [_stats(path, args) for path in args.results]
     unfinished = [path for path, stats in zip(args.results, found, strict=True) if "psnr" not in stats]
     why = "has no statistics yet; train to the first evaluation, or run pop eval"
@@ -52,6 +53,12 @@ def run(argv: Sequence[str]) -> int:
     rows = [row(stats) for stats in found]
     print(markdown(rows) if args.markdown else plain(rows))
     return 0
+
+
+def _factor(args: Args) -> int | None:
+    """Return what photographs are shrunk by before files are measured: as asked, else as all of the results say."""
+    factors = {read_config(path).factor for path in args.results if not path.is_file()}
+    return factors.pop() if args.factor is None and len(factors) == 1 else args.factor
 
 
 def _stats(path: Path, args: Args) -> dict[str, Any]:

@@ -46,11 +46,9 @@ class Args(LimitOptions, CaptureArguments):
     splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|FILE")]
     """What to export."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE|DIR")] = None
-    """Where to: a file whose name says the format, or with --layout inria a new folder; by default a file here
-    with the name of what is exported."""
+    """A file whose name says the format, or with --layout inria a new folder; by default a file here, named alike."""
     to: FormatName | None = None
-    """The format, if the name does not show it; "spz" is its version 3, which most programs read, "spz-4" the latest
-    version, and "gltf-spz" glTF with an SPZ stream, a draft."""
+    """The format, if the name does not show it; "spz" is version 3, which most programs read, "gltf-spz" a draft."""
     layout: Literal["file", "inria"] = "file"
     """"inria" writes point_cloud/, cameras.json, cfg_args, and held-out renders, as many tools expect."""
     frame: Literal["capture", "training"] | None = None
@@ -170,11 +168,11 @@ def note_lost_frame(out: Path, name: str, frame: Frame | None) -> None:
 def check_file(out: Path, source: Path, overwrite: bool) -> None:
     """Refuse a file that is not to be replaced, or is the splat itself."""
     if out.is_dir():
-        raise PopError(f"{out}: a folder of this name is in the way; choose another --out")
+        raise PopError(f"{out}: a folder of this name is in the way; choose another name")
     if out.exists() and source.exists() and out.samefile(source):
-        raise PopError(f"{out}: is the input file; choose another --out")
+        raise PopError(f"{out}: is the input file; choose another name")
     if out.exists() and not overwrite:
-        raise PopError(f"{out}: exists; pass --overwrite or another --out")
+        raise PopError(f"{out}: exists; pass --overwrite or choose another name")
     check_place(out)
 
 
@@ -344,7 +342,7 @@ def _sizes(folder: Path, splat: Splat, capture: Capture, params: dict[str, Tenso
     from pop_fast.train.environment import reproducible
     from pop_fast.train.evaluate import measure_encodings
     from pop_fast.train.views import ViewTensors
-    from pop_fast.view.report.source import encoding_heads, encoding_rows
+    from pop_fast.view.report.source import encoding_table
 
     config = splat.config
     views = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
@@ -352,7 +350,7 @@ def _sizes(folder: Path, splat: Splat, capture: Capture, params: dict[str, Tenso
     with reproducible(config.threads):
         found = measure_encodings(backend, params, views, config, splat.sh_degree, capture.world_transform)
         entries = [encoding.entry() for encoding in found]
-    for line in table_lines([encoding_heads(entries), *encoding_rows(entries)]):
+    for line in table_lines(encoding_table(entries)):
         print(line)
     results = ResultFolder(folder)
     before = results.read_stats("val", splat.step) if splat.step is not None else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sized
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -60,9 +60,9 @@ class LimitOptions:
             whatever loses least in the training views.
         fine_tune_steps: after max_gaussians, target_mb or without_floaters, train what is left for so many steps on the
             photographs, if they are at hand; 0 leaves it as it is.
-        score: what `max-gaussians` and `target-mb` go by: Speedy-Splat's sensitivity, the blending weights
-            (contributions) or the pixels dominated (dominance), each over all training views, or opacity and size alone
-            (visibility); "auto" is sensitivity where a capture is known, otherwise visibility.
+        score: what `max-gaussians` and `target-mb` go by: "sensitivity" is Speedy-Splat's, "contributions" the blending
+            weights, "dominance" the pixels dominated, each over all training views; "visibility" is opacity and size
+            alone; "auto" is sensitivity where a capture is known, otherwise visibility.
     """
 
     min_opacity: float | None = None
@@ -260,7 +260,8 @@ def _told() -> Iterator[Callable[[int, int, float | None], None]]:
 def _leave_out_floaters(left: Limited, limits: LimitOptions, shown: Shown) -> None:
     """Leave out what stands where floaters do, and where the rest is tuned on the photographs, what veils the orbit.
 
-    Of what a veil leaves out photographs show a little, which the rest has to learn.
+    Of what a veil leaves out photographs show a little, which the rest has to learn. What grows in front of a camera
+    meanwhile is left out at the end.
     """
     if shown.photographed is None:
         raise PopError("finding floaters needs the cameras; give --capture DIR")
@@ -270,29 +271,41 @@ def _leave_out_floaters(left: Limited, limits: LimitOptions, shown: Shown) -> No
 
     steps = limits.fine_tune_steps
     capture, config, learned = _photographs(shown, left, limits.crop is not None)
+    degree, backend = shown.sh_degree, renderer(config.backend)[0]
     before, near = left.params, are_floaters(left.params["means"], capture, config.test_every)
     left.keep(~near, "without floaters")
     if learned is None:
         left.said.append(_NOT_TUNED)
     if learned is None or not steps:
         return
-    veils = are_veils(before, capture, config, shown.sh_degree, renderer(config.backend)[0])[~near]
+    veils = are_veils(before, capture, config, degree, backend)[~near]
     if not veils.any():
         return
     left.keep(~veils, "without veils")
     with _told() as report:
-        tuner = compact.Tuner(left.params, shown.sh_degree, config, capture, learned, steps, report)
+        tuner = compact.Tuner(left.params, degree, config, capture, learned, steps, report)
         left.params = compact.tuned_to_the_end(tuner)
+    grown = are_floaters(left.params["means"], capture, config.test_every)
+    grown |= are_veils(left.params, capture, config, degree, backend)
+    if grown.any():
+        left.keep(~grown, "without what grew meanwhile")
     views = tuner.held_out
-    where = f"{len(views)} held-out views" if views else "training views"
+    where = _named(views)
     after, had = (tuner.psnr(params, views) for params in (left.params, before))
     left.said.append(f"tuned for {steps} steps: PSNR in {where} {after:.2f} dB, with all Gaussians {had:.2f} dB")
+
+
+def _named(held_out: Sized) -> str:
+    """Name the views that are measured: those that are held out, or the training views where none is."""
+    from pop_fast.view.report.source import held_out_views
+
+    return held_out_views(len(held_out)) if held_out else "training views"
 
 
 def _quality(tuner: Tuner, found: Compact, output: Output) -> str:
     """Say how well a file shows the held-out views, or the training views where none is held out."""
     views = tuner.held_out
-    where = f"{len(views)} held-out views" if views else "training views"
+    where = _named(views)
     before, after = (tuner.psnr(params, views) for params in (tuner.whole, output.shown(found.params, found.level)))
     return f"PSNR of the file in {where}: {after:.2f} dB, of the whole splat {before:.2f} dB"
 

@@ -43,8 +43,7 @@ class Args(CaptureArguments):
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Write a video: .webm, .avi, or .mp4 where OpenCV can write H.264."""
     path: Annotated[str, tyro.conf.arg(metavar="{views,orbit,ellipse,interpolate}|FILE")] = "views"
-    """"views" are the held-out views; the next three are paths made from the training cameras, of which "orbit" goes as
-    far round as these stand; a file is a path that 'pop view' recorded."""
+    """"views" are held out; three are made from the training cameras; a file is a path that 'pop view' recorded."""
     frames: int = 120
     """Number of frames of a path."""
     fps: float = 30.0

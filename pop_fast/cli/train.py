@@ -107,7 +107,7 @@ class _Run(BlocksOptions, FinishOptions):
 
     Attributes:
         minutes: train as much of the schedule as fits in so many, measuring and the report among them, the search for
-            cameras not. Without this, a preset and steps it is two hours. (default: 120)
+            cameras not; 120 where neither these nor a preset nor steps are given.
         resume: continue from the last checkpoint in the output folder, to the same bits as without the interruption;
             start where there is none.
         overwrite: replace the results in the output folder, once the first step has been taken.

@@ -112,7 +112,8 @@ class Capture:
 
     def __post_init__(self) -> None:
         if len(self.views) < 2:
-            raise CaptureError(f"{self.name}: has {len(self.views)} view(s); a scene needs two or more")
+            count = "1 view" if self.views else "no views"
+            raise CaptureError(f"{self.name}: has {count}; a scene needs two or more")
         object.__setattr__(self, "views", tuple(sorted(self.views, key=lambda view: view.name)))
 
     def __repr__(self) -> str:

@@ -130,9 +130,7 @@ def about_spacing(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:
 
 def about_photos(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding]:
     """Tell which photographs are absent, damaged, of another size, rotated by EXIF, or not listed."""
-    sizes = Counter(photo.size for photo in photos if photo.size != (0, 0))
-    listed = ", ".join(f"{count} of {w}x{h} px" for (w, h), count in sizes.most_common(4))
-    yield CaptureFinding("ok" if sizes else "bad", "photographs", listed or "none could be read")
+    yield _listed(photo.size for photo in photos if photo.size != (0, 0))
     absent = [photo for photo in photos if photo.path is None]
     if absent:
         names = ", ".join(photo.shot.name for photo in absent[:3])
@@ -141,8 +139,7 @@ def about_photos(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding
     for photo in photos:
         if photo.path is not None and photo.problem:
             yield bad("photographs", photo.problem)
-        elif photo.shot.camera is not None and photo.path is not None:
-            yield from _about_size(photo)
+    yield from _about_sizes(photos)
     turned = sum(photo.shot.turns > 0 for photo in photos)
     if turned:
         yield ok("EXIF", f"{turned} are stored rotated and shown upright, as pop sfm noted")
@@ -156,14 +153,33 @@ def about_photos(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding
     yield from _about_unlisted(photos, root)
 
 
-def _about_size(photo: Photo) -> Iterator[CaptureFinding]:
-    camera, (width, height) = photo.shot.camera, photo.size
-    if (width, height) == (camera.width, camera.height) or camera.width < 1:
-        return
-    same_shape = abs(width * camera.height - height * camera.width) <= max(camera.width, camera.height)
-    note = "K is scaled to fit" if same_shape else "another shape: cropped or rotated since the poses were made"
-    text = f"{photo.shot.name} is {width}x{height} px, its camera {camera.width}x{camera.height}: {note}"
-    yield CaptureFinding("ok" if same_shape else "bad", "sizes", text)
+def _listed(sizes: Iterable[tuple[int, int]]) -> CaptureFinding:
+    """List the sizes of the photographs that could be read, the most frequent four with their numbers."""
+    counts = Counter(sizes)
+    found = [f"{count} of {w}x{h} px" for (w, h), count in counts.most_common(4)]
+    if len(counts) > 4:
+        found.append(f"and {sum(counts.values()) - sum(n for _, n in counts.most_common(4))} of other sizes")
+    return CaptureFinding("ok" if found else "bad", "photographs", ", ".join(found) or "none could be read")
+
+
+def _about_sizes(photos: Sequence[Photo]) -> Iterator[CaptureFinding]:
+    """Tell how many photographs have another size than their camera: of the same shape, and of another one."""
+    alike: list[str] = []
+    odd: list[str] = []
+    for photo in photos:
+        camera, (width, height) = photo.shot.camera, photo.size
+        if camera is None or photo.problem or camera.width < 1 or (width, height) == (camera.width, camera.height):
+            continue
+        same_shape = abs(width * camera.height - height * camera.width) <= max(camera.width, camera.height)
+        text = f"{photo.shot.name} is {width}x{height} px, its camera {camera.width}x{camera.height}"
+        (alike if same_shape else odd).append(text)
+    if alike:
+        count = f"{len(alike)} of {len(photos)} have another size than their camera"
+        yield ok("sizes", f"{count} and the same shape: K is scaled to fit; first {alike[0]}")
+    if odd:
+        count = f"{len(odd)} of {len(photos)} have another shape than their camera"
+        fix = "cropped or rotated since the poses were made: use the photographs that these were made from"
+        yield bad("sizes", f"{count}, {fix}; first {odd[0]}")
 
 
 def _about_unlisted(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding]:
@@ -290,13 +306,12 @@ def about_bare(root: Path, shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     )
     count = f"{len(sound)} {number(len(sound), 'photograph', 'photographs')}"
     yield CaptureFinding("ok" if enough else "bad", "poses", f"none yet, {count}: {fix}")
-    sizes = Counter(one.size for one in sound)
-    listed = ", ".join(f"{count} of {w}x{h} px" for (w, h), count in sizes.most_common(4))
-    yield CaptureFinding("ok" if sizes else "bad", "photographs", listed or "none could be read")
+    yield _listed(one.size for one in sound)
     for one in shown:
         if one.problem:
             yield bad("photographs", one.problem)
-    yield from about_number(len(sound))
+    if enough:
+        yield from about_number(len(sound))
     yield from about_use(sound)
     mixed = about_mixed_sizes(sound)
     if mixed is not None:

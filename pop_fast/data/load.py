@@ -175,10 +175,8 @@ def load_capture(
         listing.root, listing.path, listing.shots, options, progress, None if photographs == "all" else wanted
     )
     if len(views) < 2:
-        count = len(listing.shots)
-        raise CaptureError(
-            f"{listing.path}: {len(views)} view(s) are left of {count}; a scene needs two or more: restore them"
-        )
+        left = f"{len(views)} of {len(listing.shots)} photographs {'is' if len(views) == 1 else 'are'} left"
+        raise CaptureError(f"{listing.path}: {left}; a scene needs two or more: restore them")
     whole = photographs == "all"
     listing = replace(listing, notes=[*listing.notes, *more])
     return _assemble(Path(path), listing, views, normalize, points if whole else 0, seed)
@@ -197,9 +195,8 @@ def list_capture(
     if listing is None:
         listing = _from_photos(root, images, sfm, progress)
     if len(listing.shots) < 2:
-        raise CaptureError(
-            f"{listing.path}: has {len(listing.shots)} view(s) with a known camera; a scene needs two or more"
-        )
+        count = "1 view" if listing.shots else "no views"
+        raise CaptureError(f"{listing.path}: has {count} with a known camera; a scene needs two or more")
     return listing
 
 
@@ -240,12 +237,13 @@ def _check_root(root: Path) -> None:
     if root.is_dir():
         return
     if not root.exists():
-        raise CaptureError(f"{root}: no such folder; give the folder that holds the photographs and their cameras")
+        what = "file" if root.suffix.lower() in (*VIDEO_SUFFIXES, ".zip") else "folder"
+        raise CaptureError(f"{root}: no such {what}; give the folder that holds the photographs")
     if root.suffix.lower() in VIDEO_SUFFIXES:
         raise CaptureError(f"{root}: is a video; take photographs out of it first: pop frames {root}")
     if is_zipfile(root):
         raise CaptureError(f"{root}: is a ZIP archive; unpack it first, and give the folder that it makes")
-    raise CaptureError(f"{root}: is a file, not a folder; give the folder that holds the photographs and their cameras")
+    raise CaptureError(f"{root}: is a file, not a folder; give the folder that holds the photographs")
 
 
 def _of_model(root: Path, models: Sequence[tuple[Path, int]], images: str | None) -> Listing:

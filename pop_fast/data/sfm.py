@@ -41,7 +41,7 @@ from pop_fast.data.cameras import require_colmap
 from pop_fast.data.capture import Progress, SfmOptions
 from pop_fast.data.colmap import quiet_colmap
 from pop_fast.data.exports import photographs_of_polycam
-from pop_fast.data.photo_quality import FIX, Shown, about_mixed_sizes, about_use, measure
+from pop_fast.data.photo_quality import FIX, Shown, about_mixed_sizes, about_use, measure, number
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import check_folder, folder_atomically
 from pop_fast.io.image_header import HEIF_SUFFIXES, read_exif
@@ -129,7 +129,7 @@ def run_sfm(
             )
     if len(names) < 2:
         hint = unreadable_photographs(photos) or "a scene needs two or more that overlap"
-        raise CaptureError(f"{photos}: has {len(names)} photograph(s); {hint}")
+        raise CaptureError(f"{photos}: has {len(names)} {number(len(names), 'photograph', 'photographs')}; {hint}")
     in_place = target != capture.resolve()
     own = recognise_result(capture.resolve(), target)
     check_folder(target, overwrite, recognise=own)

@@ -171,7 +171,7 @@ def take_frames(
         raise CaptureError(f"max_size is {max_size}; it must be 0, or at least 64 px")
     total = _frame_count(path)
     if total < 2:
-        raise CaptureError(f"{path}: has {total} frame(s); a scene needs two or more")
+        raise CaptureError(f"{path}: has {total} frame{'' if total == 1 else 's'}; a scene needs two or more")
     stretch = max(total / count, 1.0)
     pattern = f"{path.stem}_"
     taken: list[int] = []

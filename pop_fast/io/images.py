@@ -242,7 +242,7 @@ def _decode(path: Path) -> np.ndarray:
         raise CaptureError(f"{path}: {defect}; {FIX}")
     if size is None:
         # a size that nobody has seen is nobody's to judge, and OpenCV also decodes what no camera writes
-        raise CaptureError(f"{path}: is not an image that states its size like PNG, JPEG, WebP, TIFF and BMP do; {FIX}")
+        raise CaptureError(f"{path}: is not a PNG, JPEG, WebP, TIFF, BMP or HEIC image; {FIX}")
     try:
         # IMREAD_UNCHANGED keeps alpha and 16 bit, and leaves the EXIF orientation alone
         with QUIET:

@@ -289,7 +289,7 @@ def check_splats(splats: Any, kind: torch.dtype | None = None) -> dict[str, Tens
         The tensors under `KEYS`, contiguous, of the type `kind` or else float32; others are left out.
 
     Raises:
-        ValueError: a tensor is absent or not finite, or has another type or shape; names it.
+        ValueError: a tensor is absent or not finite, has another type or shape, or a quaternion is zero; names it.
     """
     found = _mapping(splats, "splats", KEYS, others=True)
     n: int | None = None
@@ -310,6 +310,9 @@ def check_splats(splats: Any, kind: torch.dtype | None = None) -> dict[str, Tens
     bad = first_non_finite(checked) if kind is None else first_unusable(checked)
     if bad:
         raise ValueError(f"splats.{bad[0]}{bad[1]} is {bad[2]}; every entry must be finite")
+    turned = checked["quats"].any(1)
+    if not turned.all():
+        raise ValueError(f"splats.quats[{int(turned.int().argmin())}] is zero; every quaternion must have a norm > 0")
     return checked
 
 

@@ -161,8 +161,8 @@ def evaluate(
     n = max(len(views), 1)
     return {
         **average(measured, nets),
-        "n_blended": per_pixel[0] / n,
-        "n_traversed": per_pixel[1] / n,
+        "n_blended": per_pixel[0] / n if views else None,
+        "n_traversed": per_pixel[1] / n if views else None,
         "ellipse_time": seconds / n,
         "views": len(views),
         "per_view": per_view,

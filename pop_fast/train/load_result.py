@@ -63,8 +63,7 @@ class CaptureOptions:
     own_frame: bool = False
     """The splat is in the capture's own world frame, whatever its file or its run says."""
     training_frame: bool = False
-    """The splat is in the frame that the capture is trained in, as gsplat's trainer leaves it; a file that says nothing
-    is taken to be in the capture's own."""
+    """The splat is in the frame of training, as gsplat's trainer leaves it, and not in the capture's own world."""
 
 
 @dataclass(frozen=True)

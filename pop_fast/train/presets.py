@@ -117,13 +117,13 @@ class Given:
 
     Attributes:
         method: "pop", "gsplat" for gsplat's default strategy, "3dgs" for Inria's constants, learning rates, SSIM and
-            rasterizer, "3dgs-2023" for those before October 2024, and on top of these "pup", "mini-splatting",
-            "taming" and "speedy-splat"; or one that another package registers.
+            rasterizer, "3dgs-2023" for those before October 2024; "pup", "mini-splatting", "taming" and "speedy-splat"
+            build on these; or one that another package registers.
         preset: "paper" is the paper's 30,000 steps, for a GPU or a night; "quick" 1,500 steps at higher rates that
             fall, from coarse photographs to fine ones, with thresholds for small images; "auto" has these thresholds
-            and as much of the schedule as the time allows, which `pop train` chooses; where that is no more than
-            "quick" has, it is as "quick" is, and up to 0.6 of the schedule its rates are higher than the paper's. It
-            gives defaults: explicit settings win.
+            and as much of the schedule as the time allows, which `pop train` chooses; where "quick" has no less
+            it is as "quick" is, and up to 0.6 of the schedule its rates are higher than the paper's. It gives defaults:
+            explicit settings win.
         steps_scaler: multiplies the default of every step number; None takes the preset's.
         scale_lambda_pop: divide the default of lambda_pop by the scaler, so that the push of the prior adds up to the
             same over a short schedule; it then weighs more against the photographs than in the paper.

@@ -259,6 +259,8 @@ def read_config(folder: Path) -> TrainConfig:
         PopError: it is absent or damaged, or a setting in it is unknown or out of range; names file and field.
     """
     path = folder / "cfg.json"
+    if not folder.exists():
+        raise PopError(f"{folder}: no such file or folder; give a result of 'pop train'")
     if not path.is_file():
         raise PopError(f"{folder}: has no cfg.json, so it is not a result of 'pop train'")
     try:

@@ -176,7 +176,7 @@ def test_absent_photographs_are_an_error_or_are_skipped_with_a_note(root: Path) 
     assert capture.notes == ("1 of 4 listed images are absent and were skipped",)
     for name in ("01.png", "02.png"):
         (root / "images" / name).unlink()
-    assert_one_line(lambda: raw(root, missing="skip"), "1 view(s)", "two or more")
+    assert_one_line(lambda: raw(root, missing="skip"), "1 of 4 photographs is left", "two or more")
     (root / "images" / "03.png").unlink()
     assert_one_line(lambda: raw(root, missing="skip"), "4 of them absent", "restore them")
 
@@ -448,8 +448,10 @@ def test_an_absent_file_of_a_model_is_named(tmp_path: Path, file: str, binary: b
 
 
 def test_fewer_than_two_views_and_cameras_that_did_not_move_are_refused(tmp_path: Path) -> None:
-    assert_one_line(lambda: load_capture(colmap_capture(tmp_path / "a", count=1)), "sparse", "1 view(s)", "two or more")
-    assert_one_line(lambda: load_capture(transforms_capture(tmp_path / "b", count=1)), "transforms.json", "1 view(s)")
+    assert_one_line(
+        lambda: load_capture(colmap_capture(tmp_path / "a", count=1)), "sparse", "has 1 view", "two or more"
+    )
+    assert_one_line(lambda: load_capture(transforms_capture(tmp_path / "b", count=1)), "transforms.json", "has 1 view")
     root = colmap_capture(tmp_path / "c")
     write_model(root / "sparse" / "0", ["00.png", "01.png"], ring(1)[[0, 0]])
     assert_one_line(lambda: load_capture(root), "sparse", "one place")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -46,6 +47,16 @@ def test_every_subcommand_explains_itself(pop: Pop, name: str) -> None:
     outcome = pop.done(*name.split(), "--help")
     assert outcome.out.startswith(f"usage: pop {name}")
     assert "Attributes:" not in outcome.out
+
+
+@pytest.mark.parametrize("name", ["train", "eval", "render", "view", "explain", "export", "compare", "convert", "sfm"])
+def test_no_line_of_help_breaks_off_where_the_window_has_room(
+    pop: Pop, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setenv("COLUMNS", "1500")
+    about = re.findall(r"^│? {6,}(\S.*?) *│?$", pop.done(name, "--help").out, re.MULTILINE)
+    assert about
+    assert [line for line in about if not line.endswith((")", "exit"))] == []
 
 
 def test_help_shows_what_matters_first_and_help_all_all(pop: Pop) -> None:
@@ -149,6 +160,15 @@ def test_eval_repeats_the_numbers_of_training(
     assert json.loads(written.read_text())["psnr"] == pytest.approx(trained["psnr"], abs=1e-3)
 
 
+def test_a_run_that_holds_out_no_view_has_no_numbers_of_any(pop: Pop, capture: Path, tmp_path: Path) -> None:
+    words = ("train", capture, "--out", tmp_path / "run", "--max-steps", "2", "--test-every", "0", "--skip-checks")
+    head = next(line for line in pop.done(*words).out.splitlines() if line.startswith("format"))
+    assert head.split() == ["format", "MB", "B/Gaussian", "of", "the", "PLY"]
+    assert "0.0 / 0.0" not in pop.done("compare", tmp_path / "run").out
+    assert "0.0 traversed" not in (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    says(pop("eval", tmp_path / "run"), "no view is held out")
+
+
 def test_eval_of_a_result_updates_its_stats_and_report(pop: Pop, result: Path) -> None:
     before = json.loads((result / STATS).read_text())
     (result / STATS).write_text(json.dumps({**before, "psnr": 1.0}))
@@ -180,6 +200,24 @@ def test_compare_puts_results_side_by_side(pop: Pop, shared_result: Path) -> Non
     plain = pop.done("compare", shared_result, shared_result)
     assert len(plain.out.splitlines()) == 3
     assert pop("compare", shared_result, "--markdown").out.splitlines()[1].startswith("| --- | --- | ---: |")
+
+
+def test_a_file_is_measured_at_the_size_that_the_results_beside_it_were_trained_on(
+    pop: Pop, capture: Path, tmp_path: Path
+) -> None:
+    run, lone = tmp_path / "run", tmp_path / "lone.ply"
+    pop.done("train", capture, "--out", run, "--factor", "2", "--max-steps", "2", "--skip-checks", "--skip-sizes")
+    pop.done("export", run, "--out", lone)
+
+    def psnr(*words: str) -> list[str]:
+        table = pop.done("compare", run, lone, "--capture", capture, "--markdown", *words).out.splitlines()
+        at = table[0].split("|").index(" PSNR ")
+        return [line.split("|")[at] for line in table[2:]]
+
+    beside, asked, whole = psnr(), psnr("--factor", "2"), psnr("--factor", "1")
+    assert beside == asked
+    assert beside[0] == beside[1]
+    assert whole[0] != whole[1]
 
 
 def test_sfm_says_how_well_it_went(pop: Pop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -156,7 +156,9 @@ def at(index: tuple[int, ...], value: float) -> Callable[[torch.Tensor], torch.T
         ("opacities", lambda x: x.long(), ("splats.opacities is torch.int64", "floats")),
         ("means", lambda x: torch.zeros(()), ("splats.means has shape []",)),
         ("means", lambda x: [1.0], ("splats.means is list",)),
-        ("quats", lambda x: x.index_fill(0, torch.tensor([2]), 0.0), ("quats[2", "norm > 0")),
+        ("quats", lambda x: x.index_fill(0, torch.tensor([2, 5]), 0.0), ("splats.quats[2] is zero", "norm > 0")),
+        # of halves and doubles what counts is what they are as float32
+        ("quats", lambda x: x.double().index_fill(0, torch.tensor([4]), 1e-60), ("splats.quats[4] is zero",)),
     ],
 )
 def test_every_defect_of_a_checkpoint_is_named_with_its_tensor_before_it_is_exported_or_drawn(
@@ -166,8 +168,7 @@ def test_every_defect_of_a_checkpoint_is_named_with_its_tensor_before_it_is_expo
     params[name] = change(params[name])
     path = tmp_path / "broken.pt"
     torch.save({"step": 29, "splats": {k: v for k, v in params.items() if v is not None}}, path)
-    # a zero quaternion is found when the splat is drawn or written, and the others when the file is read
-    parts = (*parts, *(["broken.pt"] if "splats." in parts[0] else []))
+    parts = (f"{path}: ", *parts, "copy it again, or use another one")
     says(pop("export", path, "--out", tmp_path / "o.ply"), *parts)
     says(pop("eval", path, "--capture", shared_capture), *parts)
     assert not (tmp_path / "o.ply").exists()

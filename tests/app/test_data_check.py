@@ -128,17 +128,33 @@ def test_every_problem_of_a_damaged_capture_is_listed_at_once(check: Check, capt
     write_photograph(capture / "images" / "extra.png", np.zeros((32, 40, 3), np.uint8))
     lines = check(capture, 1)
     assert said(lines, "1 of 8 listed are absent, first view_001.png", "view_002.png")
-    assert said(lines, "view_003.png is 32x40 px, its camera 40x32: another shape")
+    assert "1 of 8 have another shape than their camera" in finding(lines, "BAD", "sizes")
+    assert "first view_003.png is 32x40 px, its camera 40x32" in finding(lines, "BAD", "sizes")
     assert "1 files in images/ are not listed, first extra.png" in finding(lines, "LOOK", "pairing")
     assert lines[-1] == "3 problems to fix before training"
 
 
-def test_photographs_of_half_the_size_are_fine_and_said_so(check: Check, capture: Path) -> None:
-    for path in (capture / "images").iterdir():
-        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (20, 16)))
+def test_photographs_of_other_sizes_are_fine_and_said_so_in_one_line(check: Check, capture: Path) -> None:
+    for i, path in enumerate(sorted((capture / "images").iterdir())[:7]):
+        cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (20 * (i + 1), 16 * (i + 1))))
     lines = check(capture)
-    assert "K is scaled to fit" in finding(lines, "ok", "sizes")
-    assert lines[-2] == "and 3 more of the same kinds; --all prints them"
+    assert [line.split(maxsplit=2)[2] for line in lines if line.split()[1] == "sizes"] == [
+        "6 of 8 have another size than their camera and the same shape: K is scaled to fit; "
+        "first view_000.png is 20x16 px, its camera 40x32"
+    ]
+    assert "2 of 40x32 px, 1 of 20x16 px, 1 of 60x48 px, 1 of 80x64 px, and 3 of other sizes" in finding(
+        lines, "ok", "photographs"
+    )
+    assert lines[-1] == "ready to train"
+    assert not said(lines, "--all prints them")
+
+
+def test_of_a_kind_only_five_findings_are_printed_unless_all_are_asked_for(pop: Pop, capture: Path) -> None:
+    for path in (capture / "images").iterdir():
+        path.write_bytes(path.read_bytes()[:200])
+    few, every = pop("data", "check", capture), pop("data", "check", capture, "--all")
+    assert "--all prints them" in few.out.splitlines()[-2]
+    assert (few.out.count("truncated"), every.out.count("truncated")) == (4, 8), every.out
 
 
 @pytest.mark.parametrize(("orientation", "turned"), [(1, False), (3, True), (6, True)])

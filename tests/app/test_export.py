@@ -141,7 +141,7 @@ def test_inria_s_layout_has_what_its_scripts_read(export: Said, psnr: Psnr, shar
         ("--out there.ply", "exists; pass --overwrite"),
         ("--out full --layout inria", "full: holds what this command did not write (notes.txt)"),
         ("--out full --layout inria --overwrite", "did not write (notes.txt)"),
-        ("--out full.ply --overwrite", "full.ply: a folder of this name is in the way; choose another --out"),
+        ("--out full.ply --overwrite", "full.ply: a folder of this name is in the way; choose another name"),
     ],
 )
 def test_what_cannot_be_exported_is_said(pop: Pop, shared_result: Path, here: Path, words: str, part: str) -> None:
@@ -187,7 +187,7 @@ def test_an_export_never_replaces_what_it_reads(pop: Pop, capture: Path, result:
     lone = Path("inria/point_cloud/iteration_30/point_cloud.ply")
     again = ["export", lone, "--capture", capture, "--own-frame", "--overwrite"]
     says(pop(*again, "--layout", "inria", "--out", "inria"), "inria: holds", "point_cloud.ply, which is read")
-    says(pop(*again, "--out", lone), "point_cloud.ply: is the input file; choose another --out")
+    says(pop(*again, "--out", lone), "point_cloud.ply: is the input file; choose another name")
     assert contents(tmp_path) == before
 
 

@@ -149,8 +149,8 @@ def test_reading_whole_and_bad_photographs_prints_nothing(tmp_path: Path, capfd:
     ("content", "word"),
     [
         (b"", "empty"),
-        (b"no picture at all", "is not an image"),
-        (b"P5 2 2 255\n" + bytes(4), "is not an image that states its size"),
+        (b"no picture at all", "is not a PNG, JPEG"),
+        (b"P5 2 2 255\n" + bytes(4), "is not a PNG, JPEG, WebP, TIFF, BMP or HEIC image"),
         (b"\xff\xd8\xff", "truncated"),
     ],
 )
@@ -243,7 +243,7 @@ def test_what_is_not_read_is_named_with_the_way_to_convert_it(tmp_path: Path, mo
         (tmp_path / name).write_bytes(b"no JPEG")
     words = ("3 files are HEIC", "pip install pillow-heif, or convert them to JPEG", "mogrify -format jpg *.HEIC")
     assert_one_line(lambda: load_capture(tmp_path, sfm=True), "has no photographs", *words)
-    assert_one_line(lambda: run_sfm(tmp_path), "has 0 photograph(s)", *words)
+    assert_one_line(lambda: run_sfm(tmp_path), "has 0 photographs;", *words)
 
 
 @needs_heif

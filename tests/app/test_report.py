@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 
 from pop_fast.data import load_capture
 from pop_fast.data.capture import View, neighbour_degrees
+from pop_fast.density.passes import Passes, ViewContributions
 from pop_fast.errors import PopError
 from pop_fast.io import images
 from pop_fast.io.images import colormap_table, depth_picture, depth_range
@@ -27,6 +28,7 @@ from pop_fast.io.ply import Frame, save_ply
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.engines import renderer
 from pop_fast.train.load_result import load_splat
+from pop_fast.train.views import ViewTensors
 from pop_fast.view.document import Chart, Series, Window, draw, draw_histogram, nice_ticks, short_number
 from pop_fast.view.paths import frames_in
 from pop_fast.view.report import checks, write_report
@@ -134,6 +136,23 @@ def test_every_held_out_view_is_shown_as_render_photo_and_error(html: str) -> No
     # 24 dB before 25, and no pictures of depth where there are none
     assert alts.index(f"photo of {VIEWS[0]}") < alts.index(f"photo of {VIEWS[1]}")
     assert "depth of" not in html
+
+
+@pytest.mark.parametrize(("views", "said"), [(0, None), (1, "1 held-out view"), (4, "4 held-out views")])
+def test_nothing_is_said_of_held_out_views_where_there_are_none(tmp_path: Path, views: int, said: str | None) -> None:
+    psnr = [30.0, 29.5] if views else [None, None]
+    entries = [
+        {"format": name, "bytes": 24_800 // (k + 1), "num_gaussians": 100, "psnr": psnr[k], "views": views}
+        for k, name in enumerate(("ply", "spz"))
+    ]
+    found = read_result(write_result(tmp_path / "r", views=views, psnr=psnr[0], encodings=entries))
+    heads, whole, small = found.files
+    assert heads[:4] == ("format", "MB", "B/Gaussian", "of the PLY")
+    assert heads[4:] == (() if said is None else (f"PSNR of {said}",))
+    assert whole == ("ply", "0.02", "248.0", "1/1.0", *(() if said is None else ("30.00 dB",)))
+    assert small == ("spz", "0.01", "124.0", "1/2.0", *(() if said is None else ("29.50 dB (-0.50)",)))
+    assert ("held-out" in found.subtitle) == (said is not None)
+    assert said is None or found.subtitle.split(" · ")[2] == said
 
 
 def test_the_report_reads_only_the_result_folder_and_that_of_a_run_that_was_killed_early(
@@ -380,7 +399,7 @@ def test_a_veil_between_the_photographs_is_found(looked: Looked) -> None:
 
 
 def test_a_veil_that_reaches_in_from_outside_is_left_out_and_the_rest_is_tuned(
-    looked: Looked, pop: Pop, shared_capture: Path, tmp_path: Path
+    looked: Looked, pop: Pop, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     capture, splat = looked.capture, looked.splat
     turn = checks.orbit_views(capture.train_views())[1]
@@ -402,6 +421,44 @@ def test_a_veil_that_reaches_in_from_outside_is_left_out_and_the_rest_is_tuned(
     assert "without veils: " in said
     after, before = map(float, re.findall(r"([\d.]+) dB", said)[-2:])
     assert after > before - 0.1
+    # what tuning brings back is left out again
+    monkeypatch.setattr("pop_fast.train.compact.tuned_to_the_end", lambda _: params)
+    said = pop.done(*words, tmp_path / "c.ply", "--fine-tune-steps", "20").out
+    many = len(params["means"])
+    assert f"without what grew meanwhile: {many - int(veils.sum()):,} of {many:,} Gaussians kept" in said
+
+
+@pytest.mark.parametrize("most", [3, 40])
+def test_veils_are_weighed_by_all_that_is_seen_in_an_even_selection_of_the_training_views(
+    looked: Looked, monkeypatch: pytest.MonkeyPatch, most: int
+) -> None:
+    monkeypatch.setattr(checks, "_MOST_WEIGHED", most)
+    capture, config, degree = looked.capture, looked.splat.config, looked.splat.sh_degree
+    backend, drawn, whole = renderer("auto")[0], {}, Passes.contributions
+
+    def watched(self: Passes, params: dict, *rest: Any) -> ViewContributions:
+        drawn[self.view(0).name] = len(params["means"])
+        return whole(self, params, *rest)
+
+    monkeypatch.setattr(Passes, "contributions", watched)
+    train = capture.train_views(config.test_every)
+    turn = checks.orbit_views(train)
+    params = looked.with_one(turn[1], 0.06 * near_limit(turn[1], capture.points), 0.012)
+    found = are_veils(params, capture, config, degree, backend)
+    n = len(params["means"])
+    some = [train[i] for i in ((0, 3, 6) if most == 3 else range(7))]
+    assert [view.name for view in train if view.name in drawn] == [view.name for view in some]
+    assert all(drawn[view.name] == n for view in some)
+    # views of the orbit are drawn without what stands behind, and that changes nothing
+    assert all(drawn.get(view.name, 0) < n for view in turn)
+    hidden, shown = torch.zeros(n).double(), torch.zeros(n).double()
+    for sums, views, is_near in ((hidden, turn, True), (shown, some, False)):
+        for view in views:
+            seen = whole(Passes.of(backend, [ViewTensors.of(view)], config), params, 0, degree)
+            counts = (seen.depths < near_limit(view, capture.points)) == is_near
+            sums += torch.where(counts, seen.weight_sum, 0.0) / (view.width * view.height * len(views))
+    assert torch.equal(found, (hidden > 1e-5) & (hidden > shown))
+    assert found[-1]
 
 
 def test_floaters_are_left_out_of_a_file_by_their_places(

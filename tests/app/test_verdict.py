@@ -47,6 +47,12 @@ def orbit(shares: list[float]) -> dict[str, float]:
     ("about", "changes", "kind", "words"),
     [
         ("Overfitting", {}, "good", "training views 31.00 dB, held-out views 29.50 dB, 1.5 dB apart"),
+        (
+            "Overfitting",
+            {"train_psnr": 29.46},
+            "good",
+            "training views 29.46 dB, held-out views 29.50 dB, 0.0 dB apart.",
+        ),
         ("Overfitting", {"train_psnr": 34.0}, "look", "4.5 dB apart"),
         ("Overfitting", {"train_psnr": 34.5, "held_out_psnr": 24.5}, "bad", "10.0 dB apart"),
         (
@@ -58,7 +64,7 @@ def orbit(shares: list[float]) -> dict[str, float]:
         ("Overfitting", {"train_psnr": 39.5, "steps": 9_000}, "look", "already short, 150 steps a photograph"),
         ("Overfitting", {"held_out_psnr": None, "matched_psnr": None}, "look", "No view was held out"),
         ("Photographs", {}, "good", "60 trained on, neighbours 4.0 degrees apart"),
-        ("Photographs", {"photographs": 11}, "look", "11 trained on"),
+        ("Photographs", {"photographs": 11}, "look", "few. More photographs, also from other sides, would help"),
         ("Photographs", {"photographs": 11, "train_psnr": 30.0, "held_out_psnr": 24.0}, "bad", "too few"),
         ("Photographs", {"photographs": 11, "train_psnr": 36.0}, "look", "few"),
         ("Photographs", {"train_psnr": 37.4, "held_out_psnr": 29.9}, "look", "not quite enough for this subject"),
@@ -75,8 +81,11 @@ def orbit(shares: list[float]) -> dict[str, float]:
         ("Floaters", {"floaters": {"a": 0.1, "b": 0.3}}, "bad", "20.0 % of the pixels"),
         # frames of the orbit vanish, and no photograph's view shows anything
         ("Floaters", {"orbit_floaters": orbit(53 * [0.0] + 7 * [0.8])}, "bad", "hides much of 7 views"),
+        ("Floaters", {"orbit_floaters": orbit(59 * [0.0] + [0.8])}, "bad", "hides much of one view between the"),
         ("Floaters", {"orbit_floaters": orbit(60 * [0.001])}, "good", "2 photographs' views and 60"),
+        ("Floaters", {"floaters": {"a": 0.0}}, "good", "looked for in one photograph's view and 0"),
         ("Floaters", {"floaters": ONE, "without_floaters": 29.45}, "bad", "29.45 dB instead of 29.50"),
+        ("Floaters", {"floaters": ONE, "without_floaters": 29.499}, "bad", "held-out views keep their 29.50 dB."),
         ("Floaters", {"floaters": ONE, "without_floaters": 28.0}, "look", "without them held-out views have 28.00"),
         ("Fit", {}, "good", "reach 31.00 dB"),
         ("Fit", {"misfits": {"a": 0.02, "b": 0.05}}, "look", "3.5 % of a photograph is far from its render"),
@@ -152,16 +161,44 @@ def test_the_verdict_says_how_close_the_renders_are(psnr: float, kind: str, word
 
 
 @pytest.mark.parametrize(
-    ("train", "steps", "sent"), [(25.7, 300, "train"), (25.7, 3_000, "data"), (33.0, 300, "data"), (18.0, 300, "train")]
+    ("train", "steps", "sent"),
+    [
+        *((25.7, 300, "train"), (25.7, 1_935, "train"), (25.7, 3_000, "data")),
+        *((33.0, 300, "data"), (18.0, 300, "train"), (21.0, 1_935, "data")),
+    ],
 )
 def test_views_that_few_steps_left_as_they_are_ask_for_more_steps(train: float, steps: int, sent: str) -> None:
     # 43 photographs of fox: 24.65 dB after 300 steps, training views 25.66; 31.09 dB after 3,120
     checks = replace(GOOD, photographs=43, train_psnr=train, held_out_psnr=min(train, 25.7) - 1.0, steps=steps)
     found = {one.about: one for one in verdict({}, checks, None)}
     assert found["Quality"].next[0] == sent
-    assert ("7 a photograph" in found["Quality"].text) == (sent == "train")
+    assert (f"few steps, {steps / 43:.0f} a photograph" in found["Quality"].text) == (sent == "train")
     if train < 22.0:
         assert found["Fit"].next == found["Overfitting"].next == found["Quality"].next
+
+
+@pytest.mark.parametrize(
+    ("photographs", "steps", "seconds", "words"),
+    [
+        # three minutes of the fox, of a terrace, of a capture with almost enough
+        (43, 300, 180.0, ("--minutes", "15")),
+        (302, 330, 190.0, ("--minutes", "90")),
+        (43, 1_289, 180.0, ("--minutes", "10")),
+        # a few seconds; what a night takes
+        (43, 300, 4.0, ("--minutes", "1")),
+        (900, 9_000, 30_000.0, ("--minutes", "1500")),
+        # minutes never choose more than the paper's 30,000 steps, and are not known of every run
+        (1_200, 30_000, 7_200.0, ("--steps-scaler", "3")),
+        (43, 300, None, ("--steps-scaler", "0.043")),
+    ],
+)
+def test_a_run_of_few_steps_is_sent_to_one_that_is_several_times_as_long(
+    photographs: int, steps: int, seconds: float | None, words: tuple[str, ...]
+) -> None:
+    checks = replace(GOOD, photographs=photographs, train_psnr=18.0, held_out_psnr=17.0, steps=steps)
+    stats = {} if seconds is None else {"seconds_total": seconds}
+    told = {one.about: one.next for one in verdict(stats, checks, None)}
+    assert told["Quality"] == told["Fit"] == ("train", "DATA", *words)
 
 
 def test_a_view_that_spoils_the_mean_is_named() -> None:
@@ -176,6 +213,11 @@ def test_a_run_whose_held_out_views_got_worse_is_told_when_that_began() -> None:
     fell = verdict({}, None, ([700.0, 3000.0], [20.2, 16.7]))
     assert [f.kind for f in fell] == ["bad"]
     assert "fell from 20.20 dB after 700 steps to 16.70 dB after 3,000" in fell[0].text
+    # and is not sent to more steps by another sentence
+    checks = replace(GOOD, train_psnr=18.0, held_out_psnr=16.7, steps=900)
+    told = {one.about: one.next for one in verdict({}, checks, ([700.0, 900.0], [20.2, 16.7]))}
+    assert told["Course"][2:] == ("--steps-scaler", "0.023")
+    assert told["Quality"] == told["Fit"] == ("data", "check", "DATA")
     assert verdict({}, None, ([700.0, 3000.0], [16.7, 20.2])) == []
 
 
@@ -305,7 +347,7 @@ def test_more_steps_help_where_few_left_all_views_far_off_and_fewer_where_it_lea
     noisy = edited(demo, tmp_path / "noisy", lambda _, image: image + draw.normal(0.0, 25.0, image.shape))
     short, told = trained(pop, ["train", noisy, "--out", tmp_path / "run", "--steps-scaler", "0.002"])
     assert {told["Quality"].kind, told["Fit"].kind} == {"bad"}
-    assert told["Quality"].next[:4] == told["Fit"].next[:4] == ("train", str(noisy), "--minutes", "240")
+    assert told["Quality"].next[:4] == told["Fit"].next[:4] == ("train", str(noisy), "--minutes", "1")
     long, told = trained(pop, told["Quality"].next)
     assert long.judged_psnr > short.judged_psnr + 1.0
     assert long.train_psnr > short.train_psnr + 3.0

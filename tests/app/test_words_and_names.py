@@ -234,10 +234,11 @@ def test_a_full_disk_leaves_nothing_half_written(
     ("words", "parts"),
     [
         ("eval gone", ("gone", "no such file or folder")),
-        ("report gone", ("gone", "no cfg.json")),
-        ("compare gone", ("gone", "no cfg.json")),
         ("compare", ("name one or more",)),
         ("data check gone", ("gone", "no such folder")),
+        ("train gone.mp4", ("gone.mp4", "no such file;")),
+        ("compare gone.ply", ("gone.ply", "no such file or folder", "pop train")),
+        ("report gone", ("gone", "no such file or folder", "pop train")),
         ("sfm gone", ("gone", "no such folder")),
         ("demo here --views 2", ("2 views", "use 4")),
         ("doctor --lpips-alex gone", ("gone", "LPIPS")),

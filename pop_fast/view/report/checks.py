@@ -27,7 +27,7 @@ from pop_fast.stages.appearance import expose
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.evaluate import measure, psnr
 from pop_fast.train.results import ResultFolder
-from pop_fast.train.views import Layers, ViewTensors, render_layers
+from pop_fast.train.views import Layers, ViewTensors, evenly, render_layers
 from pop_fast.view.paths import VideoFile, camera_path
 
 # training views that are rendered, evenly over the capture
@@ -42,6 +42,8 @@ _FEWEST_POINTS: Final = 20
 _SEEN: Final = 0.1
 # of the orbit's pixels, on average: what hides less is not seen
 _HAZE: Final = 1e-5
+# training views that a veil is weighed against, evenly over the capture
+_MOST_WEIGHED: Final = 40
 # in what a capture says of its points, where they were made up
 _RANDOM: Final = "random ones"
 # a picture's longer side in blocks; of what moved, a block's error is so many times the median block's, and so much of
@@ -200,10 +202,14 @@ def near_limit(view: View, points: np.ndarray) -> float | None:
 
 def nearer_than(params: Mapping[str, Tensor], view: View, limit: float) -> dict[str, Tensor]:
     """Select the Gaussians whose centres lie before a camera and nearer than a limit, world units."""
-    axis = torch.from_numpy(view.viewmat[2]).to(params["means"])
-    depths = params["means"].detach() @ axis[:3] + axis[3]
-    chosen = (depths > 0.0) & (depths < limit)
+    chosen = _are_nearer(params["means"], view, limit)
     return {name: tensor.detach()[chosen] for name, tensor in params.items()}
+
+
+def _are_nearer(means: Tensor, view: View, limit: float) -> Tensor:
+    axis = torch.from_numpy(view.viewmat[2]).to(means)
+    depths = means.detach() @ axis[:3] + axis[3]
+    return (depths > 0.0) & (depths < limit)
 
 
 def are_floaters(means: Tensor, capture: Capture, test_every: int) -> Tensor:
@@ -234,19 +240,31 @@ def are_veils(
     """Tell which Gaussians hide more of the orbit's views than they show of the photographs, wherever they stand.
 
     In a view of the orbit counts what stands nearer than floaters do, also what reaches into it from outside of it; in
-    a training view what does not. Each is a share of the pixels, by blending weights, on average. bool [N]
+    a training view what does not. Each is a share of the pixels, by blending weights, on average. What stands behind
+    takes nothing off these weights, so that a view of the orbit is drawn without it. A training view is drawn whole,
+    and of more than 40 such views 40 are, evenly spread over the capture. bool [N]
     """
     train = capture.train_views(config.test_every)
     hidden, shown = (torch.zeros(len(params["means"]), dtype=torch.float64) for _ in range(2))
+
+    def weights(view: View, chosen: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        found = Passes.of(backend, [ViewTensors.of(view)], config).contributions(chosen, 0, sh_degree)
+        return found.weight_sum.cpu() / (view.width * view.height), found.depths.cpu()
+
     orbit = orbit_views(train)
-    for sums, views, want_near in ((hidden, orbit, True), (shown, train, False)):
-        for view in views:
-            limit = near_limit(view, capture.points)
-            if limit is None:
-                continue
-            found = Passes.of(backend, [ViewTensors.of(view)], config).contributions(params, 0, sh_degree)
-            counts = (found.depths < limit) == want_near
-            sums += torch.where(counts, found.weight_sum, 0.0).cpu() / (view.width * view.height * len(views))
+    for view in orbit:
+        limit = near_limit(view, capture.points)
+        near = None if limit is None else _are_nearer(params["means"], view, limit)
+        if near is not None and near.any():
+            hidden[near] += weights(view, {name: tensor[near] for name, tensor in params.items()})[0] / len(orbit)
+    if not (hidden > _HAZE).any():
+        return hidden > _HAZE
+    some = evenly(train, _MOST_WEIGHED)
+    for view in some:
+        limit = near_limit(view, capture.points)
+        if limit is not None:
+            share, depths = weights(view, params)
+            shown += torch.where(depths < limit, 0.0, share) / len(some)
     return (hidden > _HAZE) & (hidden > shown)
 
 

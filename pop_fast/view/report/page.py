@@ -293,8 +293,8 @@ def sizes_section(table: Sequence[Sequence[str]]) -> str:
         for row in rows
     )
     return (
-        "<h2>Files</h2><p>The splat in every format that <code>pop export --to FORMAT</code> writes, and the PSNR of "
-        "some held-out views after reading the file back.</p>"
+        "<h2>Files</h2><p>The splat in every format that <code>pop export --to FORMAT</code> writes, and where views "
+        "are held out its PSNR after reading the file back.</p>"
         f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
     )
 

@@ -59,7 +59,7 @@ def read_result(folder: Path) -> ReportData:
     viewer = folder / "viewer.html"
     fix = "train again with --resume, which measures them"
     entries = checked_encodings(stats.get("encodings") or [], str(folder), fix)
-    held_out = f"{stats['views']} held-out views" if "views" in stats else ""
+    held_out = held_out_views(stats["views"]) if stats.get("views") else ""
     return ReportData(
         title=f"{Path(config.data).resolve().name} · {method.split(' (')[0]}",
         subtitle=" · ".join(filter(None, [method, _schedule_note(config), held_out, _machine(stats)])),
@@ -74,7 +74,7 @@ def read_result(folder: Path) -> ReportData:
         n_held_out=stats.get("views"),
         config=_settings(config, folder),
         changes=[{key: change.get(key) for key in _CHANGE_COLUMNS} for change in changes],
-        files=[encoding_heads(entries), *encoding_rows(entries)] if entries else [],
+        files=encoding_table(entries) if entries else [],
         viewer=_read(viewer).decode("utf-8", "replace") if viewer.is_file() else None,
         verdict=[typed(found, config, folder) for found in verdict(stats, checks, curves.get("psnr_val"))],
         checked=checks is not None,
@@ -453,16 +453,15 @@ def checked_encodings(entries: Any, where: str, fix: str) -> list[dict[str, Any]
     return entries
 
 
-def encoding_heads(encodings: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
-    """Return the heads of a table of encodings; few of many held-out views are rendered, and the last head says so."""
+def encoding_table(encodings: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
+    """Lay encodings out: heads, and a row a format.
+
+    A row is name, MB, bytes a Gaussian, share of the PLY's size, and where views were held out PSNR and how far it is
+    from the PLY's. Few of many held-out views are rendered, and the last head says how many.
+    """
     views = max((entry["views"] for entry in encodings), default=0)
-    return "format", "MB", "B/Gaussian", "of the PLY", f"PSNR of {views} held-out view{'' if views == 1 else 's'}"
-
-
-def encoding_rows(encodings: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    """Return a row a format: name, MB, bytes a Gaussian, share of the PLY's size, PSNR and how far from the PLY's."""
+    rows = [("format", "MB", "B/Gaussian", "of the PLY", f"PSNR of {held_out_views(views)}")]
     whole = next((entry for entry in encodings if entry["format"] == "ply"), None)
-    rows = []
     for entry in encodings:
         share = f"1/{whole['bytes'] / max(entry['bytes'], 1):.1f}" if whole else ""
         psnr = "" if entry["psnr"] is None else f"{entry['psnr']:.2f} dB"
@@ -470,7 +469,12 @@ def encoding_rows(encodings: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...
             psnr += f" ({entry['psnr'] - whole['psnr']:+.2f})"
         each = f"{entry['bytes'] / max(entry['num_gaussians'], 1):.1f}"
         rows.append((entry["format"], f"{entry['bytes'] / 1e6:.2f}", each, share, psnr))
-    return rows
+    return rows if views else [row[:-1] for row in rows]
+
+
+def held_out_views(count: int) -> str:
+    """Say how many views are held out."""
+    return f"{count} held-out view{'' if count == 1 else 's'}"
 
 
 def write_report(result_dir: str | Path) -> Path:
