@@ -252,8 +252,9 @@ def about_held_out(capture: Capture, config: TrainConfig) -> str | None:
     own = any(view.split is not None for view in capture.views)
     if own or not held_out or count > FEW or "test_every" in _said(config):
         return None
+    are = "is" if held_out == 1 else "are"
     return (
-        f"{held_out} of {count} photographs are held out for measuring, {100 * held_out / count:.0f} % of what there "
+        f"{held_out} of {count} photographs {are} held out for measuring, {100 * held_out / count:.0f} % of what there "
         "is to learn from; --test-every 0 trains on all of them, and measures nothing"
     )
 

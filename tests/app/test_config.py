@@ -633,7 +633,7 @@ def test_what_was_chosen_for_few_photographs_is_said_kept_reported_and_gone_on_w
     assert outcome.status == 130
     weight = DEPTH_LAMBDAS[0][1]
     assert f"(--depth-lambda {weight:g}), because 7 photographs are few" in outcome.out
-    assert "1 of 8 photographs are held out" in outcome.out
+    assert "1 of 8 photographs is held out" in outcome.out
     assert "--test-every 0" in outcome.out
     assert pop(*words, "--resume").status == 0
     resolved = json.loads((tmp_path / "r" / "cfg.json").read_text())["resolved"]
