@@ -397,6 +397,7 @@ def brighter(image: np.ndarray, stops: float) -> np.ndarray:
     return np.clip(image * 2.0 ** (stops / GAMMA), 0.0, 255.0).round().astype(np.uint8)
 
 
+@pytest.mark.slow  # it trains
 @pytest.mark.parametrize(("width", "learned"), [(0.0, False), (0.4, True)])
 def test_training_learns_exposures_that_differ(demo: Path, width: float, learned: bool) -> None:
     capture = load_capture(demo)

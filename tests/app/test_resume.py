@@ -245,6 +245,7 @@ def test_sums_do_not_depend_on_who_adds_and_a_process_whose_fellow_has_ended_say
     assert told.startswith("process 1 of 2 lost the others: one of them has ended, and its own message says why")
 
 
+@pytest.mark.slow  # two processes that train
 @needs_gloo
 def test_pop_train_is_one_command_for_two_processes(shared_capture: Path, tmp_path: Path) -> None:
     settings = ["--steps-scaler", "0.0003", "--no-progress", "--backend", "fast", "--batch-size", "2", "--threads", "1"]

@@ -42,6 +42,7 @@ def test_iterations_are_steps() -> None:
     assert arguments(["scene", "--preset", "quick", "--iterations=700"])[0].max_steps == 700
 
 
+@pytest.mark.slow  # it trains
 def test_a_photograph_whose_name_is_no_text_is_trained_on(pop: Pop, tmp_path: Path) -> None:
     # a file name is bytes; Python carries the odd ones through a string
     odd = os.fsdecode(b"view\xff.png")

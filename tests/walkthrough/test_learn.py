@@ -141,7 +141,11 @@ def _mistaken(stage: Stage, name: str, old: str, new: str) -> str:
     return text.replace(body, body.replace(old, new))
 
 
-@pytest.mark.parametrize("name", WRONG)
+# every second function here; the others are for `make test-all`
+HALF = [name if k % 2 else pytest.param(name, marks=pytest.mark.slow) for k, name in enumerate(WRONG)]
+
+
+@pytest.mark.parametrize("name", HALF)
 def test_every_wrong_solution_is_refused_and_told_what_is_wrong(mine: Path, name: str) -> None:
     stage = next(stage for stage in COURSE if name in stage.names)
     for old, new, *wanted in WRONG[name]:
@@ -437,6 +441,7 @@ def test_density_control_ends_at_half_time_and_the_toy_learns(mine: Path) -> Non
     assert told_[-1].psnr > told_[0].psnr + 1.5
 
 
+@pytest.mark.slow  # it trains
 def test_a_capture_is_trained_on_from_its_points(mine: Path) -> None:
     _written(mine)
     make_demo(mine / "demo", views=6, width=64, height=48)

@@ -134,6 +134,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Alone]:
     return trained
 
 
+@pytest.mark.slow  # two processes that train
 @needs_gloo
 @pytest.mark.parametrize("name", RUNS)
 def test_two_gpus_train_to_the_bits_of_one(gpu, together: Path, alone, name: str) -> None:
@@ -147,6 +148,7 @@ def test_two_gpus_train_to_the_bits_of_one(gpu, together: Path, alone, name: str
         assert min(received.values()) > 0
 
 
+@pytest.mark.slow  # two processes that train
 @needs_gloo
 @pytest.mark.parametrize("name", RUNS)
 def test_two_gpus_exchange_the_bytes_that_the_model_says(gpu, together: Path, alone, name: str) -> None:
@@ -175,6 +177,7 @@ def test_two_gpus_exchange_the_bytes_that_the_model_says(gpu, together: Path, al
     assert sum(received["rows"] for received, _, _ in told) == pytest.approx(rows, rel=1e-9)
 
 
+@pytest.mark.slow  # two processes that train
 @needs_gloo
 def test_who_watches_a_run_of_two_gpus_sees_the_rows_of_both(gpu, together: Path, tmp_path: Path) -> None:
     seen: dict[int, float] = {}
@@ -191,6 +194,7 @@ def test_who_watches_a_run_of_two_gpus_sees_the_rows_of_both(gpu, together: Path
     assert torch.load(together / "looked_1.pt") == []
 
 
+@pytest.mark.slow  # two processes that train
 @needs_gloo
 def test_one_gpu_continues_what_two_began(gpu, together: Path, tmp_path: Path) -> None:
     folder = tmp_path / "window"
