@@ -1,6 +1,6 @@
 """Array types whose shapes are checked when jaxtyping is installed, and plain arrays when it is not.
 
-`pop_ref` runs with numpy alone. Under the project's tests jaxtyping is installed and beartype checks annotations of arrays.
+`pop_ref` runs with numpy alone. Under the tests jaxtyping is installed, and beartype checks annotations of arrays.
 """
 
 from __future__ import annotations
