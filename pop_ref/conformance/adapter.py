@@ -13,6 +13,7 @@ import functools
 import importlib
 import importlib.util
 import inspect
+import sys
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, fields, replace
@@ -268,7 +269,7 @@ def stage_function(package: str, name: str) -> Callable[..., Any] | None:
 
 def _module(name: str) -> ModuleType | None:
     # a stage that an implementation does not have is a skipped law, a stage that fails to import is a bug
-    return importlib.import_module(name) if _is_there(name) else None
+    return sys.modules.get(name) or (importlib.import_module(name) if _is_there(name) else None)
 
 
 # every law asks again for what it needs, and to look for a file that is not there takes longer than most laws' examples

@@ -14,7 +14,7 @@ from typing import Final
 
 from hypothesis import HealthCheck, settings
 
-EXAMPLES: Final = {"quick": 5, "dev": 15, "ci": 32, "thorough": 500, "explore": 25}
+EXAMPLES: Final = {"quick": 5, "dev": 15, "ci": 24, "thorough": 500, "explore": 25}
 
 
 def load_profile(name: str) -> None:

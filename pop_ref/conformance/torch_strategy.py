@@ -120,7 +120,7 @@ def _taken(
     trainer.move(params, optimizers, step, state)
     before, counted = ({key: value.detach().clone() for key, value in params.items()}, _counters(params, optimizers))
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(step)
+        _seed(step)
         done = _looked(strategy, script, trainer, (params, optimizers, state), step, info)
     same = [key for key in KEYS if len(before[key]) == len(params[key]) and torch.equal(before[key], params[key])]
     return _recorded(params, optimizers) | {
@@ -130,6 +130,18 @@ def _taken(
         "noisy": bool(getattr(strategy, "noise_lr", 0.0)),
         "counted": counted == _counters(params, optimizers),
     }
+
+
+def _seed(seed: int) -> None:
+    """Seed what draws: the CPU, and CUDA where it is in use.
+
+    `torch.manual_seed` keeps the call, with its stack, for every kind of device that is not in use; that takes longer
+    than a scripted step.
+    """
+    torch = importlib.import_module("torch")
+    torch.default_generator.manual_seed(seed)
+    if torch.cuda.is_initialized():
+        torch.cuda.manual_seed_all(seed)
 
 
 def _looked(
