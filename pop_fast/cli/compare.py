@@ -18,7 +18,7 @@ from pop_fast.train.results import read_config
 
 _EXAMPLES: Final = """
     pop compare out/scene_pop out/scene_adc
-    pop compare out/scene_pop scene.sog scene.spz --capture scene    files are measured as 'pop eval' does
+    pop compare out/scene_pop scene.sog scene.spz    files are measured as 'pop eval' does
 """
 
 
@@ -27,7 +27,7 @@ class Args(CaptureArguments):
     """Put several results side by side: quality, Gaussians, Gaussians per pixel, opacities, seconds.
 
     Of a result folder these are the numbers that its training left. The file of a splat is measured; the options say on
-    which photographs, by default of the size that the results beside it were trained on.
+    which photographs, by default those that the results beside it were trained on, at their size.
     """
 
     results: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|FILE [RESULT|FILE ...]")]
@@ -42,7 +42,7 @@ def run(argv: Sequence[str]) -> int:
         raise PopError("nothing to compare; name one or more result folders")
     from pop_fast.view.report.source import markdown, plain, row
 
-    args = replace(args, factor=_factor(args))
+    args = replace(args, **_of_results(args))
     found = [_stats(path, args) for path in args.results]
     unfinished = [path for path, stats in zip(args.results, found, strict=True) if "psnr" not in stats]
     why = "has no statistics yet; train to the first evaluation, or run pop eval"
@@ -55,10 +55,15 @@ def run(argv: Sequence[str]) -> int:
     return 0
 
 
-def _factor(args: Args) -> int | None:
-    """Return what photographs are shrunk by before files are measured: as asked, else as all of the results say."""
-    factors = {read_config(path).factor for path in args.results if not path.is_file()}
-    return factors.pop() if args.factor is None and len(factors) == 1 else args.factor
+def _of_results(args: Args) -> dict[str, Any]:
+    """Return by which photographs files are measured, as far as nothing is asked: those that all of the results had."""
+    configs = [read_config(path) for path in args.results if not path.is_file()]
+    had: dict[str, set[Any]] = {
+        "capture": {Path(config.data) for config in configs},
+        "factor": {config.factor for config in configs},
+        "test_every": {config.test_every for config in configs},
+    }
+    return {name: of.pop() for name, of in had.items() if len(of) == 1 and getattr(args, name) is None}
 
 
 def _stats(path: Path, args: Args) -> dict[str, Any]:

@@ -202,7 +202,7 @@ def test_compare_puts_results_side_by_side(pop: Pop, shared_result: Path) -> Non
     assert pop("compare", shared_result, "--markdown").out.splitlines()[1].startswith("| --- | --- | ---: |")
 
 
-def test_a_file_is_measured_at_the_size_that_the_results_beside_it_were_trained_on(
+def test_a_file_is_measured_by_the_photographs_that_the_results_beside_it_were_trained_on(
     pop: Pop, capture: Path, tmp_path: Path
 ) -> None:
     run, lone = tmp_path / "run", tmp_path / "lone.ply"
@@ -210,7 +210,7 @@ def test_a_file_is_measured_at_the_size_that_the_results_beside_it_were_trained_
     pop.done("export", run, "--out", lone)
 
     def psnr(*words: str) -> list[str]:
-        table = pop.done("compare", run, lone, "--capture", capture, "--markdown", *words).out.splitlines()
+        table = pop.done("compare", run, lone, "--markdown", *words).out.splitlines()
         at = table[0].split("|").index(" PSNR ")
         return [line.split("|")[at] for line in table[2:]]
 
@@ -218,6 +218,8 @@ def test_a_file_is_measured_at_the_size_that_the_results_beside_it_were_trained_
     assert beside == asked
     assert beside[0] == beside[1]
     assert whole[0] != whole[1]
+    assert psnr("--capture", str(capture)) == beside
+    assert psnr("--capture", str(capture), "--test-every", "2") != beside
 
 
 def test_sfm_says_how_well_it_went(pop: Pop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

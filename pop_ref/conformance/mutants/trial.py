@@ -95,7 +95,7 @@ def killed_by(mutant: Mutant | BlackBox, dtype: str = "float32") -> str | None:
     """Return how the mutant's named law breaks on it in a precision, None if the mutant survives."""
     stated = law_named(mutant.law)
     with alive(mutant, dtype) as backend:
-        return _noticed(stated, backend)
+        return noticed(stated, backend)
 
 
 def killers(mutant: Mutant | BlackBox, examples: int = EXAMPLES["ci"]) -> list[str]:
@@ -103,12 +103,12 @@ def killers(mutant: Mutant | BlackBox, examples: int = EXAMPLES["ci"]) -> list[s
     found = []
     with alive(mutant) as backend:
         for path, stated in every_law().items():
-            if _noticed(stated, backend, examples) is not None:
+            if noticed(stated, backend, examples) is not None:
                 found.append(path)
     return found
 
 
-def _noticed(stated: Law, backend: Any, examples: int = EXAMPLES["ci"]) -> str | None:
+def noticed(stated: Law, backend: Any, examples: int = EXAMPLES["ci"]) -> str | None:
     """Return how a law breaks; None where it holds, and where it is skipped, before it is tried or by its answer."""
     try:
         return None if missing(backend, stated.needs) else obeys(stated, backend, examples)

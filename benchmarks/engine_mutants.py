@@ -1,0 +1,220 @@
+"""Faults drawn at random from the C++ engine that trains on CPUs: how many of them do the kit's laws notice?
+
+    python -m benchmarks.engine_mutants --draw 60 --work out/engine     # goes on where it was stopped
+    python -m benchmarks.engine_mutants                                 # what the JSON says
+
+A site is an operator, a number or a statement of the engine's C++, and of the arithmetic that it shares with the CUDA
+kernels. Each fault is compiled by itself, with little optimization, and every law that judges the engine is tried with
+four examples: in float32, which trains, then in float64. What does not compile is drawn anew. Whether a fault that no
+law notices changes anything at all is found by reading; the JSON keeps that in words, under "changes nothing".
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import random
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Final
+
+if __package__ in (None, ""):
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.record import commit, read_json, write_json
+from pop_fast.compiled import build, library
+from pop_ref.conformance.backends import shipped
+from pop_ref.conformance.mutants.trial import every_law, noticed
+
+ROOT: Final = Path(__file__).resolve().parents[1]
+RESULTS: Final = ROOT / "benchmarks" / "results" / "engine_mutants.json"
+EXAMPLES: Final = 4
+PRECISIONS: Final = ("compiled32", "compiled64")
+# what takes longer hangs
+SECONDS: Final = 1200.0
+# they start threads, name vectors of lanes and declare functions
+_LEFT_OUT: Final = ("threads.h", "c_api.h", "lanes.h", "real.cuh")
+_FLAGS: Final = (*(flag for flag in build.FLAGS if flag not in ("-O3", "-shared")), "-O1", *build.TUNING[0])
+
+_SWAPS: Final = {
+    " + ": " - ", " - ": " + ", " * ": " / ", " / ": " * ", " < ": " <= ", " <= ": " < ", " > ": " >= ", " >= ": " > ",
+    " == ": " != ", " != ": " == ", " && ": " || ", " || ": " && ", " += ": " = ", " -= ": " = ",
+    "std::min": "std::max", "std::max": "std::min", "(!": "(", "if (": "if (!",
+}  # fmt: skip
+_OPERATOR: Final = re.compile("|".join(map(re.escape, sorted(_SWAPS, key=len, reverse=True))))
+_NUMBER: Final = re.compile(r"(?<![\w.\[<])(\d+\.\d+|\d+)(?=f?[\s,;)\]])")
+_STATEMENT: Final = re.compile(r"^\s+[\w.>\[\]*()+-]+ [+-]?= .*;$|^\s+(continue|break);$|^\s+[\w.]+\(.*\);$")
+# what a compiler reads, and memory
+_NOT_ARITHMETIC: Final = re.compile(
+    r"^\s*(#|//|template|static_assert|using|namespace|extern)|resize|bytes\(|make_unique"
+)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One line of the engine, changed.
+
+    Attributes:
+        file: in the checkout.
+        line: its number, from 1.
+        old, new: the line before and after.
+    """
+
+    file: str
+    line: int
+    old: str
+    new: str
+
+    @property
+    def name(self) -> str:
+        """Return how the JSON calls it."""
+        return f"{self.file}:{self.line}: {self.old.strip()} -> {self.new.strip()}"
+
+
+def faults() -> list[Fault]:
+    """Return every fault that can be drawn."""
+    files = [*(build.HERE / name for name in build.SOURCES), *(build.CUDA / name for name in build.SHARED)]
+    return [
+        Fault(str(file.relative_to(ROOT)), number, line, new)
+        for file in sorted(files)
+        if file.name not in _LEFT_OUT
+        for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1)
+        if not _NOT_ARITHMETIC.search(line)
+        for new in dict.fromkeys(_broken(line))
+    ]
+
+
+def _broken(line: str) -> Iterator[str]:
+    code, mark, comment = line.partition("  //")
+    for at in _OPERATOR.finditer(code):
+        yield code[: at.start()] + _SWAPS[at.group()] + code[at.end() :] + mark + comment
+    for at in _NUMBER.finditer(code):
+        told = at.group(1)
+        value = str(int(told) + 1) if told.isdigit() else f"{float(told) * 1.1 or 0.1:.6g}"
+        yield code[: at.start()] + value + code[at.end() :] + mark + comment
+    if _STATEMENT.match(code):
+        yield "  ;"
+
+
+def compiled(fault: Fault | None, work: Path) -> Path | None:
+    """Compile the engine with a fault, or sound; return the library, None where that does not compile."""
+    sources = work / "faulty"
+    for name in (*(build.HERE / s for s in build.SOURCES), *(build.CUDA / s for s in build.SHARED)):
+        to = sources / name.relative_to(ROOT)
+        to.parent.mkdir(parents=True, exist_ok=True)
+        lines = name.read_text(encoding="utf-8").splitlines()
+        if fault is not None and str(name.relative_to(ROOT)) == fault.file:
+            lines[fault.line - 1] = fault.new
+        to.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    objects = [_object(sources, unit, fault, work) for unit in build.UNITS]
+    if None in objects:
+        return None
+    # a name of its own, since a library that is loaded stays loaded
+    made = work / f"engine_{time.monotonic_ns()}.so"
+    subprocess.run(["g++", "-shared", "-pthread", "-o", made, *map(str, objects)], check=True)
+    return made
+
+
+def _object(sources: Path, unit: str, fault: Fault | None, work: Path) -> Path | None:
+    """Compile one unit; what does not read the faulty file is compiled once."""
+    touched = fault is not None and Path(fault.file).name in _read_by(unit)
+    to = work / f"{'faulty' if touched else 'sound'}_{unit}.o"
+    if not touched and to.exists():
+        return to
+    command = ["g++", *_FLAGS, f"-I{sources}", "-c", "-o", str(to), str(sources / "pop_fast/compiled" / unit)]
+    return to if subprocess.run(command, capture_output=True, check=False).returncode == 0 else None
+
+
+def _read_by(unit: str) -> set[str]:
+    """Return the names of the files that a unit includes, itself among them."""
+    found, left = set[str](), [build.HERE / unit]
+    while left:
+        file = left.pop()
+        if file.name not in found and file.exists():
+            found.add(file.name)
+            included = re.findall(r'#include "(.*)"', file.read_text(encoding="utf-8"))
+            left += [ROOT / name if name.startswith("cuda_ext/") else file.parent / name for name in included]
+    return found
+
+
+def noticed_by(engine: Path) -> str:
+    """Return the first law that breaks on an engine, "crash" or "hang", or "" where all laws hold."""
+    context = multiprocessing.get_context("fork")
+    here, there = context.Pipe(duplex=False)
+    child = context.Process(target=_judge, args=(engine, there))
+    child.start()
+    there.close()
+    child.join(SECONDS)
+    if child.is_alive():
+        child.kill()
+        child.join()
+        return "hang"
+    try:
+        return str(here.recv()) if here.poll() else "crash"
+    except EOFError:
+        return "crash"
+
+
+def _judge(engine: Path, answer: Connection) -> None:
+    for module in (build, library):
+        module.library_path = lambda: engine  # type: ignore[assignment]
+    for name in PRECISIONS:
+        backend = shipped(name)
+        for path, law in every_law().items():
+            broken = noticed(law, backend, EXAMPLES)
+            if broken is not None:
+                answer.send(f"{path} ({name}): {broken[:160]}")
+                return
+    answer.send("")
+
+
+def draw(count: int, seed: int, work: Path) -> None:
+    """Draw faults until so many have been tried, and write what becomes of each into the JSON."""
+    every, tried = faults(), read_json(RESULTS)
+    if "sound" not in tried:
+        engine = compiled(None, work)
+        if engine is None or noticed_by(engine):
+            raise SystemExit("the sound engine does not compile, or breaks a law: nothing can be told of faulty ones")
+        tried["sound"] = {"sites": len(every), "seed": seed, "commit": commit(ROOT)}
+    for fault in random.Random(seed).sample(every, len(every)):
+        if len(tried) - 1 >= count:
+            return
+        if fault.name in tried or (engine := compiled(fault, work)) is None:
+            continue
+        tried[fault.name] = {"noticed by": noticed_by(engine)}
+        engine.unlink()
+        write_json(RESULTS, tried)
+        print(fault.name, tried[fault.name], flush=True)
+
+
+def told(tried: dict[str, Any]) -> list[str]:
+    """Return what the JSON says, a line each: how many die, and what lives."""
+    rows = {name: row for name, row in tried.items() if name != "sound" and "changes nothing" not in row}
+    died = [row["noticed by"] for row in rows.values() if row["noticed by"]]
+    errors = sum(said in ("crash", "hang") for said in died)
+    same = len(tried) - 1 - len(rows)
+    lives = [f"lives: {name}" for name, row in rows.items() if not row["noticed by"]]
+    return [f"{len(died)} of {len(rows)} die, {errors} of them by a crash; {same} change nothing", *lives]
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--draw", type=int, help="how many faults to try, those of the JSON among them")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--work", type=Path, default=Path("out/engine"), help="folder for what is compiled")
+    args = parser.parse_args()
+    if args.draw is not None:
+        args.work.mkdir(parents=True, exist_ok=True)
+        draw(args.draw, args.seed, args.work.resolve())
+    print("\n".join(told(read_json(RESULTS))))
+
+
+if __name__ == "__main__":
+    main()
