@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.law import law
+from pop_ref.conformance.scenes import in_precision
 from pop_ref.conformance.short_training import ShortTraining, assert_steps
 from pop_ref.methods import KEYS, RECIPE_OF
 from pop_ref.refinement import without_common_motion
@@ -66,7 +67,9 @@ def test_every_step_is_the_oracles_under_every_setting(backend):
     window = replace(PRIOR, order=(0, 1), seed=1216, count=9)
     # visible Gaussians dominate no pixel
     hidden = replace(MASKED, order=(0,), seed=40)
-    for short in (PRIOR, window, ENTROPY, MASKED, hidden):
+    # several tiles, and more rows than an engine takes at a time
+    large = [replace(short, size=(21, 37), order=(0,), count=9, seed=1078) for short in (PRIOR, MASKED)]
+    for short in (PRIOR, window, ENTROPY, MASKED, hidden, *large):
         _assert_steps(backend, short)
 
 
@@ -309,6 +312,47 @@ def test_at_rates_of_zero_every_look_at_a_photograph_costs_the_same(backend):
         assert_close("steps.still", record["loss"], loss, loss, backend.dtype)
         for key, value in short.params.items():
             assert_same_bits(key, record["params"][key], value)
+
+
+# more than any engine takes at a time
+CROWD = 4500
+
+
+class _Crowded(ShortTraining):
+    """A short training among thousands of Gaussians that lie behind its cameras."""
+
+    @functools.cached_property
+    def places(self):
+        """Return the rows of those that are not behind."""
+        return np.linspace(0, CROWD - 1, self.count).astype(int)
+
+    @functools.cached_property
+    def params(self):
+        few, rows = super().params, {}
+        for key, value in few.items():
+            rows[key] = np.repeat(value[:1], CROWD, axis=0)
+            rows[key][self.places] = value
+        behind = np.setdiff1d(np.arange(CROWD), self.places)
+        centres = [c.viewmat[:3, :3].T @ (np.array([0.0, 0.0, -9.0]) - c.viewmat[:3, 3]) for c in self.cameras]
+        rows["means"][behind] = in_precision(np.mean(centres, axis=0))
+        return rows
+
+
+@law("training", "taken_steps")
+def test_what_no_view_sees_has_no_say_in_a_step_and_in_the_prior_of_what_is_visible(backend):
+    asked = {"settings": {**STILL, **FIRST, "pop_over": "visible"}, "options": PRIOR.options, "order": (0, 1)}
+    few, many = ShortTraining(**asked, seed=125), _Crowded(**asked, seed=125)
+    behind = np.setdiff1d(np.arange(CROWD), many.places)
+    taken = zip(*map(backend.stage("taken_steps"), (few, many)), strict=True)
+    for alone, among in taken:
+        assert_close("steps.still", among["loss"], alone["loss"], alone["loss"], backend.dtype)
+        for kind in ("params", "m"):
+            for key in KEYS:
+                value = alone[kind][key]
+                size = np.max(np.abs(value), initial=0.0)
+                assert_close("steps.still", among[kind][key][many.places], value, size, backend.dtype)
+        for key in KEYS:
+            assert_same_bits(f"{key} of what no view sees", among["params"][key][behind], many.params[key][behind])
 
 
 @law("training", "taken_steps")
