@@ -58,12 +58,7 @@ def test_a_written_file_holds_what_the_writer_wrote_and_parents_are_made(tmp_pat
 
 @pytest.mark.parametrize(
     ("number", "word"),
-    [
-        (errno.ENOSPC, "disk is full"),
-        (errno.EDQUOT, "quota"),
-        (errno.EROFS, "read-only"),
-        (errno.EACCES, "permission"),
-    ],
+    [(errno.ENOSPC, "disk is full"), (errno.EDQUOT, "quota"), (errno.EROFS, "read-only"), (errno.EACCES, "permission")],
 )
 def test_a_failing_writer_leaves_the_old_file(old: Path, number: int, word: str) -> None:
     refused = OSError(number, os.strerror(number))
@@ -292,9 +287,7 @@ def test_an_empty_folder_is_filled_without_being_asked_and_a_file_in_the_way_is_
 
 
 @pytest.mark.parametrize("can_exchange", [True, False])
-def test_a_killed_replacement_never_hides_the_old_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, can_exchange: bool
-) -> None:
+def test_a_killed_replacement_never_hides_the_old_folder(tmp_path, monkeypatch, can_exchange):
     if not can_exchange:
         monkeypatch.setattr(atomic, "_exchange", lambda *_: False)
     kills, own = 0, by_name("a.txt")

@@ -193,9 +193,7 @@ def test_what_is_finished_is_not_done_again_and_overwriting_begins_anew(train: T
     assert not (blocks / "blocks" / "litter").exists()
 
 
-def test_a_block_that_was_interrupted_goes_on_to_the_same_bits(
-    pop: Pop, train: Train, shared_blocks, tmp_path, monkeypatch
-):
+def test_a_block_that_was_interrupted_goes_on_to_the_same_bits(pop, train, shared_blocks, tmp_path, monkeypatch):
     folder, words = tmp_path / "out", (*BLOCKS, "--checkpoint-every", "5")
     with monkeypatch.context() as patch:
         interrupt(patch, at=11)
@@ -209,7 +207,7 @@ def test_a_block_that_was_interrupted_goes_on_to_the_same_bits(
 
 
 def test_a_run_of_the_native_step_goes_on_with_other_threads_to_the_same_bits(
-    train: Train, shared_blocks, tmp_path, monkeypatch
+    train, shared_blocks, tmp_path, monkeypatch
 ):
     reason = get_backend("compiled").why_not()
     if reason is not None:
@@ -616,9 +614,7 @@ def by_parts(pop: Pop, folder: Path) -> None:
     assert (folder / "blocks" / "merged").is_file()
 
 
-def test_parts_can_be_done_one_by_one_and_a_core_without_gaussians_has_nothing_to_train(
-    pop: Pop, rounds, shared_rounds
-):
+def test_parts_can_be_done_one_by_one_and_a_core_without_gaussians_has_nothing_to_train(pop, rounds, shared_rounds):
     by_parts(pop, rounds)
     assert_same(load_splat(rounds).params, merged(shared_rounds, 2))
     none = {key: value[:0] for key, value in core(rounds, 1, "1_0").items()}

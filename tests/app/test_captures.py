@@ -519,9 +519,7 @@ def test_a_model_file_cut_anywhere_or_with_more_than_it_says_is_named(file: str,
         ("images.bin", 72, b"\xfc", ("image 1", "\\xfc", "not UTF-8")),
     ],
 )
-def test_a_wrong_field_is_named_in_binary(
-    shared: Path, file: str, offset: int, value: bytes, words: tuple[str, ...]
-) -> None:
+def test_a_wrong_field_is_named_in_binary(shared, file, offset, value, words):
     refused(shared, file, lambda data: data[:offset] + value + data[offset + len(value) :], *words)
 
 
@@ -659,8 +657,8 @@ def color_errors(capture: Capture) -> list[float]:
     ],
 )
 def test_a_real_capture_is_loaded_whole_and_its_points_project_onto_their_colours(
-    name: str, factor: int, views: int, size: tuple[int, int], points: int, tests: int
-) -> None:
+    name, factor, views, size, points, tests
+):
     capture = load_capture(real(name), factor=factor)
     assert len(capture.views) == views
     assert len(capture.test_views()) == tests

@@ -553,8 +553,8 @@ def test_a_run_chooses_where_no_schedule_is_said() -> None:
 
 
 def test_a_run_without_options_says_what_it_chose_keeps_it_and_resumes_to_the_same_bits(
-    pop: Pop, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    pop, shared_capture, tmp_path, monkeypatch
+):
     words = ("train", shared_capture, "--minutes", "0.001", *QUICKLY)
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     outcome = pop(*words, "--out", whole)
@@ -624,8 +624,8 @@ def test_exposures_are_learned_where_cameras_noted_that_they_drift() -> None:
 
 
 def test_what_was_chosen_for_few_photographs_is_said_kept_reported_and_gone_on_with(
-    pop: Pop, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    pop, capture, tmp_path, monkeypatch
+):
     words = ("train", with_tracks(capture, 4), "--minutes", "0.001", "--out", tmp_path / "r", *QUICKLY)
     with monkeypatch.context() as patch:
         interrupt(patch, at=120)

@@ -142,10 +142,7 @@ SHAPES: list[tuple[Shape, object]] = [
         Frustum((0.0, 0.1, 0.0), nothing, 0.3, bottom=0.5, top=0.2, height=0.9),
         lambda p: np.maximum(np.hypot(p[0], p[1]) - 0.5 + p[2] / 3.0, np.abs(p[2] - 0.45) - 0.45),
     ),
-    (
-        Torus((0.0, 0.0, 0.3), nothing, ring=0.5, tube=0.2),
-        lambda p: np.hypot(np.hypot(p[0], p[1]) - 0.5, p[2]) - 0.2,
-    ),
+    (Torus((0.0, 0.0, 0.3), nothing, ring=0.5, tube=0.2), lambda p: np.hypot(np.hypot(p[0], p[1]) - 0.5, p[2]) - 0.2),
 ]
 
 

@@ -78,9 +78,7 @@ def test_the_oracle_on_a_few_gaussians_agrees_with_rasterization_of_all(changes:
     assert statuses == {"blended", "skipped", "stopped", "hidden", "clamped"}
 
 
-def test_weights_and_what_is_left_sum_to_one_and_rays_end_at_the_depth_of_who_stopped_them(
-    scene: ExplainedView,
-) -> None:
+def test_weights_and_what_is_left_sum_to_one_and_rays_end_at_the_depth_of_who_stopped_them(scene):
     depths, ended = termination_depths(scene), []
     for x, y in PIXELS:
         e = explain_pixel(scene, x, y)
@@ -296,8 +294,8 @@ def test_a_pixel_is_explained_in_every_profile_and_its_view_may_be_named(explain
     ],
 )
 def test_bad_words_are_answered_by_one_line_that_names_field_and_fix(
-    pop: Pop, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, part: str
-) -> None:
+    pop, shared_result, tmp_path, monkeypatch, words, part
+):
     monkeypatch.chdir(tmp_path)
     says(pop("explain", shared_result, *words.split()), part)
 
@@ -324,9 +322,7 @@ def test_an_objective_is_the_papers_whatever_the_run_was_trained_with(equation: 
     assert all((row.v_opacity_pop == 0.0) == (name == "3dgs") for row in e.blended)
 
 
-def test_the_objective_of_the_command_line_changes_the_pull_and_not_the_picture(
-    explain: Callable[..., Outcome], tmp_path: Path
-) -> None:
+def test_the_objective_of_the_command_line_changes_the_pull_and_not_the_picture(explain, tmp_path):
     told = {}
     for objective in ("run", "pop", "3dgs"):
         plain, page = (tmp_path / f"{objective}.{kind}" for kind in ("json", "html"))
@@ -406,9 +402,7 @@ def fainter(gaussian: int, alpha: float, falloff: float) -> Change:
     return change
 
 
-def test_a_backend_that_skips_a_splat_is_shown_with_the_decision_that_flipped(
-    scene: ExplainedView, instead_of_cuda: Callable[[Change], None]
-) -> None:
+def test_a_backend_that_skips_a_splat_is_shown_with_the_decision_that_flipped(scene, instead_of_cuda):
     row, floor = explain_pixel(scene, 16, 12).blended[1], PAPER.alpha_floor
     instead_of_cuda(fainter(row.id, 0.999 * floor, row.falloff))
     found = difference(scene, "fast", "cuda", 16, 12)
@@ -422,9 +416,7 @@ def test_a_backend_that_skips_a_splat_is_shown_with_the_decision_that_flipped(
     assert found.largest > 0.0
 
 
-def test_a_backend_with_another_ceiling_parts_by_d6_and_the_worst_pixel_is_looked_up(
-    scene: ExplainedView, instead_of_cuda: Callable[[Change], None]
-) -> None:
+def test_a_backend_with_another_ceiling_parts_by_d6_and_the_worst_pixel_is_looked_up(scene, instead_of_cuda):
     instead_of_cuda(lambda given: {"profile": "gsplat_1_6"})
     image, info = scene.rasterized(torch.float32, get_backend("cuda"))
     sound, own = scene.rasterized(torch.float32, get_backend("fast"))
@@ -438,9 +430,7 @@ def test_a_backend_with_another_ceiling_parts_by_d6_and_the_worst_pixel_is_looke
     assert found.n_colors == int(((image - sound).abs().amax(dim=2) > 1.0 / 255.0).sum())
 
 
-def test_the_command_line_shows_where_two_backends_part(
-    explain: Callable[..., Outcome], tmp_path: Path, instead_of_cuda: Callable[[Change], None]
-) -> None:
+def test_the_command_line_shows_where_two_backends_part(explain, tmp_path, instead_of_cuda):
     assert explain("--json", tmp_path / "own.json").status == 0
     rows = json.loads((tmp_path / "own.json").read_text())["rows"]
     # away from its centre a splat may be too faint at the pixel and still be visible elsewhere

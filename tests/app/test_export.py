@@ -293,8 +293,8 @@ def test_sog_folders_and_ksplat_are_converted(pop: Pop, export: Said, psnr: Psnr
 
 
 def test_an_export_measures_as_its_run_moved_into_the_other_frame_and_back(
-    pop: Pop, export: Said, psnr: Psnr, own: Path, shared_result: Path, trained: Any
-) -> None:
+    pop, export, psnr, own, shared_result, trained
+):
     record = json.loads((shared_result / "capture.json").read_text())
     found = frame_of(own)
     assert found.name == "training"
@@ -312,8 +312,8 @@ def test_an_export_measures_as_its_run_moved_into_the_other_frame_and_back(
 
 
 def test_a_ply_that_says_nothing_is_taken_to_be_in_the_capture_s_frame_with_a_note(
-    pop: Pop, export: Said, psnr: Psnr, shared_capture: Path, trained: Any
-) -> None:
+    pop, export, psnr, shared_capture, trained
+):
     export("--out", "o.ply")
     save_ply("s.ply", load_ply("o.ply"))
     outcome = pop.done("eval", "s.ply", "--capture", shared_capture, "--json", "e.json")
@@ -327,9 +327,7 @@ def test_a_ply_that_says_nothing_is_taken_to_be_in_the_capture_s_frame_with_a_no
     assert frame_of(Path("t.ply")) is None
 
 
-def test_a_ply_of_a_trainer_that_moves_the_world_is_read_as_the_command_says(
-    pop: Pop, psnr: Psnr, shared_capture: Path, own: Path, trained: Any
-) -> None:
+def test_a_ply_of_a_trainer_that_moves_the_world_is_read_as_the_command_says(pop, psnr, shared_capture, own, trained):
     save_ply("s.ply", load_ply(own))
     about = ("--capture", shared_capture, "--training-frame")
     assert psnr("s.ply", "--training-frame") == trained

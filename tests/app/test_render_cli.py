@@ -55,9 +55,7 @@ def rendered(pop: Pop, shared_result: Path) -> Render:
     return lambda *words: pop("render", shared_result, *words)
 
 
-def test_held_out_views_are_rendered_to_the_same_bytes_as_in_training(
-    rendered: Render, shared_result: Path, tmp_path: Path
-) -> None:
+def test_held_out_views_are_rendered_to_the_same_bytes_as_in_training(rendered, shared_result, tmp_path):
     assert "1 views of toy" in rendered("--out", tmp_path / "views").out
     assert sorted(os.listdir(tmp_path / "views")) == ["renders.json", "view_000.png"]
     kept = np.load(shared_result / "report_data" / "val_step29_0000.npz")
@@ -65,9 +63,7 @@ def test_held_out_views_are_rendered_to_the_same_bytes_as_in_training(
 
 
 @pytest.mark.parametrize("path", ["orbit", "ellipse", "interpolate"])
-def test_a_path_gives_as_many_pictures_and_frames_as_asked(
-    rendered: Render, shared_result: Path, tmp_path: Path, path: str
-) -> None:
+def test_a_path_gives_as_many_pictures_and_frames_as_asked(rendered, shared_result, tmp_path, path):
     words = ["--path", path, "--frames", "3", "--out", tmp_path / "frames", "--video", tmp_path / "clip.webm"]
     assert rendered(*words).status == 0
     pictures = sorted((tmp_path / "frames").glob("*.png"))
@@ -100,9 +96,7 @@ def test_a_path_gives_as_many_pictures_and_frames_as_asked(
         ("--out .", "the folder that this command runs in; choose another output folder"),
     ],
 )
-def test_what_cannot_be_rendered_is_said_and_nothing_is_written(
-    rendered: Render, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, part: str
-) -> None:
+def test_what_cannot_be_rendered_is_said_and_nothing_is_written(rendered, tmp_path, monkeypatch, words, part):
     monkeypatch.chdir(tmp_path)
     says(rendered(*words.split()), part)
     assert list(tmp_path.iterdir()) == []
@@ -266,9 +260,7 @@ CASES = {
 
 @pytest.mark.parametrize("backend", ["fast", "compiled"])
 @pytest.mark.parametrize("case", CASES)
-def test_a_gaussian_at_half_of_inrias_near_plane_is_seen_where_the_world_was_shrunk(
-    case: str, backend: str, tmp_path: Path
-) -> None:
+def test_a_gaussian_at_half_of_inrias_near_plane_is_seen_where_the_world_was_shrunk(case, backend, tmp_path):
     engine_or_skip(backend)
     (scale, is_seen), capture = CASES[case], tiny_capture()
     eye, *others = capture.train_views(5)
@@ -305,9 +297,7 @@ def test_a_run_writes_its_near_plane_down_and_goes_on_with_it(pop: Pop, shared_c
     assert own.renderer.near_plane == pytest.approx(0.2, rel=1e-12)
 
 
-def test_blocks_are_trained_with_the_near_plane_of_the_whole(
-    pop: Pop, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_blocks_are_trained_with_the_near_plane_of_the_whole(pop, shared_capture, tmp_path, monkeypatch):
     monkeypatch.setattr(jobs, "_run", in_this_process)
     monkeypatch.setattr(jobs, "has_snakemake", lambda: False)
     scale, out = load_capture(shared_capture).world_scale, tmp_path / "out"

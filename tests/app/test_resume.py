@@ -138,9 +138,7 @@ def test_a_run_in_batches_goes_on_from_a_checkpoint_within_a_window(tmp_path):
 
 
 @pytest.mark.parametrize("engine", ["fast", "compiled"])
-def test_a_measurement_that_is_left_is_made_by_who_resumes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: str
-) -> None:
+def test_a_measurement_that_is_left_is_made_by_who_resumes(tmp_path, monkeypatch, engine):
     reason = get_backend(engine).why_not()
     if reason is not None:
         pytest.skip(reason)
@@ -325,9 +323,7 @@ def test_sigkill_at_random_moments_changes_nothing(tmp_path):
         pytest.param(signal.SIGKILL, -signal.SIGKILL, marks=pytest.mark.slow),
     ],
 )
-def test_the_search_for_cameras_is_left_at_once_and_leaves_nothing(
-    tmp_path: Path, number: signal.Signals, status: int
-) -> None:
+def test_the_search_for_cameras_is_left_at_once_and_leaves_nothing(tmp_path, number, status):
     # photographs of noise that overlap: thousands of features each, minutes of matching
     wall = np.random.default_rng(0).integers(0, 256, (900, 3000, 3), dtype=np.uint8)
     for i in range(24):
@@ -348,9 +344,7 @@ def test_the_search_for_cameras_is_left_at_once_and_leaves_nothing(
 
 @posix
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_training_that_is_told_to_stop_writes_a_checkpoint(
-    shared_capture: Path, tmp_path: Path, number: signal.Signals
-) -> None:
+def test_training_that_is_told_to_stop_writes_a_checkpoint(shared_capture, tmp_path, number):
     folder = tmp_path / "r"
     words = ("--max-steps", "100000", "--checkpoint-every", "0", *TRAIN)
     process = start(tmp_path, "train", shared_capture, "--out", folder, *words)
@@ -418,9 +412,7 @@ def test_sigterm_while_a_capture_is_read_is_one_line_and_the_end(shared_capture:
 @pytest.mark.slow  # photographs of 12 megapixels
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_training_on_photographs_of_12_megapixels_is_gone_after_less_than_two_seconds_of_work(
-    tmp_path: Path, number: signal.Signals
-) -> None:
+def test_a_training_on_photographs_of_12_megapixels_is_gone_after_less_than_two_seconds_of_work(tmp_path, number):
     reason = get_backend("compiled").why_not()
     if reason is not None:
         pytest.skip(reason)

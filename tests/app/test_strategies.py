@@ -363,9 +363,7 @@ def test_a_run_that_is_stopped_anywhere_goes_on_to_the_same_bits(method: str, ba
         assert all(torch.equal(again.params[key], whole.params[key]) for key in KEYS), f"after step {step}"
 
 
-def test_a_method_that_looks_at_the_views_sees_those_of_the_run_as_they_are_drawn(
-    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_method_that_looks_at_the_views_sees_those_of_the_run_as_they_are_drawn(tmp_path, monkeypatch):
     # what each method makes of what it sees the laws of training say, and what a pass sees `tests/fast/test_passes.py`
     config = tiny_method(tmp_path, "mini-splatting")
     start = TrainingRun(config, tiny_capture())
@@ -431,9 +429,7 @@ def test_a_method_that_looks_at_the_views_sees_those_of_the_run_as_they_are_draw
         ("pop", {"refine_every": 0}, "pop.refine_every is 0; it must be at least 1"),
     ],
 )
-def test_a_setting_that_cannot_be_is_named_as_the_command_line_names_it(
-    method: str, setting: dict[str, Any], words: str
-) -> None:
+def test_a_setting_that_cannot_be_is_named_as_the_command_line_names_it(method, setting, words):
     with pytest.raises(PopError) as error:
         TrainConfig.of(method=method, **{method: setting})
     assert str(error.value) == words

@@ -38,7 +38,6 @@ from tests.app.captures import (
     transforms_capture,
     write_photograph,
 )
-from tests.app.conftest import Pop
 
 Edit = Callable[[dict[str, Any]], object]
 
@@ -395,8 +394,8 @@ def assert_same_cameras(found: Capture, expected: Capture) -> None:
 
 @pytest.mark.parametrize("program", PROGRAMS)
 def test_the_cameras_of_an_export_are_those_it_was_made_from_and_data_check_looks_it_over(
-    program: str, original: Capture, write: Callable[..., Path], pop: Pop
-) -> None:
+    program, original, write, pop
+):
     folder = write(program)
     for source in ({}, {"source": program}):
         found = raw(folder, points=20, **source)

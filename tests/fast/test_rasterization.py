@@ -143,9 +143,7 @@ def test_the_oracle_and_the_fast_path_are_both_backends() -> None:
 
 
 @pytest.mark.parametrize("compiled", [False, True])
-def test_auto_is_the_default_and_takes_the_fastest_that_is_there(
-    compiled: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_auto_is_the_default_and_takes_the_fastest_that_is_there(compiled, monkeypatch):
     from pop_fast import compiled as kernels
     from pop_fast.api.backends import CompiledBackend
 

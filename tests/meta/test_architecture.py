@@ -26,12 +26,7 @@ ORACLE = [p for p in sorted((ROOT / "pop_ref").glob("*.py")) if p.name != "__ini
 VALUES = {"pop_ref.constants", "pop_ref.settings", "pop_ref.recipes"}
 SHARED_WITH_FAST = VALUES | {"pop_ref.notation", "pop_ref.records", "pop_ref.registry"}
 # rooms of the program whose work is to show what the oracle does
-SHOW_THE_ORACLE = (
-    "pop_fast/view/explain/",
-    "pop_fast/oracle.py",
-    "pop_fast/cli/vectors.py",
-    "pop_fast/cli/learn.py",
-)
+SHOW_THE_ORACLE = ("pop_fast/view/explain/", "pop_fast/oracle.py", "pop_fast/cli/vectors.py", "pop_fast/cli/learn.py")
 
 
 def _name(path: Path) -> str:

@@ -38,15 +38,7 @@ from pop_ref.conformance.hypothesis_profiles import EXAMPLES
 from pop_ref.conformance.law import is_crash, missing
 from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, living
 from pop_ref.conformance.mutants.trial import every_law, law_named, obeys
-from pop_ref.conformance.pairs import (
-    FACTORS,
-    accepted,
-    call_of,
-    covering_rows,
-    judged_pairs,
-    pairs_of,
-    possible_pairs,
-)
+from pop_ref.conformance.pairs import FACTORS, accepted, call_of, covering_rows, judged_pairs, pairs_of, possible_pairs
 from pop_ref.conformance.scenes import (
     Scene,
     cotangents,
@@ -143,9 +135,7 @@ def test_rounding_a_scene_twice_is_rounding_it_once() -> None:
     ],
     ids=["index", "values", "million", "nan", "inf", "-inf", "shape"],
 )
-def test_what_differs_is_told_with_index_values_and_units(
-    actual: Any, expected: Any, scale: float, dtype: Any, said: str
-) -> None:
+def test_what_differs_is_told_with_index_values_and_units(actual, expected, scale, dtype, said):
     with pytest.raises(AssertionError, match=said):
         assert_close("alpha.sigma", np.array(actual), np.array(expected), scale, dtype)
 
@@ -316,9 +306,7 @@ def stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Judged:
 
 
 @pytest.mark.parametrize("shift", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
-def test_a_stranger_with_gsplats_signature_is_judged_by_what_it_offers(
-    stranger: Judged, tmp_path: Path, shift: float
-) -> None:
+def test_a_stranger_with_gsplats_signature_is_judged_by_what_it_offers(stranger, tmp_path, shift):
     # nothing but gsplat's arguments and meta keys; with half a pixel's shift it must fail and say where
     done = stranger(STRANGER.format(shift=shift), "--dtype", "float64", "--profile", "gsplat_1_5", "-rs",
                     "-k", "round_splat or stop_itself or any_tile", "--failures", str(tmp_path / "broken"))  # fmt: skip
@@ -340,9 +328,7 @@ PACKED = STRANGER.replace("absgrad=False,", "sparse_grad=False, absgrad=False,")
 
 
 @pytest.mark.slow
-def test_one_cause_that_breaks_several_laws_is_told_once_with_where_it_was_raised(
-    stranger: Judged, tmp_path: Path
-) -> None:
+def test_one_cause_that_breaks_several_laws_is_told_once_with_where_it_was_raised(stranger, tmp_path):
     chosen = "packed_rows_are_those or arguments_that_are_taken_alone or sparse_gradients"
     options = ("--profile", "gsplat_1_5", "-v", "-k", chosen, "--failures", str(tmp_path))
     done = stranger(PACKED.format(shift=0.0), *options)
@@ -573,9 +559,7 @@ def test_pairs_that_only_failing_calls_hold_are_named_and_count_as_not_judged() 
 
 @pytest.mark.slow  # all laws of the signature
 @pytest.mark.parametrize(("argument", "keys"), [("tile_size", ()), ("backend", ("camera_ids", "batch_ids"))])
-def test_a_sound_rasterizer_without_tile_size_or_camera_ids_breaks_no_law_of_the_signature(
-    argument: str, keys: tuple[str, ...]
-) -> None:
+def test_a_sound_rasterizer_without_tile_size_or_camera_ids_breaks_no_law_of_the_signature(argument, keys):
     def rasterization(*args: Any, **options: Any) -> Any:
         images, alphas, meta = shipped("fast32")._rasterization(*args, **options)
         return images, alphas, {key: meta[key] for key in meta if key not in keys}
@@ -658,11 +642,7 @@ def test_exploring_draws_by_the_seed(tmp_path: Path) -> None:
 # What laws are tried on before anything is drawn: enough to kill what random scenes kill by luck.
 
 IMAGE, GRADIENTS = "test_agreement:the_image_is_one_of_the_oracles_outcomes", "test_agreement:gradients_are_the_oracles"
-DYING = {
-    "sorted_by_distance": IMAGE,
-    "gradient_of_unit_quaternions": GRADIENTS,
-    "camera_in_world_axes": IMAGE,
-}
+DYING = {"sorted_by_distance": IMAGE, "gradient_of_unit_quaternions": GRADIENTS, "camera_in_world_axes": IMAGE}
 
 
 @pytest.mark.parametrize(("name", "path"), DYING.items())

@@ -102,9 +102,7 @@ class _Soft:
     name, law, precisions = "soft", "test_alpha:soft", ("float32", "float64")
 
 
-def test_a_mutant_that_lives_in_one_precision_is_kept_as_alive(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_mutant_that_lives_in_one_precision_is_kept_as_alive(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(command, "FAMILIES", {"soft ones": (_Soft,)})
     monkeypatch.setattr(command, "killed_by", lambda mutant, dtype: "broken" if dtype == "float32" else None)
     assert command.main(["--json", str(tmp_path / "kills.json")]) == 1
@@ -114,9 +112,7 @@ def test_a_mutant_that_lives_in_one_precision_is_kept_as_alive(
     }
 
 
-def test_named_mutants_alone_are_kept_anew_and_those_that_are_gone_are_dropped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_named_mutants_alone_are_kept_anew_and_those_that_are_gone_are_dropped(tmp_path, monkeypatch):
     class New(_Soft):
         name = "new"
 

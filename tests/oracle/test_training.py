@@ -179,9 +179,7 @@ def test_updates_count_from_one() -> None:
 
 
 @pytest.mark.parametrize(("opacity", "steps"), [(0.1, 130), (0.5, 380), (0.99, 430)])
-def test_an_opacity_that_only_pop_touches_falls_under_the_pruning_threshold_in_so_many_steps(
-    opacity: float, steps: int
-) -> None:
+def test_an_opacity_that_only_pop_touches_falls_under_the_pruning_threshold_in_so_many_steps(opacity, steps):
     logit = {"o": np.log(np.array([opacity]) / (1.0 - opacity))}
     m = v = {"o": np.zeros(1)}
     taken = 0

@@ -109,13 +109,7 @@ def test_one_seed_decides_nothing_where_no_row_has_two_and_else_beyond_the_noise
 def test_every_command_that_would_decide_is_one(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     # of a folder without results, so that no row which is done here is missing from the list
     empty = ["--results", str(tmp_path)]
-    found = [
-        whole("pop", psnr=30.01),
-        whole("reset"),
-        *two("l2"),
-        *two("gsplat", "bear_512"),
-        whole("pop_size_prune"),
-    ]
+    found = [whole("pop", psnr=30.01), whole("reset"), *two("l2"), *two("gsplat", "bear_512"), whole("pop_size_prune")]
     for claim in claims("small", found):
         for told in (claim.told, *claim.others):
             for line in told.deciders:
@@ -606,8 +600,8 @@ def test_without_a_difference_a_verdict_is_as_rare_as_stated(scenes: tuple[str, 
     seed=st.integers(0, 10**6),
 )
 def test_a_difference_far_beyond_the_noise_is_decided_by_its_sign_in_results_of_any_shape(
-    effects: dict[str, float], seeds: dict[str, int], repeated: int, sigma: float, seed: int
-) -> None:
+    effects, seeds, repeated, sigma, seed
+):
     rng = random.Random(seed)
     found = drawn(rng, {scene: effect * sigma for scene, effect in effects.items()}, seeds, sigma)
     # without this row shapes of one seed each have no noise floor

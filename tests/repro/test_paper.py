@@ -299,9 +299,7 @@ def test_marks_that_are_absent_are_told() -> None:
         with_part("a", "y", "new")
 
 
-def test_the_script_writes_and_checks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_script_writes_and_checks(tmp_path, monkeypatch, capsys):
     for name in ("README.md", "protocol.md", "claims.md"):
         (tmp_path / name).write_text((HERE / name).read_text(encoding="utf-8"), encoding="utf-8")
     make = status.files

@@ -351,11 +351,7 @@ def test_a_scene_is_one_file_and_nothing_else_is_edited_to_add_one(tmp_path: Pat
         ('folder = "fox"', "", "has no folder"),
         ("shrunk = 1", "shrunk = 0", "shrunk is 0; it must be a whole number of at least 1"),
         ("verified = true", "verified = 1", "verified is 1; it must be true or false"),
-        (
-            'dataset = "further"',
-            'dataset = "moon"',
-            "dataset is 'moon'; it must be one of mipnerf360, tandt",
-        ),
+        ('dataset = "further"', 'dataset = "moon"', "dataset is 'moon'; it must be one of mipnerf360, tandt"),
         ("size = [1080, 1920]", "size = [1080]", r"size is \[1080\]; it must be \[width, height\] in pixels"),
         ("small = 4", "small = 0", "factors is .*; it must be a table of whole numbers of at least 1, by scale"),
         ("shrunk = 1", "shrunken = 1", "shrunk"),
@@ -585,8 +581,8 @@ def traced(run: TrainingRun, patch: pytest.MonkeyPatch) -> list[str]:
 @pytest.mark.parametrize("backend", ["fast", "compiled"])
 @pytest.mark.parametrize("method", METHODS)
 def test_what_happens_to_the_gaussians_in_a_step_has_the_order_of_the_methods_table(
-    method: str, backend: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    method, backend, tmp_path, monkeypatch
+):
     engine_or_skip(backend)
     order = load_pinned(method).order
     kinds = {**{kind: USUAL[kind] for kind in USUAL if kind in order}, **KINDS.get(method, {})}

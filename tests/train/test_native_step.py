@@ -178,9 +178,7 @@ def test_gaussians_of_one_depth_are_blended_row_by_row_however_many_there_are(tm
 
 @needs_compiled
 @pytest.mark.parametrize("what", ["on grey, with a mask", "antialiased", "all for few photographs"])
-def test_the_bits_depend_neither_on_threads_nor_on_how_many_steps_are_asked_for_at_once(
-    what: str, tmp_path: Path
-) -> None:
+def test_the_bits_depend_neither_on_threads_nor_on_how_many_steps_are_asked_for_at_once(what, tmp_path):
     found = []
     for threads, pace in ((1, 1), (2, STEPS), (3, 2), (7, STEPS)):
         torch.set_num_threads(threads)
@@ -228,9 +226,7 @@ def test_a_step_that_is_left_changes_nothing_and_is_taken_by_whoever_goes_on(tmp
 
 @needs_compiled
 @pytest.mark.parametrize("method", ["pop", "gsplat"])
-def test_how_many_steps_are_taken_at_a_time_changes_no_bit(
-    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_how_many_steps_are_taken_at_a_time_changes_no_bit(method, tmp_path, monkeypatch):
     found: list[dict[str, Any]] = []
     blocks: list[int] = []
     own, took = CompiledBackend.whole_step, TrainingRun.take_steps
@@ -279,9 +275,7 @@ def test_a_run_goes_on_with_another_number_of_threads_to_the_same_bits(method: s
 
 @needs_compiled
 @pytest.mark.parametrize("most", [1_000_000, 10])
-def test_a_step_whose_lists_cannot_be_numbered_is_told_before_it_is_taken(
-    most: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_step_whose_lists_cannot_be_numbered_is_told_before_it_is_taken(most, tmp_path, monkeypatch):
     monkeypatch.setattr(native_step, "MOST_ENTRIES", most)
     run = run_of(tmp_path, whole_engine(), {})
     before = {key: param.detach().clone() for key, param in run.params.items()}
@@ -450,9 +444,7 @@ def test_counts_are_those_of_a_walk_through_the_lists() -> None:
         ("blurred", lambda found: found & False),
     ],
 )
-def test_laws_notice_statistics_that_a_whole_step_hands_on_wrongly(
-    name: str, change: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_laws_notice_statistics_that_a_whole_step_hands_on_wrongly(name, change, monkeypatch):
     law = law_named("test_collected:a_training_collects_the_oracles_gradients_views_and_blur_flags")
     backend = shipped("compiled32")
     assert obeys(law, backend) is None

@@ -244,9 +244,7 @@ def test_transparency_matters_to_a_random_background_alone(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("name", sorted(ALL))
-def test_the_fused_step_refuses_each_setting_and_the_native_one_takes_exposures_alone(
-    tmp_path: Path, name: str
-) -> None:
+def test_the_fused_step_refuses_each_setting_and_the_native_one_takes_exposures_alone(tmp_path, name):
     config = tiny_config(tmp_path, **{name: True})
     assert name in str(why_not_trained(CUDA, config))
     assert why_not_trained(CUDA, tiny_config(tmp_path)) is None
