@@ -110,7 +110,6 @@ class Browser:
         """Return what the window shows. uint8 RGB [H, W, 3]"""
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        assert image is not None
         return image[..., ::-1]
 
 

@@ -131,7 +131,6 @@ def written(folder: Path) -> dict[str, int]:
 
 def test_the_merged_splat_is_what_each_block_has_in_its_core_and_nothing_twice(shared_blocks):
     merged, plan = splats(shared_blocks), read_plan(shared_blocks)
-    assert plan is not None
     partition, entries = plan
     whole = partition.block_of(merged["means"].double().numpy())
     assert np.array_equal(whole, np.sort(whole))
@@ -158,7 +157,6 @@ def test_statistics_are_those_of_the_whole_and_name_what_each_block_took(shared_
 
 def test_a_block_is_trained_on_its_own_views_and_points_in_the_frame_of_the_whole(shared_blocks, shared_capture):
     whole, plan = load_capture(shared_capture), read_plan(shared_blocks)
-    assert plan is not None
     by_name = {view.name: view for view in whole.views}
     for entry in plan[1]:
         block = load_capture(shared_blocks / "blocks" / entry["name"])
@@ -542,7 +540,6 @@ def test_views_that_show_nothing_of_a_core_are_not_drawn(rounds):
 
 def test_the_merge_takes_a_share_of_what_every_block_has_changed(shared_rounds):
     halves, plan = [], read_plan(shared_rounds)
-    assert plan is not None
     for number, name in enumerate(NAMES):
         before = core(shared_rounds, 1, name)
         after = load_splat(shared_rounds / "blocks" / "round_2" / name / "result").params
@@ -662,7 +659,6 @@ def test_the_steps_of_a_round_are_a_tenth_unless_they_are_said(train: Train, tmp
     monkeypatch.setattr(jobs, "_run", lambda words, quiet: 0)
     done(train(*ROUNDS))
     job = read_job(tmp_path / "out")
-    assert job is not None
     assert job.rounds > 0
     assert job.round_steps == 3
 
@@ -700,7 +696,6 @@ def divided(begun: Path, tmp_path: Path) -> Path:
 def workflow(folder: Path, scratch: Path, profile: Path | None = None) -> str:
     """Ask the workflow what it would do."""
     job = read_job(folder)
-    assert job is not None
     command = jobs.workflow_words(folder, job, 1, 1, "compiled", profile, "-n")
     environment = {**os.environ, "HOME": str(scratch), "XDG_CACHE_HOME": str(scratch / "cache")}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)

@@ -123,7 +123,6 @@ def test_the_views_derivatives_are_those_of_the_loss_that_is_trained(scene: Expl
     with torch.enable_grad():
         image = rasterization(**given, **settings, sh_degree=3, backgrounds=scene.background[None])[0][0]
         prior = POPStrategy().regularizer(opacities, {"dominant_sum": None}, 0, {"dominant_counts": scene.counts[None]})
-        assert prior is not None
         (v,) = torch.autograd.grad(photometric_pop(image, target) + prior, opacities)
     rows = {row.id: row for x, y in PIXELS for row in explain_pixel(scene, x, y).rows}
     assert len(rows) > 60
@@ -208,7 +207,6 @@ def test_profiles_are_compared_over_the_view_and_the_oracle_over_the_tile(scene:
     assert parting.n_dominant == int((info["dominant_ids"] != scene.info["dominant_ids"]).sum())
     assert parting.largest == pytest.approx(float((inria - scene.image).abs().max()))
     assert parting.n_blended > 0
-    assert parting.flip is not None
     assert parting.maps[0].picture.shape == (VIEW.height, VIEW.width, 3)
     exact = difference(scene, "fast", "ref", 16, 12)
     assert exact.region == (16, 0, 16, 16)
@@ -408,7 +406,6 @@ def test_a_backend_that_skips_a_splat_is_shown_with_the_decision_that_flipped(sc
     found = difference(scene, "fast", "cuda", 16, 12)
     assert (found.names, found.at) == (("fast", "cuda"), (16, 12))
     assert found.region == (0, 0, VIEW.width, VIEW.height)
-    assert found.flip is not None
     assert (found.flip.decision, found.flip.gaussian) == ("D5", row.id)
     assert found.flip.first.startswith("blends it: alpha ")
     assert re.fullmatch(rf"skips it: alpha 0\.0039\d+, floor {floor:.9f}", found.flip.second)

@@ -430,7 +430,6 @@ def test_a_training_on_photographs_of_12_megapixels_is_gone_after_less_than_two_
     _, status, used = os.wait4(process.pid, 0)
     assert os.waitstatus_to_exitcode(status) == 130
     ((step, _),) = ckpt.list_checkpoints(folder)
-    assert process.stderr is not None
     assert process.stderr.read() == f"pop: stopped after step {step + 1:,}; the same command with --resume continues\n"
     assert used.ru_utime + used.ru_stime - before / os.sysconf("SC_CLK_TCK") < 2.0
 

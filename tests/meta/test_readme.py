@@ -50,8 +50,6 @@ OTHER_PARAMETERS = {
 def load(file: str, name: str = "") -> ModuleType:
     """Import a script of docs/ by its path."""
     spec = importlib.util.spec_from_file_location(name or file, DOCS / f"{file}.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name or file] = module
     spec.loader.exec_module(module)

@@ -497,7 +497,6 @@ def compared(pop: list[Result], reset: list[Result], more: Sequence[Result] = ()
 def test_the_spread_is_pooled_over_rows_and_scenes_about_each_mean() -> None:
     found = noise_of([*runs("pop", 1.0, 3.0), *runs("l2", 5.0, 5.0, 8.0, scene="bear_512"), *runs("reset", 77.0)])
     spread = found.of(PSNR)
-    assert spread is not None
     # 2 and 6, over one and two degrees of freedom
     assert (spread.s, spread.df, spread.groups) == (pytest.approx(sqrt(8.0 / 3.0)), 3, 2)
     assert (spread.least, spread.largest) == (pytest.approx(sqrt(2.0)), pytest.approx(sqrt(3.0)))
@@ -508,12 +507,10 @@ def test_the_spread_is_pooled_over_rows_and_scenes_about_each_mean() -> None:
 def test_counts_vary_by_their_ratios_and_times_on_each_machine_alone() -> None:
     two = [whole(seed=s, n=n, machine=m) for s, n, m in ((1, 1000, "a"), (2, 2000, "b"))]
     spread = noise_of(two).of(COUNT)
-    assert spread is not None
     assert exp(spread.s * sqrt(2.0)) == pytest.approx(2.0)
     assert noise_of(two).of(SECONDS) is None
     same = [replace(r, machine="a", seconds={**r.seconds, "cpu": 100.0 * r.seed}) for r in two]
     known = noise_of(same).of(SECONDS)
-    assert known is not None
     assert exp(known.s * sqrt(2.0)) == pytest.approx(2.0)
     # a CPU's time by the clock is no time of a method
     by_clock = [replace(r, seconds={"load": 1.0, "train": 100.0 * r.seed, "evaluate": 1.0}) for r in same]

@@ -439,7 +439,6 @@ def test_other_data_never_stands_beside_a_number_of_the_paper(number: int, scale
 
 def test_ratios_stand_beside_the_papers_own() -> None:
     ratios = table(1, "small", DEV).ratios
-    assert ratios is not None
     assert ratios.columns == (
         "fox",
         "bear_512",
@@ -448,12 +447,9 @@ def test_ratios_stand_beside_the_papers_own() -> None:
         "paper, Mip-NeRF 360",
         "paper, Deep Blending",
     )
-    assert ratios.relative is not None
     assert ratios.relative["pop"] == ["51.0%, -0.30 dB", *["not run"] * 3, "8.5%, -0.65 dB", "3.9%, -0.95 dB"]
     assert ratios.relative["taming"][:2] == ["not run", "not run"]
     blur = table(3, "small", DEV).ratios
-    assert blur is not None
-    assert blur.relative is not None
     assert blur.relative["pop"] == [
         "46.4%, -0.20 dB",
         *["not run"] * 3,
@@ -466,8 +462,6 @@ def test_ratios_stand_beside_the_papers_own() -> None:
 
 def test_a_ratio_without_its_base_says_so_and_every_base_is_in_its_table() -> None:
     ratios = table(1, "small", DEV[:1]).ratios
-    assert ratios is not None
-    assert ratios.relative is not None
     assert ratios.relative["pop"][0] == "gsplat not run"
     assert {number: base for number, base in REFERENCES.items() if paper().table(number).row(base)} == REFERENCES
     assert set(REFERENCES) == {1, 2, 3, 4, 5}
