@@ -44,7 +44,7 @@ from pop_fast.train.views import ViewTensors
 from tests.app.captures import assert_one_line, write_photograph
 from tests.app.conftest import TRAIN, Outcome, Pop, done, wait_until
 from tests.app.damage import says
-from tests.app.tiny import interrupt, tiny_capture
+from tests.app.tiny import interrupt, skip_without, tiny_capture
 
 SETTINGS = (*TRAIN, "--skip-sizes", "--threads", "1")
 BLOCKS = ("--blocks", "2x1", "--blocks-rounds", "0", *SETTINGS)
@@ -83,7 +83,6 @@ def trained(made_once: Callable[..., Path], name: str, words: Sequence[object], 
 
 @pytest.fixture(scope="module")
 def shared_blocks(shared_capture: Path, made_once: Callable[..., Path]) -> Path:
-    """A run in two blocks that tests only read."""
     return trained(made_once, "blocks", [shared_capture, *BLOCKS])
 
 
@@ -95,13 +94,11 @@ def blocks(shared_blocks: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def shared_rounds(shared_capture: Path, made_once: Callable[..., Path]) -> Path:
-    """A run in two blocks and two rounds that tests only read."""
     return trained(made_once, "rounds", [shared_capture, *ROUNDS, *TWO_ROUNDS])
 
 
 @pytest.fixture
 def rounds(shared_rounds: Path, tmp_path: Path) -> Path:
-    """A copy of the run in rounds that a test may change."""
     return Path(shutil.copytree(shared_rounds, tmp_path / "rounds"))
 
 
@@ -207,9 +204,7 @@ def test_a_block_that_was_interrupted_goes_on_to_the_same_bits(pop, train, share
 def test_a_run_of_the_native_step_goes_on_with_other_threads_to_the_same_bits(
     train, shared_blocks, tmp_path, monkeypatch
 ):
-    reason = get_backend("compiled").why_not()
-    if reason is not None:
-        pytest.skip(reason)
+    skip_without("compiled")
     folder = tmp_path / "out"
     with monkeypatch.context() as patch:
         interrupt(patch, at=11)
@@ -689,12 +684,10 @@ def begun(shared_capture: Path, made_once: Callable[..., Path]) -> Path:
 
 @pytest.fixture
 def divided(begun: Path, tmp_path: Path) -> Path:
-    """A copy of it that a test may change."""
     return Path(shutil.copytree(begun, tmp_path / "copy"))
 
 
 def workflow(folder: Path, scratch: Path, profile: Path | None = None) -> str:
-    """Ask the workflow what it would do."""
     job = read_job(folder)
     command = jobs.workflow_words(folder, job, 1, 1, "compiled", profile, "-n")
     environment = {**os.environ, "HOME": str(scratch), "XDG_CACHE_HOME": str(scratch / "cache")}

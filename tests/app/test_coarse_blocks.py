@@ -34,7 +34,6 @@ def _one_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def shared_coarse(shared_capture: Path, made_once: Callable[..., Path]) -> Path:
-    """A run from a coarse model that tests only read."""
 
     def make(folder: Path) -> None:
         with pytest.MonkeyPatch.context() as patch:

@@ -161,9 +161,6 @@ def test_bands_that_show_nothing_are_spent_before_gaussians_and_nothing_where_al
     assert all(torch.equal(found.params[key], value) for key, value in tuner.whole.items())
 
 
-# `pop export` with a budget.
-
-
 @pytest.mark.parametrize("share", [pytest.param(0.6, marks=pytest.mark.slow), 0.4])
 @pytest.mark.parametrize("name", typing.get_args(FormatName))
 def test_a_size_is_met_in_every_format_and_the_file_shows_what_was_told(

@@ -131,9 +131,6 @@ def test_an_array_of_another_form_is_named(pop: Pop, result: Path, stem: str, na
     says(pop("report", result), f"{path}: {name} ", "which no run writes")
 
 
-# Checkpoints, and a result without them.
-
-
 def at(index: tuple[int, ...], value: float) -> Callable[[torch.Tensor], torch.Tensor]:
     def change(tensor: torch.Tensor) -> torch.Tensor:
         changed = torch.zeros_like(tensor)

@@ -54,7 +54,6 @@ def bare(tmp_path: Path, pictures: list[np.ndarray]) -> Path:
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """A capture of four photographs that a test may change."""
     return colmap_capture(tmp_path / "scene")
 
 
@@ -71,7 +70,6 @@ def check(pop: Pop) -> Check:
 
 
 def finding(lines: list[str], mark: str, about: str) -> str:
-    """Give the first finding of that mark and topic."""
     return next(line for line in lines if line.split()[:2] == [mark, about])
 
 
@@ -199,9 +197,6 @@ def test_tracks_that_colmap_refuses_are_told_with_the_models_folder(pop: Pop, tm
     assert f"{tmp_path / 'scene' / 'sparse' / '0'}: COLMAP cannot read its tracks" in line
     assert line.endswith("training ignores its tracks; write the model again to use them")
     assert pop("data", "check", HERE / "tracked").out.count("mean error") == 1
-
-
-# Photographs alone.
 
 
 def test_photographs_alone_are_looked_over(check: Check, bare: Path, tmp_path: Path) -> None:
@@ -431,9 +426,6 @@ def test_data_check_says_what_training_will_do(check: Check, demo: Path, tmp_pat
     darkest, brightest = paths[int(stops.argmin())].name, paths[int(stops.argmax())].name
     assert re.search(rf"photograph, -0\.\d+ \({darkest}\) to \+0\.\d+ \({brightest}\); a ", line)
     assert line.endswith("; lock the exposure, or train with --exposure")
-
-
-# `pop doctor`.
 
 
 def test_a_whole_install_is_found_whole(pop: Pop) -> None:

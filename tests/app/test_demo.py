@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from pop_fast.demo import make_demo
 from pop_fast.demo.make import first_hits, render_view
 from pop_fast.demo.scene import Ball, Box, Frustum, Shape, Torus, make_scene
-from pop_fast.io.images import write_png
 from tests.app.captures import assert_one_line, look_at, raw
 from tests.app.damage import contents
 
@@ -92,21 +91,6 @@ def test_brightness_changes_with_the_viewing_direction_somewhere() -> None:
         viewmat = look_at(np.add(top, (2.0 * np.cos(azimuth), 2.0 * np.sin(azimuth), 1.6)), top)
         colors.append(render_view(scene, viewmat, K, 64, 48)[24, 32].astype(float))
     assert np.abs(colors[0] - colors[1]).max() > 8.0
-
-
-def test_a_failure_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    written: list[Path] = []
-
-    def break_third(path: Path, image: np.ndarray) -> None:
-        written.append(path)
-        if len(written) == 3:
-            raise OSError(28, "No space left on device", str(path))
-        write_png(path, image)
-
-    monkeypatch.setattr("pop_fast.demo.make.write_png", break_third)
-    target = tmp_path / "demo"
-    assert_one_line(lambda: make_demo(target, **SMALL), str(target), "view_002.png", "disk is full")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_existing_folder_is_replaced_only_on_request(tmp_path: Path) -> None:

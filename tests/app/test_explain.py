@@ -218,7 +218,6 @@ def test_profiles_are_compared_over_the_view_and_the_oracle_over_the_tile(scene:
 
 @pytest.fixture
 def explain(pop: Pop, shared_result: Path) -> Callable[..., Outcome]:
-    """`pop explain` at one pixel of the tiny result."""
     return lambda *words, view="3": pop("explain", shared_result, "--view", view, "--pixel", "20,16", *words)
 
 

@@ -36,7 +36,6 @@ Said, Psnr = Callable[..., str], Callable[..., float]
 
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder that a test runs and writes in."""
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     return tmp_path / "here"
@@ -44,7 +43,6 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def export(pop: Pop, shared_result: Path) -> Said:
-    """Export the tiny result, and return what is said."""
     return lambda *words: pop.done("export", shared_result, *words).out
 
 

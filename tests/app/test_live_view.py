@@ -354,7 +354,6 @@ KEYS = {"ArrowRight": 39, "ArrowLeft": 37, "End": 35, "Home": 36}
 
 
 def click(tab: Any, name: str) -> None:
-    """Press the button of this name."""
     found = f"[...document.querySelectorAll('button, label')].find(b => b.innerText.trim() === {name!r})"
     tab.value(f"{found}.click()")
 

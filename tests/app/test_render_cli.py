@@ -38,8 +38,8 @@ from tests.app.captures import (
 from tests.app.conftest import Outcome, Pop
 from tests.app.damage import contents, says
 from tests.app.test_blocks import in_this_process
-from tests.app.test_strategies import engine_or_skip, tiny_method
-from tests.app.tiny import tiny_capture
+from tests.app.test_strategies import tiny_method
+from tests.app.tiny import skip_without, tiny_capture
 
 Render = Callable[..., Outcome]
 PATHS = "views, orbit, ellipse, interpolate"
@@ -51,7 +51,6 @@ def read(path: Path) -> np.ndarray:
 
 @pytest.fixture
 def rendered(pop: Pop, shared_result: Path) -> Render:
-    """`pop render` of the tiny result."""
     return lambda *words: pop("render", shared_result, *words)
 
 
@@ -261,7 +260,7 @@ CASES = {
 @pytest.mark.parametrize("backend", ["fast", "compiled"])
 @pytest.mark.parametrize("case", CASES)
 def test_a_gaussian_at_half_of_inrias_near_plane_is_seen_where_the_world_was_shrunk(case, backend, tmp_path):
-    engine_or_skip(backend)
+    skip_without(backend)
     (scale, is_seen), capture = CASES[case], tiny_capture()
     eye, *others = capture.train_views(5)
     config = tiny_method(tmp_path, case.split()[0], backend=backend, test_every=5)

@@ -21,7 +21,6 @@ import pytest
 import torch
 
 import pop_fast.compiled
-from pop_fast.api.backend import get_backend
 from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun, training_run
 from pop_fast.train import checkpoint as ckpt
@@ -31,7 +30,15 @@ from pop_fast.train.torch_stepper import check_batch
 from tests.app.captures import PINHOLE, camera, photograph, ring, write_model, write_photograph
 from tests.app.conftest import ROOT, TRAIN, in_a_child, launched, wait_until
 from tests.app.damage import contents
-from tests.app.tiny import assert_same_run, interrupt, last_checkpoint, run_until, tiny_capture, tiny_config
+from tests.app.tiny import (
+    assert_same_run,
+    interrupt,
+    last_checkpoint,
+    run_until,
+    skip_without,
+    tiny_capture,
+    tiny_config,
+)
 
 
 def run_to(folder, stop_after=None, resume=False, method="pop"):
@@ -139,9 +146,7 @@ def test_a_run_in_batches_goes_on_from_a_checkpoint_within_a_window(tmp_path):
 
 @pytest.mark.parametrize("engine", ["fast", "compiled"])
 def test_a_measurement_that_is_left_is_made_by_who_resumes(tmp_path, monkeypatch, engine):
-    reason = get_backend(engine).why_not()
-    if reason is not None:
-        pytest.skip(reason)
+    skip_without(engine)
     whole = tiny_config(tmp_path / "whole", eval_steps=(12,), backend=engine)
     TrainingRun(whole, tiny_capture()).run()
     parts = replace(whole, result_dir=str(tmp_path / "parts"))
@@ -413,9 +418,7 @@ def test_sigterm_while_a_capture_is_read_is_one_line_and_the_end(shared_capture:
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_training_on_photographs_of_12_megapixels_is_gone_after_less_than_two_seconds_of_work(tmp_path, number):
-    reason = get_backend("compiled").why_not()
-    if reason is not None:
-        pytest.skip(reason)
+    skip_without("compiled")
     names, folder = [f"{i}.bmp" for i in range(6)], tmp_path / "r"
     for i, name in enumerate(names):
         write_photograph(tmp_path / "large" / "images" / name, photograph(i, 4000, 3000))

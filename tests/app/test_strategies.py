@@ -18,7 +18,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from pop_fast.api.backend import get_backend
 from pop_fast.api.rasterize import rasterization
 from pop_fast.density import DensityControl, GsplatStrategy, InriaStrategy, POPStrategy, Strategy
 from pop_fast.density.control import SHORTEST_REFINE_EVERY
@@ -35,18 +34,16 @@ from pop_ref.records import Camera
 from pop_ref.render import render
 from pop_ref.settings import PopTerm
 from pop_ref.training import gaussians_from_params
-from tests.app.tiny import tiny_capture, tiny_config
-
-WIDTH, HEIGHT = 64, 32
+from tests.app.tiny import skip_without, tiny_capture, tiny_config
 
 
-def make(n: int, seed: int = 0, opacities: float = 0.5, scale: float = 0.005):
-    g = torch.Generator().manual_seed(seed)
+def make(n: int, scale: float = 0.005):
+    g = torch.Generator().manual_seed(0)
     params = {
         "means": torch.randn(n, 3, generator=g),
         "scales": torch.full((n, 3), math.log(scale)),
         "quats": torch.randn(n, 4, generator=g),
-        "opacities": torch.full((n,), math.log(opacities / (1 - opacities))),
+        "opacities": torch.zeros(n),
         "sh0": torch.randn(n, 1, 3, generator=g),
         "shN": torch.randn(n, 15, 3, generator=g),
     }
@@ -58,43 +55,23 @@ def make(n: int, seed: int = 0, opacities: float = 0.5, scale: float = 0.005):
     return params, optimizers
 
 
-def make_info(
-    n: int, grads=None, visible=None, counts=None, cameras: int = 1, width: int = WIDTH, height: int = HEIGHT
-):
-    def rows(values, otherwise):
-        return otherwise if values is None else torch.as_tensor(values).to(otherwise.dtype).reshape(otherwise.shape)
-
-    means2d = torch.zeros(cameras, n, 2, requires_grad=True)
-    means2d.grad = rows(grads, torch.zeros(cameras, n, 2))
-    seen = rows(visible, torch.ones(cameras, n, dtype=torch.bool))
-    radii = seen[..., None].int().expand(-1, -1, 2) * 4
+def make_info(n: int, grads: Tensor | None = None):
+    means2d = torch.zeros(1, n, 2, requires_grad=True)
+    means2d.grad = torch.zeros(1, n, 2) if grads is None else grads[None]
     return {
         "means2d": means2d,
-        "radii": radii,
-        "width": width,
-        "height": height,
-        "n_cameras": cameras,
-        "dominant_counts": rows(counts, torch.zeros(cameras, n, dtype=torch.int64)),
+        "radii": torch.full((1, n, 2), 4, dtype=torch.int32),
+        "width": 64,
+        "height": 32,
+        "n_cameras": 1,
+        "dominant_counts": torch.zeros(1, n, dtype=torch.int64),
         "gaussian_ids": None,
     }
 
 
-def packed(info):
-    """The same statistics as rasterization(packed=True) reports them: visible rows only."""
-    cameras, ids = torch.nonzero((info["radii"] > 0).all(-1), as_tuple=True)
-    means2d = torch.zeros(len(ids), 2, requires_grad=True)
-    means2d.grad = info["means2d"].grad[cameras, ids]
-    return {**info, "means2d": means2d, "radii": info["radii"][cameras, ids], "gaussian_ids": ids.int()}
-
-
-def moments(optimizers, params, key):
-    state = optimizers[key].state[params[key]]
-    return state["exp_avg"], state["exp_avg_sq"], state["step"]
-
-
-def densified_at(strategy, params, optimizers, info, step: int, is_packed: bool = False, scene_scale: float = 1.0):
-    state = strategy.initialize_state(scene_scale, seed=3)
-    return strategy.step_post_backward(params, optimizers, state, step, info, packed=is_packed)
+def densified_at(strategy, params, optimizers, info, step: int):
+    state = strategy.initialize_state(1.0, seed=3)
+    return strategy.step_post_backward(params, optimizers, state, step, info)
 
 
 def test_gsplat_attribute_names_exist_with_gsplat_numbers():
@@ -204,9 +181,6 @@ def test_the_same_seed_splits_to_the_same_bits_and_another_does_not():
         means.append(params["means"].detach())
     assert torch.equal(means[0], means[1])
     assert not torch.equal(means[0], means[2])
-
-
-# What is POP's own: the blur rule and the prior.
 
 
 def test_a_trainer_that_leaves_out_the_prior_is_warned() -> None:
@@ -340,16 +314,10 @@ def tiny_method(folder: Any, method: str, **changes: Any) -> TrainConfig:
     return replace(base, strategy=strategy, **settings, **changes)
 
 
-def engine_or_skip(backend: str) -> None:
-    reason = get_backend(backend).why_not()
-    if reason is not None:
-        pytest.skip(reason)
-
-
 @pytest.mark.parametrize("backend", [pytest.param("fast", marks=pytest.mark.slow), "compiled"])
 @pytest.mark.parametrize("method", BASELINES)
 def test_a_run_that_is_stopped_anywhere_goes_on_to_the_same_bits(method: str, backend: str, tmp_path: Any) -> None:
-    engine_or_skip(backend)
+    skip_without(backend)
     config = tiny_method(tmp_path, method, backend=backend, checkpoint_every=1, keep_checkpoints=30)
     whole = TrainingRun(config, tiny_capture())
     assert np.isfinite(whole.run()["psnr"])

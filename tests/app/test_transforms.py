@@ -44,7 +44,6 @@ Edit = Callable[[dict[str, Any]], object]
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """A capture of four photographs that a test may change."""
     return transforms_capture(tmp_path)
 
 
@@ -69,7 +68,6 @@ def test_the_views_are_those_of_the_same_scene_by_colmap(tmp_path: Path, terms: 
 
 
 def K_of(root: Path, index: int = 0) -> list[float]:
-    """Read fx, fy, cx, cy of a view."""
     K = raw(root).views[index].K
     return [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
 

@@ -19,7 +19,6 @@ from tests.app.damage import contents, says, truncate
 
 @pytest.fixture(scope="session")
 def shared_vectors(made_once: Callable[..., Path]) -> Path:
-    """Vectors that tests only read."""
 
     def make(folder: Path) -> None:
         assert main(["vectors", "export", str(folder / "vectors")]) == 0
@@ -29,7 +28,6 @@ def shared_vectors(made_once: Callable[..., Path]) -> Path:
 
 @pytest.fixture
 def vectors(shared_vectors: Path, tmp_path: Path) -> Path:
-    """A copy of the vectors that a test may damage."""
     return Path(shutil.copytree(shared_vectors, tmp_path / "vectors"))
 
 

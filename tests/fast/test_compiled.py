@@ -120,7 +120,6 @@ def as_splats(drawn: Splats) -> Rows:
 
 
 def sums(functions: tuple[Callable, Callable, Callable], drawn: Splats, profile: Profile) -> dict[str, Tensor]:
-    """Take all sums of a view."""
     of_view = (as_splats(drawn), drawn.lists, WIDTH, HEIGHT, drawn.lists.tile_size)
     contributions, sensitivities, screen_moments = functions
     found = contributions(*of_view, PIXEL_MAP, profile)

@@ -354,6 +354,3 @@ def test_the_test_of_a_tile_allows_as_much_on_every_backend():
     sources = [header, *Path(tiles.__file__).parent.rglob("*.py"), *Path(compiled.__file__).parent.glob("*.h")]
     slacks = [path.name for path in sources if re.search(r"\bslack\b.*=", path.read_text())]
     assert sorted(slacks) == ["lists.h", "tiles.cuh", "tiles.py"]
-
-
-# A step of the blend, pixel by pixel: weights, the light that is left and the entries passed are the oracle's.

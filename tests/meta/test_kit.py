@@ -31,7 +31,7 @@ from pop_ref.activations import scales_from_log_scales
 from pop_ref.conformance import laws
 from pop_ref.conformance.adapter import OracleAdapter, View
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
-from pop_ref.conformance.backends import Absent, shipped, shipped_or_absent
+from pop_ref.conformance.backends import shipped
 from pop_ref.conformance.calls import Call, call_as_code
 from pop_ref.conformance.failure_report import failure_report
 from pop_ref.conformance.hypothesis_profiles import EXAMPLES
@@ -58,7 +58,7 @@ from pop_ref.constants import INRIA
 from pop_ref.covariance import covars_from_quats_scales
 from pop_ref.losses import l2
 from pop_ref.records import Camera, Gaussians
-from tests.judged import POISONED_INTEGER, poisoned_allocations
+from tests.judged import POISONED_INTEGER, here, poisoned_allocations
 
 ROOT = Path(__file__).resolve().parents[2]
 SEEN = settings(max_examples=200, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
@@ -186,9 +186,11 @@ def test_the_scorecard_counts_by_backend_and_stage(tmp_path: Path) -> None:
     assert "differs &lt;by&gt; 3" in page
 
 
+KIT = ("-q", "-p", "no:cacheprovider", "--pyargs", "pop_ref.conformance")
+
+
 def _kit(*options: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
-    command += ["--pyargs", "pop_ref.conformance", *options]
+    command = [sys.executable, "-m", "pytest", *KIT, *options]
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT / "docs")
 
 
@@ -226,28 +228,49 @@ def test_a_session_that_judges_nothing_is_left_alone(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--rasterizer", "no_such.module:f"), "no_such.module:f needs no_such, which is not installed"),
-        (("--rasterizer", "numpy"), "'numpy' must be written module:name, as my.module:rasterization"),
-        (("--rasterizer", "math:exp"), "math:exp draws nothing on cpu: a first small picture raises TypeError"),
-        (("--rasterizer", "math:exp", "--profile", "gsplat_2"), "profile 'gsplat_2' is unknown; use one of paper"),
-        (("--adapter", "pathlib:Path"), "pathlib:Path makes no adapter: it has no dtype"),
-        (("--backend", "gsplt"), "backend 'gsplt' is unknown; use one of oracle, fast64"),
-        (("--scorecard", "card.txt"), "scorecard card.txt must end in .json or .html"),
-        (("--stage", "order"), "invalid choice: 'order' (choose from"),
-        (("--strategy", "nowhere.at_all:Strategy"), "needs nowhere, which is not installed"),
-        (("--strategy", "math:Strategy"), "module math has no function Strategy"),
-        (("--strategy", "math"), "must be written module:name"),
-    ],
-    ids=lambda value: value[1] if isinstance(value, tuple) else None,
-)
-def test_the_kit_refuses_what_it_cannot_judge(words: tuple[str, ...], said: str) -> None:
-    done = _kit(*words, "-k", "grid")
-    assert done.returncode == 4, done.stdout + done.stderr
-    assert said in done.stdout + done.stderr
-    assert len((done.stdout + done.stderr).strip().splitlines()) < 8
+# a run of the kit for each, in one process
+REFUSING = """
+import contextlib, io, json, sys
+import pytest
+told = []
+for words in json.loads(sys.argv[1]):
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text):
+        status = pytest.main(words)
+    told.append((status, text.getvalue()))
+print(json.dumps(told))
+"""
+
+
+REFUSED = {
+    ("--rasterizer", "no_such.module:f"): "no_such.module:f needs no_such, which is not installed",
+    ("--rasterizer", "numpy"): "'numpy' must be written module:name, as my.module:rasterization",
+    ("--rasterizer", "math:exp"): "math:exp draws nothing on cpu: a first small picture raises TypeError",
+    ("--rasterizer", "math:exp", "--profile", "gsplat_2"): "profile 'gsplat_2' is unknown; use one of paper",
+    ("--adapter", "pathlib:Path"): "pathlib:Path makes no adapter: it has no dtype",
+    ("--backend", "gsplt"): "backend 'gsplt' is unknown; use one of oracle, fast64",
+    ("--scorecard", "card.txt"): "scorecard card.txt must end in .json or .html",
+    ("--stage", "order"): "invalid choice: 'order' (choose from",
+    ("--strategy", "nowhere.at_all:Strategy"): "needs nowhere, which is not installed",
+    ("--strategy", "math:Strategy"): "module math has no function Strategy",
+    ("--strategy", "math"): "must be written module:name",
+}
+
+
+@pytest.fixture(scope="module")
+def refusals() -> dict[tuple[str, ...], tuple[int, str]]:
+    words = json.dumps([[*KIT, *words, "-k", "grid"] for words in REFUSED])
+    done = subprocess.run([sys.executable, "-c", REFUSING, words], capture_output=True, text=True, cwd=ROOT / "docs")
+    assert done.returncode == 0, done.stderr
+    return dict(zip(REFUSED, json.loads(done.stdout), strict=True))
+
+
+@pytest.mark.parametrize("words", REFUSED, ids=" ".join)
+def test_the_kit_refuses_what_it_cannot_judge(refusals, words):
+    status, text = refusals[words]
+    assert status == 4, text
+    assert REFUSED[words] in text
+    assert len(text.strip().splitlines()) < 8
 
 
 def test_a_backend_that_is_not_here_is_skipped_with_the_reason(tmp_path: Path) -> None:
@@ -356,9 +379,7 @@ def test_who_has_gsplat_and_nothing_else_reads_first_what_is_judged_and_what_is_
 
 def _obeys_on(name: str, law: str, gaussians: Gaussians, K: Any, tile_size: int) -> None:
     """Hold a backend to a law on a scene of 4 x 4 pixels that a camera at the origin sees."""
-    backend = shipped_or_absent(name)
-    if isinstance(backend, Absent):
-        pytest.skip(backend.reason)
+    backend = here(name)
     scene = Scene(gaussians, Camera(np.eye(4), np.array(K), 4, 4), tile_size=tile_size)
     sentence = law_named(law).sentence
     settings(max_examples=1, database=None)(given(scene=st.just(scene))(lambda scene: sentence(backend, scene=scene)))()

@@ -55,7 +55,6 @@ _OFF = ((42, -0.01), (43, 0.01))
 
 
 def judged(id: str, results: list[Result], scale: str = "small") -> Claim:
-    """Judge one claim."""
     return next(claim for claim in claims(scale, results) if claim.id == id)
 
 
@@ -480,12 +479,10 @@ RESET = next(question for question in questions(paper()) if question.id == "rese
 
 
 def runs(row: str, *psnr: float, scene: str = "fox", n: int = 1000) -> list[Result]:
-    """Make the runs of a row, a seed each."""
     return [whole(row, scene, seed=seed, n=n, psnr=value) for seed, value in zip(count(42), psnr, strict=False)]
 
 
 def compared(pop: list[Result], reset: list[Result], more: Sequence[Result] = ()) -> Comparison:
-    """Compare PSNR of two rows on fox."""
     found = compare(
         "PSNR", groups([*pop, *reset])["fox"], noise_of([*pop, *reset, *more]), PSNR, {"pop": 1.0, "reset": -1.0},
         "at least",
