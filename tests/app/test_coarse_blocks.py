@@ -113,7 +113,7 @@ def test_a_run_that_was_interrupted_goes_on_to_the_same_bits(train: Train, share
     assert_same(load_splat(tmp_path / "out").params, load_splat(shared_coarse).params)
 
 
-def test_parts_are_done_by_name_and_a_run_without_a_coarse_model_has_none(pop: Pop, shared_coarse, train: Train):
+def test_parts_are_done_by_name_and_a_run_without_a_coarse_model_has_none(pop, shared_coarse):
     job = read_job(shared_coarse)
     assert [part.name for part in parts_of(job)][:3] == ["block_coarse", "round_0_merge", "round_1_block_0_0"]
     assert f"its blocks are {COARSE}, 0_0, 1_0" in pop("blocks", "train", shared_coarse, "7_7").err

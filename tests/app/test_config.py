@@ -58,28 +58,18 @@ from tests.app.tiny import interrupt, tiny_capture
 
 def test_the_defaults_are_the_papers_schedule():
     config = TrainConfig()
-    assert (config.max_steps, config.sh_degree, config.sh_interval, config.test_every) == (30_000, 3, 1000, 8)
-    assert (config.factor, config.strategy.blur_min_pixels) == (1, 0.0)
-    plan, lr = config.strategy, config.lr
-    assert (plan.pop_start_iter, plan.pop_stop_iter, plan.lambda_pop) == (0, 15_000, 1e-3)
-    assert (plan.blur_start_iter, plan.blur_stop_iter, plan.theta_blur) == (3000, 7000, 2e-5)
+    assert_trains(config, RECIPES["POP"])
+    assert (config.max_steps, config.sh_degree, config.test_every, config.factor) == (30_000, 3, 8, 1)
     assert config.objective_at(29_999) == Objective(pixelwise="l2", lambda_ssim=0.01, padding="valid")
-    assert (lr.means, lr.means_decay, lr.scales, lr.quats, lr.opacities) == (1.6e-4, 0.01, 5e-3, 1e-3, 5e-2)
-    assert (lr.sh0, lr.sh_rest) == (2.5e-3, 1.25e-4)
     for same in (TrainConfig.of(), TrainConfig.of(preset="paper")):
         assert replace(same, given=None) == config
 
 
 def test_the_controls_are_two_methods_with_constants_of_their_own():
     gsplat, inria = TrainConfig.of(method="gsplat"), TrainConfig.of(method="3dgs")
-    for control in (gsplat, inria):
-        assert (control.objective_at(0).pixelwise, control.objective_at(0).lambda_ssim) == ("l1", 0.2)
-        assert (control.strategy.reset_every, control.strategy.lambda_pop) == (3000, 0.0)
+    for control, name in ((gsplat, "gsplat"), (inria, "3DGS")):
+        assert_trains(control, RECIPES[name])
     assert (gsplat.method, inria.method, TrainConfig().method) == ("gsplat", "3dgs", "pop")
-    assert (gsplat.lr.opacities, inria.lr.opacities) == (0.05, 0.025)
-    assert (gsplat.ssim_padding, inria.ssim_padding) == ("valid", "same")
-    assert (gsplat.strategy.inclusive, inria.strategy.inclusive) == (False, True)
-    assert (gsplat.profile, inria.profile) == ("paper", "inria")
     assert TrainConfig.of(method="adc") == gsplat
     said = TrainConfig.of(method="gsplat", photometric="l2", lambda_ssim=0.05)
     assert said.objective_at(0) == Objective(pixelwise="l2", lambda_ssim=0.05)

@@ -306,13 +306,13 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 REFUSED: dict[str, tuple[str, tuple[str, ...]]] = {
-    "no such path": ("render splat.ply --out o --path spiral", ("spiral", "orbit")),
-    "no frames": ("render splat.ply --out o --path orbit --frames 0", ("--frames 1",)),
+    "no such path": ("render splat.ply --out o --path spiral", ("spiral", "one of views, orbit, ellipse, interpolate")),
+    "no frames": ("render splat.ply --out o --path orbit --frames 0", ("frames is 0; give --frames 1 or more",)),
     "pictures where somebody's files are": ("render splat.ply --out folder --overwrite", ("folder", "thesis.txt")),
     "pictures where a folder is": ("render splat.ply --out folder", ("folder", "thesis.txt")),
     "pictures where a file is": ("render splat.ply --out file", ("file", "in the way")),
     "pictures under a file": ("render splat.ply --out file/o", ("file/o", "is a file")),
-    "a video of no kind": ("render splat.ply --video o.gif", ("o.gif", ".webm")),
+    "a video of no kind": ("render splat.ply --video o.gif", ("o.gif", "must end in .webm, .mp4, .avi")),
     "a video under a file": ("render splat.ply --video file/o.webm", ("file/o.webm", "is a file")),
     "numbers where a folder is": ("eval splat.ply --capture photos --json folder", ("folder", "in the way")),
     "numbers under a file": ("eval splat.ply --capture photos --json file/o.json", ("file/o.json", "is a file")),

@@ -419,7 +419,7 @@ def test_a_scene_other_than_published_is_refused(root: Path, monkeypatch, what: 
     assert says in found.reason
 
 
-def test_a_capture_with_a_split_of_its_own_is_refused(root: Path, monkeypatch):
+def test_a_capture_with_a_split_of_its_own_is_refused(root: Path):
     job = job_named("pop", "bonsai", "paper")
     config = job.config()
     capture = load_capture(root / "360_v2" / "bonsai", images="images_2")

@@ -150,7 +150,7 @@ def test_a_row_that_was_interrupted_ends_with_the_same_result(made, tmp_path):
     assert values(again) == values(made[1])
 
 
-def test_what_was_asked_to_be_kept_is_kept(made, tmp_path):
+def test_what_was_asked_to_be_kept_is_kept(tmp_path):
     how = options(tmp_path, keep_ply=True, keep_checkpoints=True)
     job = toy("l1_div_10", steps_scaler=0.002)
     result = train_row(job, how)
@@ -200,7 +200,7 @@ def test_a_result_whose_row_has_changed_is_refused_and_new_settings_are_not(made
     assert read(path) == (other,)
 
 
-def test_a_row_that_another_process_trains_is_left_to_it(made, tmp_path):
+def test_a_row_that_another_process_trains_is_left_to_it(tmp_path):
     job, how = toy("l2"), options(tmp_path)
     with (
         only_one(job.work(how.work).with_suffix(".lock"), "taken"),
