@@ -89,18 +89,15 @@ class Browser:
         self.show(f"{page.as_uri()}{fragment}", width, height)
 
     def show(self, url: str, width: int, height: int) -> None:
-        """Show an address in a window of this size, px."""
         metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self.call("Emulation.setDeviceMetricsOverride", **metrics)
         self.call("Page.navigate", url="about:blank")
         self.call("Page.navigate", url=url)
 
     def value(self, expression: str) -> Any:
-        """Evaluate an expression in the page."""
         return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
 
     def wait_for(self, expression: str) -> None:
-        """Wait until an expression is true in the page."""
         until = time.monotonic() + _PATIENCE
         while not self.value(expression):
             assert time.monotonic() < until, (self.errors, self.value("document.body.innerText"))
@@ -110,7 +107,6 @@ class Browser:
         """Return what the window shows. uint8 RGB [H, W, 3]"""
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        assert image is not None
         return image[..., ::-1]
 
 

@@ -56,6 +56,14 @@ def judge_own_backends(metafunc: pytest.Metafunc) -> None:
     parametrize_backends(metafunc, [*everywhere, *concerned], dict.fromkeys(second, pytest.mark.slow))
 
 
+def here(name: str) -> Any:
+    """Return a shipped backend, or skip the test with the reason why it cannot run here."""
+    backend = shipped_or_absent(name)
+    if isinstance(backend, Absent):
+        pytest.skip(backend.reason)
+    return backend
+
+
 @functools.cache
 def own_backends() -> tuple[list[Any], list[Any]]:
     """Return the adapters of what is judged everywhere, and of the compiled stages.

@@ -106,7 +106,6 @@ def make_model(
 def write_model(
     folder: Path, names: Sequence[str], viewmats: np.ndarray, *about: Any, binary: bool = True, **more: Any
 ) -> None:
-    """Write the COLMAP model that `make_model` makes."""
     model = make_model(names, viewmats, *about, **more)
     folder.mkdir(parents=True, exist_ok=True)
     model.write_binary(folder) if binary else model.write_text(folder)
@@ -146,7 +145,6 @@ def transforms_capture(root: Path, count: int = 4, **fields: Any) -> Path:
 
 
 def edit_transforms(root: Path, edit: Callable[[dict[str, Any]], object]) -> None:
-    """Change transforms.json in place."""
     path = root / "transforms.json"
     listing = json.loads(path.read_text())
     edit(listing)

@@ -91,7 +91,6 @@ class Drift:
 
 
 def drift_engine() -> Engine:
-    """Return an engine whose steps are `Drift`'s."""
     facts = {"gpu": "drift", "gpu_memory_bytes": 0}
     return Engine(
         "cuda",

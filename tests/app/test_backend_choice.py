@@ -298,9 +298,7 @@ def eight_gpus(monkeypatch: pytest.MonkeyPatch, with_gpu: None) -> list[int]:
     return chosen
 
 
-def test_gpus_that_are_left_idle_are_said_with_what_would_use_them(
-    pop: Pop, shared_capture: Path, tmp_path: Path, eight_gpus: list[int]
-) -> None:
+def test_gpus_that_are_left_idle_are_said_with_what_would_use_them(pop, shared_capture, tmp_path, eight_gpus):
     outcome = pop.done("train", shared_capture, "--out", tmp_path / "r", *TRAIN, "--skip-sizes")
     note = "note: 1 of 8 GPUs is used; torchrun --nproc-per-node 8 --no-python pop train ... --batch-size 8 uses all"
     assert f"\n{note}, for steps of 8 views\n" in outcome.out
@@ -328,9 +326,7 @@ def test_processes_use_as_many_gpus_as_they_are(tmp_path: Path, monkeypatch: pyt
         check_gpus(config, 16)
 
 
-def test_each_block_is_trained_on_a_gpu_of_its_own(
-    pop: Pop, shared_capture: Path, tmp_path: Path, eight_gpus: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_block_is_trained_on_a_gpu_of_its_own(pop, shared_capture, tmp_path, eight_gpus, monkeypatch):
     begun: list[list[str]] = []
     monkeypatch.setattr(jobs, "has_snakemake", lambda: True)
     monkeypatch.setattr(jobs, "_run", lambda words, quiet: begun.append(list(words)) or 0)
@@ -427,9 +423,7 @@ def compiler(folder: Path, script: str, monkeypatch: pytest.MonkeyPatch) -> None
 
 @pytest.mark.slow  # it compiles the kernels
 @needs_compiler
-def test_it_is_compiled_once_older_versions_go_and_a_run_that_has_it_loaded_goes_on_without(
-    fresh: Path, pop: Pop
-) -> None:
+def test_it_is_compiled_once_older_versions_go_and_a_run_that_has_it_loaded_goes_on_without(fresh, pop):
     assert "run `pop build-cpu`" in (compiled.why_not() or "")
     older = building.library_path().name.split("_")
     older[2] = "0123456789abcdef"
@@ -449,9 +443,7 @@ def test_it_is_compiled_once_older_versions_go_and_a_run_that_has_it_loaded_goes
 
 @pytest.mark.slow
 @needs_compiler
-def test_a_change_of_the_source_and_another_processor_ask_for_a_new_build_and_leave_the_first_ones(
-    fresh: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_change_of_the_source_and_another_processor_ask_for_a_new_build_and_leave_the_first_ones(fresh, monkeypatch):
     before = building.build()
     monkeypatch.setattr(building, "processor_features", lambda: "another one")
     building.library_path.cache_clear()
@@ -468,9 +460,7 @@ def test_a_change_of_the_source_and_another_processor_ask_for_a_new_build_and_le
 
 @needs_compiler
 @pytest.mark.slow  # it compiles
-def test_a_processor_that_nothing_is_known_of_gets_code_for_any(
-    fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_processor_that_nothing_is_known_of_gets_code_for_any(fresh, pop, monkeypatch):
     monkeypatch.setattr(building, "processor_features", lambda: None)
     building.library_path.cache_clear()
     outcome = pop.done("build-cpu", "--verbose")
@@ -494,9 +484,7 @@ V4 = f"{V3} avx512f avx512bw avx512cd avx512dq avx512vl"
         ("riscv64", "fp asimd", []),
     ],
 )
-def test_a_wheel_brings_the_highest_level_that_the_processor_has(
-    fresh: Path, monkeypatch: pytest.MonkeyPatch, machine: str, features: str, levels: list[str]
-) -> None:
+def test_a_wheel_brings_the_highest_level_that_the_processor_has(fresh, monkeypatch, machine, features, levels):
     monkeypatch.setattr(building.platform, "machine", lambda: machine)
     monkeypatch.setattr(building, "processor_features", lambda: f"{machine} flags : {features}")
     assert building.supported_levels() == levels
@@ -528,9 +516,7 @@ def test_a_library_that_no_longer_loads_is_compiled_again(fresh: Path, pop: Pop)
 
 
 @needs_compiler
-def test_the_compiler_that_is_asked_for_is_the_one_that_runs(
-    fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch, remembering: str
-) -> None:
+def test_the_compiler_that_is_asked_for_is_the_one_that_runs(fresh, pop, monkeypatch, remembering):
     monkeypatch.setenv("CXX", "clang++-of-tomorrow")
     outcome = pop("build-cpu")
     says(outcome, "CXX is 'clang++-of-tomorrow', which is not on this machine")
@@ -539,9 +525,7 @@ def test_the_compiler_that_is_asked_for_is_the_one_that_runs(
     assert outcome.out.split()[0].endswith("/env")
 
 
-def test_a_compiler_that_does_not_run_or_fails_is_named_and_leaves_nothing(
-    fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_compiler_that_does_not_run_or_fails_is_named_and_leaves_nothing(fresh, pop, monkeypatch):
     junk = fresh / "junk"
     junk.write_bytes(bytes(64))
     junk.chmod(0o755)
@@ -555,9 +539,7 @@ def test_a_compiler_that_does_not_run_or_fails_is_named_and_leaves_nothing(
     assert not list(fresh.glob("*.so"))
 
 
-def test_without_a_compiler_it_says_which_to_install(
-    fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_compiler_it_says_which_to_install(fresh, pop, monkeypatch, capsys):
     monkeypatch.delenv("CXX", raising=False)
     monkeypatch.setattr(building, "find_compiler", lambda: None)
     outcome = pop("build-cpu")
@@ -572,9 +554,7 @@ def test_without_a_compiler_it_says_which_to_install(
 
 
 @needs_compiler
-def test_a_compiler_that_does_not_know_the_processor_makes_code_for_any(
-    fresh: Path, pop: Pop, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_compiler_that_does_not_know_the_processor_makes_code_for_any(fresh, pop, monkeypatch):
     real = " ".join(find_compiler() or [])
     compiler(fresh, f'case "$*" in *=native*) echo "unknown value" >&2; exit 1;; esac; exec {real} "$@"', monkeypatch)
     outcome = pop.done("build-cpu", "--verbose")
@@ -606,9 +586,7 @@ def test_a_library_of_another_layout_is_refused(monkeypatch: pytest.MonkeyPatch)
         open_library.__wrapped__(str(building.library_path()))
 
 
-def test_auto_takes_it_where_it_is_and_says_how_to_get_it_where_it_is_not(
-    fresh: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_auto_takes_it_where_it_is_and_says_how_to_get_it_where_it_is_not(fresh, tmp_path, monkeypatch):
     chosen, line = choose_backend(tiny_config(tmp_path, backend="auto"))
     assert chosen.backend == "fast"
     assert line.startswith("backend fast (CPU): the CPU kernels are not compiled")

@@ -199,9 +199,7 @@ def counting() -> int:
     return len(re.findall("getppid", shown.stdout))
 
 
-def test_busy_processes_end_with_their_block_and_with_who_started_them(
-    script: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_busy_processes_end_with_their_block_and_with_who_started_them(script, monkeypatch):
     busy = script("processes")
     alone = subprocess.Popen([sys.executable, "-S", "-c", busy.LOOP, "0"])
     try:
@@ -385,9 +383,7 @@ def test_what_was_foretold_of_four_captures_came_within_thirty_percent() -> None
     assert "What was foretold came within 30 % on the four captures" in (ROOT / "docs" / "guide.md").read_text()
 
 
-def test_reports_of_captures_with_known_faults_say_what_is_known_and_the_table_marks_those_that_do_not(
-    script: Any,
-) -> None:
+def test_reports_of_captures_with_known_faults_say_what_is_known_and_the_table_marks_those_that_do_not(script):
     kinds = script("kinds")
     rows = json.loads((BENCHMARKS / "results" / "kinds.json").read_text(encoding="utf-8"))
     for name, kind in kinds.KINDS.items():

@@ -44,7 +44,7 @@ from pop_fast.train.views import ViewTensors
 from tests.app.captures import assert_one_line, write_photograph
 from tests.app.conftest import TRAIN, Outcome, Pop, done, wait_until
 from tests.app.damage import says
-from tests.app.tiny import interrupt, tiny_capture
+from tests.app.tiny import interrupt, skip_without, tiny_capture
 
 SETTINGS = (*TRAIN, "--skip-sizes", "--threads", "1")
 BLOCKS = ("--blocks", "2x1", "--blocks-rounds", "0", *SETTINGS)
@@ -83,7 +83,6 @@ def trained(made_once: Callable[..., Path], name: str, words: Sequence[object], 
 
 @pytest.fixture(scope="module")
 def shared_blocks(shared_capture: Path, made_once: Callable[..., Path]) -> Path:
-    """A run in two blocks that tests only read."""
     return trained(made_once, "blocks", [shared_capture, *BLOCKS])
 
 
@@ -95,13 +94,11 @@ def blocks(shared_blocks: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def shared_rounds(shared_capture: Path, made_once: Callable[..., Path]) -> Path:
-    """A run in two blocks and two rounds that tests only read."""
     return trained(made_once, "rounds", [shared_capture, *ROUNDS, *TWO_ROUNDS])
 
 
 @pytest.fixture
 def rounds(shared_rounds: Path, tmp_path: Path) -> Path:
-    """A copy of the run in rounds that a test may change."""
     return Path(shutil.copytree(shared_rounds, tmp_path / "rounds"))
 
 
@@ -131,7 +128,6 @@ def written(folder: Path) -> dict[str, int]:
 
 def test_the_merged_splat_is_what_each_block_has_in_its_core_and_nothing_twice(shared_blocks):
     merged, plan = splats(shared_blocks), read_plan(shared_blocks)
-    assert plan is not None
     partition, entries = plan
     whole = partition.block_of(merged["means"].double().numpy())
     assert np.array_equal(whole, np.sort(whole))
@@ -158,7 +154,6 @@ def test_statistics_are_those_of_the_whole_and_name_what_each_block_took(shared_
 
 def test_a_block_is_trained_on_its_own_views_and_points_in_the_frame_of_the_whole(shared_blocks, shared_capture):
     whole, plan = load_capture(shared_capture), read_plan(shared_blocks)
-    assert plan is not None
     by_name = {view.name: view for view in whole.views}
     for entry in plan[1]:
         block = load_capture(shared_blocks / "blocks" / entry["name"])
@@ -193,9 +188,7 @@ def test_what_is_finished_is_not_done_again_and_overwriting_begins_anew(train: T
     assert not (blocks / "blocks" / "litter").exists()
 
 
-def test_a_block_that_was_interrupted_goes_on_to_the_same_bits(
-    pop: Pop, train: Train, shared_blocks, tmp_path, monkeypatch
-):
+def test_a_block_that_was_interrupted_goes_on_to_the_same_bits(pop, train, shared_blocks, tmp_path, monkeypatch):
     folder, words = tmp_path / "out", (*BLOCKS, "--checkpoint-every", "5")
     with monkeypatch.context() as patch:
         interrupt(patch, at=11)
@@ -209,11 +202,9 @@ def test_a_block_that_was_interrupted_goes_on_to_the_same_bits(
 
 
 def test_a_run_of_the_native_step_goes_on_with_other_threads_to_the_same_bits(
-    train: Train, shared_blocks, tmp_path, monkeypatch
+    train, shared_blocks, tmp_path, monkeypatch
 ):
-    reason = get_backend("compiled").why_not()
-    if reason is not None:
-        pytest.skip(reason)
+    skip_without("compiled")
     folder = tmp_path / "out"
     with monkeypatch.context() as patch:
         interrupt(patch, at=11)
@@ -544,7 +535,6 @@ def test_views_that_show_nothing_of_a_core_are_not_drawn(rounds):
 
 def test_the_merge_takes_a_share_of_what_every_block_has_changed(shared_rounds):
     halves, plan = [], read_plan(shared_rounds)
-    assert plan is not None
     for number, name in enumerate(NAMES):
         before = core(shared_rounds, 1, name)
         after = load_splat(shared_rounds / "blocks" / "round_2" / name / "result").params
@@ -616,9 +606,7 @@ def by_parts(pop: Pop, folder: Path) -> None:
     assert (folder / "blocks" / "merged").is_file()
 
 
-def test_parts_can_be_done_one_by_one_and_a_core_without_gaussians_has_nothing_to_train(
-    pop: Pop, rounds, shared_rounds
-):
+def test_parts_can_be_done_one_by_one_and_a_core_without_gaussians_has_nothing_to_train(pop, rounds, shared_rounds):
     by_parts(pop, rounds)
     assert_same(load_splat(rounds).params, merged(shared_rounds, 2))
     none = {key: value[:0] for key, value in core(rounds, 1, "1_0").items()}
@@ -666,7 +654,6 @@ def test_the_steps_of_a_round_are_a_tenth_unless_they_are_said(train: Train, tmp
     monkeypatch.setattr(jobs, "_run", lambda words, quiet: 0)
     done(train(*ROUNDS))
     job = read_job(tmp_path / "out")
-    assert job is not None
     assert job.rounds > 0
     assert job.round_steps == 3
 
@@ -697,14 +684,11 @@ def begun(shared_capture: Path, made_once: Callable[..., Path]) -> Path:
 
 @pytest.fixture
 def divided(begun: Path, tmp_path: Path) -> Path:
-    """A copy of it that a test may change."""
     return Path(shutil.copytree(begun, tmp_path / "copy"))
 
 
 def workflow(folder: Path, scratch: Path, profile: Path | None = None) -> str:
-    """Ask the workflow what it would do."""
     job = read_job(folder)
-    assert job is not None
     command = jobs.workflow_words(folder, job, 1, 1, "compiled", profile, "-n")
     environment = {**os.environ, "HOME": str(scratch), "XDG_CACHE_HOME": str(scratch / "cache")}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)

@@ -45,7 +45,6 @@ K = np.array([[PINHOLE[0], 0.0, PINHOLE[2]], [0.0, PINHOLE[1], PINHOLE[3]], [0.0
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """A capture of four photographs that a test may change."""
     return colmap_capture(tmp_path / "scene")
 
 
@@ -57,7 +56,6 @@ def text(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A capture that tests only read, or repair."""
     return colmap_capture(tmp_path_factory.mktemp("shared"))
 
 
@@ -126,9 +124,6 @@ def test_the_model_is_found_wherever_programs_put_it(root: Path, place: str) -> 
     assert len(raw(root).views) == 4
 
 
-# Photographs are paired by name.
-
-
 @pytest.mark.parametrize("listed", [["left/a 1.png", "left/b.png", "right/a 1.png"], ["images/0.png", "images/1.png"]])
 def test_subfolders_and_spaces_in_names_are_kept(tmp_path: Path, listed: list[str]) -> None:
     root = colmap_capture(tmp_path, names=listed)
@@ -193,9 +188,6 @@ def test_photographs_that_lie_in_another_folder_than_listed_are_found_by_name(tm
     (problem,) = [found for found in look_over(root) if "are absent" in found.text]
     assert problem.text.endswith(asked)
     assert shows(raw(root, images=folder), 0, 1, 2, 3)
-
-
-# Sizes of every kind.
 
 
 @given(factor=st.integers(1, 12))
@@ -519,15 +511,11 @@ def test_a_model_file_cut_anywhere_or_with_more_than_it_says_is_named(file: str,
         ("images.bin", 72, b"\xfc", ("image 1", "\\xfc", "not UTF-8")),
     ],
 )
-def test_a_wrong_field_is_named_in_binary(
-    shared: Path, file: str, offset: int, value: bytes, words: tuple[str, ...]
-) -> None:
+def test_a_wrong_field_is_named_in_binary(shared, file, offset, value, words):
     refused(shared, file, lambda data: data[:offset] + value + data[offset + len(value) :], *words)
 
 
 # COLMAP models in text, which people write by hand: what is wrong is named by file, line and field.
-
-FAR_ID = f"{2**32} SIMPLE_RADIAL 40 30 36 20 15 0"
 
 
 @pytest.mark.parametrize(
@@ -659,8 +647,8 @@ def color_errors(capture: Capture) -> list[float]:
     ],
 )
 def test_a_real_capture_is_loaded_whole_and_its_points_project_onto_their_colours(
-    name: str, factor: int, views: int, size: tuple[int, int], points: int, tests: int
-) -> None:
+    name, factor, views, size, points, tests
+):
     capture = load_capture(real(name), factor=factor)
     assert len(capture.views) == views
     assert len(capture.test_views()) == tests

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import re
 import shutil
 import sys
 from collections.abc import Callable, Iterator
@@ -24,7 +25,7 @@ from pop_fast.train import checkpoint as ckpt
 from tests.app.conftest import Pop, in_a_child, pop_in_a_child
 from tests.app.damage import FORGED, INF, Content, contents, forge, latest, says, to
 from tests.app.drift import drift_engine
-from tests.app.tiny import assert_same_run, tiny_capture, tiny_config
+from tests.app.tiny import tiny_capture, tiny_config
 
 
 def resume(folder, capture=None, **changes):
@@ -127,16 +128,6 @@ def test_a_checkpoint_cannot_run_code(tmp_path):
     assert not (tmp_path / "boom").exists()
 
 
-def test_a_failed_write_leaves_the_old_checkpoint(tmp_path):
-    path = tmp_path / "ckpts" / "ckpt_1_rank0.pt"
-    ckpt.save_checkpoint(path, {"a": torch.ones(3)})
-    before = path.read_bytes()
-    with pytest.raises(Exception, match="pickle"):
-        ckpt.save_checkpoint(path, {"a": lambda: 0})
-    assert path.read_bytes() == before
-    assert [p.name for p in path.parent.iterdir()] == [path.name]
-
-
 SAVE_UNDER_LIMITS = """
 import resource, signal, sys
 from pathlib import Path
@@ -206,7 +197,6 @@ def test_processor_time_goes_on_from_a_checkpoint_and_is_not_told_where_a_part_w
 
 @pytest.fixture
 def forged(stopped: Path, tmp_path: Path) -> Path:
-    """A copy of the run that a test may damage."""
     return Path(shutil.copytree(stopped, tmp_path / "run"))
 
 
@@ -235,7 +225,8 @@ def test_what_no_run_can_have_written_is_refused_and_named(case: str, forged: Pa
     if "metrics.jsonl" not in message:
         assert message.startswith(f"{latest(forged)}: ")
     if not message.endswith("reads format 1") and "metrics.jsonl" not in message:
-        assert "continue from" in message
+        where = r"remove it to continue from ckpt_4_rank0\.pt|remove the file to continue from the one before it"
+        assert re.search(where, message), message
     assert contents(forged) == before
 
 
@@ -285,16 +276,6 @@ def test_what_a_run_can_come_to_is_accepted(forged: Path) -> None:
     assert all(value.is_contiguous() for value in content["splats"].values())
     resume(forged)
     assert ckpt.list_checkpoints(forged)[-1][0] == 29
-
-
-def test_going_on_from_the_checkpoint_before_ends_in_the_same_bits(forged: Path, tmp_path: Path) -> None:
-    forge(forged, FORGED["m of another shape"][0])
-    with pytest.raises(PopError, match=r"remove it to continue from ckpt_4_rank0\.pt"):
-        ckpt.load_checkpoint(latest(forged))
-    latest(forged).unlink()
-    resume(forged)
-    TrainingRun(tiny_config(tmp_path / "whole"), tiny_capture()).run()
-    assert_same_run(forged, tmp_path / "whole")
 
 
 def test_pop_train_refuses_a_moment_of_another_shape_and_lives(result: Path, shared_capture: Path) -> None:

@@ -50,9 +50,7 @@ def test_every_subcommand_explains_itself(pop: Pop, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["train", "eval", "render", "view", "explain", "export", "compare", "convert", "sfm"])
-def test_no_line_of_help_breaks_off_where_the_window_has_room(
-    pop: Pop, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+def test_no_line_of_help_breaks_off_where_the_window_has_room(pop, monkeypatch, name):
     monkeypatch.setenv("COLUMNS", "1500")
     about = re.findall(r"^│? {6,}(\S.*?) *│?$", pop.done(name, "--help").out, re.MULTILINE)
     assert about
@@ -82,9 +80,7 @@ def test_help_shows_what_matters_first_and_help_all_all(pop: Pop) -> None:
         ("train x --no-such-option", ""),
     ],
 )
-def test_bad_usage_has_status_two_and_an_unknown_subcommand_suggests_the_nearest(
-    pop: Pop, words: str, hint: str
-) -> None:
+def test_bad_usage_has_status_two_and_an_unknown_subcommand_suggests_the_nearest(pop, words, hint):
     outcome = pop(*words.split())
     assert outcome.status == 2
     assert hint in outcome.err
@@ -113,8 +109,8 @@ STATS = "stats/val_step0029.json"
 
 
 def test_a_bare_folder_of_photographs_is_placed_then_trained_on_and_the_end_is_told(
-    pop: Pop, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    pop, capture, tmp_path, monkeypatch
+):
     (capture / "sparse").rename(tmp_path / "sparse")
 
     def placed(photos: Path, root: Path, **_: Any) -> SfmResult:
@@ -129,9 +125,7 @@ def test_a_bare_folder_of_photographs_is_placed_then_trained_on_and_the_end_is_t
     assert f"report: {tmp_path / 'r' / 'report.html'}" in outcome.out
 
 
-def test_ctrl_c_says_how_to_go_on_and_exits_with_130(
-    pop: Pop, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_ctrl_c_says_how_to_go_on_and_exits_with_130(pop, shared_capture, tmp_path, monkeypatch):
     for at, said in (
         (10, "stopped after step 10; the same command with --resume continues from step 7"),
         (0, "stopped before the first step; nothing was written"),
@@ -142,9 +136,7 @@ def test_ctrl_c_says_how_to_go_on_and_exits_with_130(
     assert not (tmp_path / "0").exists()
 
 
-def test_eval_repeats_the_numbers_of_training(
-    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path
-) -> None:
+def test_eval_repeats_the_numbers_of_training(pop, shared_result, shared_capture, tmp_path):
     written = tmp_path / "e.json"
     outcome = pop.done("eval", shared_result / "ckpts" / "ckpt_29_rank0.pt", "--json", written, "--per-view")
     trained, measured = (json.loads(path.read_text()) for path in (shared_result / STATS, written))
@@ -189,7 +181,6 @@ def test_photographs_of_full_size_are_told_what_they_cost() -> None:
     view = View("a.jpg", image, np.eye(4), np.eye(3))
     large = Capture("large", (view, replace(view, name="b.jpg")), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), "")
     told = about_large(large, TrainConfig())
-    assert told is not None
     assert "4000x3000 px" in told
     assert "--factor 3 takes about 1/9 of the time, at 1333x1000 px" in told
     small = replace(view, image=image[:1000, :1333])
@@ -202,9 +193,7 @@ def test_compare_puts_results_side_by_side(pop: Pop, shared_result: Path) -> Non
     assert pop("compare", shared_result, "--markdown").out.splitlines()[1].startswith("| --- | --- | ---: |")
 
 
-def test_a_file_is_measured_by_the_photographs_that_the_results_beside_it_were_trained_on(
-    pop: Pop, capture: Path, tmp_path: Path
-) -> None:
+def test_a_file_is_measured_by_the_photographs_that_the_results_beside_it_were_trained_on(pop, capture, tmp_path):
     run, lone = tmp_path / "run", tmp_path / "lone.ply"
     pop.done("train", capture, "--out", run, "--factor", "2", "--max-steps", "2", "--skip-checks", "--skip-sizes")
     pop.done("export", run, "--out", lone)
@@ -236,9 +225,7 @@ def raising(error: BaseException) -> Callable[..., Any]:
     return call
 
 
-def test_building_cuda_says_what_is_missing_first_and_the_compiler_s_words_apart(
-    pop: Pop, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_building_cuda_says_what_is_missing_first_and_the_compiler_s_words_apart(pop, monkeypatch):
     error = BuildError("compiling the CUDA extension failed; nvcc said:\nerror: expected a ;")
     monkeypatch.setattr("pop_fast.cli.build.build_cuda", raising(error))
     outcome = pop("build-cuda")
@@ -247,9 +234,7 @@ def test_building_cuda_says_what_is_missing_first_and_the_compiler_s_words_apart
     assert outcome.out == "error: expected a ;\n"
 
 
-def test_a_fault_of_the_program_keeps_its_traceback_and_ctrl_c_anywhere_exits_with_130(
-    pop: Pop, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fault_of_the_program_keeps_its_traceback_and_ctrl_c_anywhere_exits_with_130(pop, monkeypatch):
     monkeypatch.setattr("pop_fast.view.report.source.write_report", raising(ZeroDivisionError("a bug")))
     with pytest.raises(ZeroDivisionError):
         pop("report", ".")
@@ -268,8 +253,8 @@ def test_a_fault_of_the_program_keeps_its_traceback_and_ctrl_c_anywhere_exits_wi
     ids=repr,
 )
 def test_results_are_complete_before_the_report_and_whatever_becomes_of_it(
-    pop: Pop, shared_capture: Path, tmp_path: Path, fault: BaseException, status: int, words: str
-) -> None:
+    pop, shared_capture, tmp_path, fault, status, words
+):
     folder, found = tmp_path / "r", []
 
     def broken(result: Path) -> None:
@@ -403,9 +388,7 @@ def call(folder: Path, calls: list[tuple[str, list[str]]], before: str = "") -> 
     return done.stdout
 
 
-def test_the_planted_modules_run_where_python_takes_the_current_folder_and_no_child_is_started_so(
-    planted: tuple[Path, Path],
-) -> None:
+def test_the_planted_modules_run_where_python_takes_the_current_folder_and_no_child_is_started_so(planted):
     folder, marker = planted
     for command in (python_command("-c", "import pop_fast.cli"), module_command("pop_fast.cli", "-V")):
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
@@ -416,9 +399,7 @@ def test_the_planted_modules_run_where_python_takes_the_current_folder_and_no_ch
     assert {"cv2"} < set(marker.read_text().splitlines())
 
 
-def test_no_command_runs_a_module_of_the_current_folder(
-    planted: tuple[Path, Path], shared_capture: Path, shared_result: Path
-) -> None:
+def test_no_command_runs_a_module_of_the_current_folder(planted, shared_capture, shared_result):
     folder, marker = planted
     assert WORDS.keys() == COMMANDS.keys()
     assert REPRO_WORDS.keys() == REPRO_COMMANDS.keys()

@@ -34,7 +34,6 @@ def _one_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def shared_coarse(shared_capture: Path, made_once: Callable[..., Path]) -> Path:
-    """A run from a coarse model that tests only read."""
 
     def make(folder: Path) -> None:
         with pytest.MonkeyPatch.context() as patch:
@@ -70,7 +69,6 @@ def test_the_coarse_model_sees_all_photographs_smaller_through_the_low_pass_of_t
 def test_rounds_begin_with_the_coarse_model_divided_by_cores_and_nothing_is_lost(shared_coarse):
     coarse = load_splat(result_of(shared_coarse, COARSE)).params
     plan = read_plan(shared_coarse)
-    assert plan is not None
     core = torch.from_numpy(plan[0].block_of(coarse["means"].double().numpy()))
     divided = {key: torch.cat([value[core == number] for number in (0, 1)]) for key, value in coarse.items()}
     assert_same(cores(shared_coarse, 0), divided)
@@ -80,7 +78,6 @@ def test_rounds_begin_with_the_coarse_model_divided_by_cores_and_nothing_is_lost
 def test_blocks_are_not_trained_by_themselves_and_statistics_name_the_coarse_model(shared_coarse):
     assert not result_of(shared_coarse, "0_0").exists()
     stats = ResultFolder(shared_coarse).read_stats("val", read_config(shared_coarse).max_steps - 1)
-    assert stats is not None
     assert [row["name"] for row in stats["blocks"]] == [COARSE]
     assert [row["name"] for row in stats["rounds"][1]["blocks"]] == ["0_0", "1_0"]
     config = read_config(shared_coarse)
@@ -90,7 +87,6 @@ def test_blocks_are_not_trained_by_themselves_and_statistics_name_the_coarse_mod
 
 def test_rounds_after_a_coarse_model_have_higher_rates_which_fall(shared_coarse):
     config, job = read_config(shared_coarse), read_job(shared_coarse)
-    assert job is not None
     part = next(part for part in parts_of(job) if part.round == 1 and part.block)
     ours = round_config(shared_coarse, config, part, job).lr
     plain = round_config(shared_coarse, config, part, Job(blocks="2x1", rounds=2, round_steps=12)).lr
@@ -117,9 +113,8 @@ def test_a_run_that_was_interrupted_goes_on_to_the_same_bits(train: Train, share
     assert_same(load_splat(tmp_path / "out").params, load_splat(shared_coarse).params)
 
 
-def test_parts_are_done_by_name_and_a_run_without_a_coarse_model_has_none(pop: Pop, shared_coarse, train: Train):
+def test_parts_are_done_by_name_and_a_run_without_a_coarse_model_has_none(pop, shared_coarse):
     job = read_job(shared_coarse)
-    assert job is not None
     assert [part.name for part in parts_of(job)][:3] == ["block_coarse", "round_0_merge", "round_1_block_0_0"]
     assert f"its blocks are {COARSE}, 0_0, 1_0" in pop("blocks", "train", shared_coarse, "7_7").err
     assert parts_of(Job(blocks="2x1", rounds=1, round_steps=1))[0].block == "0_0"

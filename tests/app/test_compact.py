@@ -161,14 +161,11 @@ def test_bands_that_show_nothing_are_spent_before_gaussians_and_nothing_where_al
     assert all(torch.equal(found.params[key], value) for key, value in tuner.whole.items())
 
 
-# `pop export` with a budget.
-
-
 @pytest.mark.parametrize("share", [pytest.param(0.6, marks=pytest.mark.slow), 0.4])
 @pytest.mark.parametrize("name", typing.get_args(FormatName))
 def test_a_size_is_met_in_every_format_and_the_file_shows_what_was_told(
-    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path, name: str, share: float
-) -> None:
+    pop, shared_result, shared_capture, tmp_path, name, share
+):
     suffix = ".html" if name == "html" else FORMATS[name].suffix if name in FORMATS else ".ply"
     file = tmp_path / f"x{suffix}"
     words = ("export", shared_result, "--to", name, "--out", file)

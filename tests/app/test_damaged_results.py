@@ -75,9 +75,7 @@ DAMAGED: list[tuple[str, Damage, str, tuple[str, ...]]] = [
 
 
 @pytest.mark.parametrize(("file", "damage", "commands", "parts"), DAMAGED, ids=range(len(DAMAGED)))
-def test_a_file_of_a_result_that_is_damaged_is_named(
-    pop: Pop, result: Path, file: str, damage: Damage, commands: str, parts: tuple[str, ...]
-) -> None:
+def test_a_file_of_a_result_that_is_damaged_is_named(pop, result, file, damage, commands, parts):
     path = result / file
     path.write_bytes(damage(path.read_bytes()))
     last = str(len(path.read_bytes().splitlines()))
@@ -133,9 +131,6 @@ def test_an_array_of_another_form_is_named(pop: Pop, result: Path, stem: str, na
     says(pop("report", result), f"{path}: {name} ", "which no run writes")
 
 
-# Checkpoints, and a result without them.
-
-
 def at(index: tuple[int, ...], value: float) -> Callable[[torch.Tensor], torch.Tensor]:
     def change(tensor: torch.Tensor) -> torch.Tensor:
         changed = torch.zeros_like(tensor)
@@ -162,8 +157,8 @@ def at(index: tuple[int, ...], value: float) -> Callable[[torch.Tensor], torch.T
     ],
 )
 def test_every_defect_of_a_checkpoint_is_named_with_its_tensor_before_it_is_exported_or_drawn(
-    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path, name: str, change, parts
-) -> None:
+    pop, shared_result, shared_capture, tmp_path, name, change, parts
+):
     params: dict[str, Any] = load_ply(shared_result / "ply" / "point_cloud_29.ply")
     params[name] = change(params[name])
     path = tmp_path / "broken.pt"

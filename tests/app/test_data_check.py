@@ -54,7 +54,6 @@ def bare(tmp_path: Path, pictures: list[np.ndarray]) -> Path:
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """A capture of four photographs that a test may change."""
     return colmap_capture(tmp_path / "scene")
 
 
@@ -71,7 +70,6 @@ def check(pop: Pop) -> Check:
 
 
 def finding(lines: list[str], mark: str, about: str) -> str:
-    """Give the first finding of that mark and topic."""
     return next(line for line in lines if line.split()[:2] == [mark, about])
 
 
@@ -201,9 +199,6 @@ def test_tracks_that_colmap_refuses_are_told_with_the_models_folder(pop: Pop, tm
     assert pop("data", "check", HERE / "tracked").out.count("mean error") == 1
 
 
-# Photographs alone.
-
-
 def test_photographs_alone_are_looked_over(check: Check, bare: Path, tmp_path: Path) -> None:
     lines = check(bare)
     assert said(lines, "none yet, 8 photographs", "pop train finds", "8 of 160x120 px", "8 are few", "ready to train")
@@ -259,9 +254,7 @@ def test_exposures_and_lenses_that_differ_are_told(check: Check, tmp_path: Path,
     assert said(check(tmp_path), "1 has no focal length, first edited.jpg; where photographs were edited")
 
 
-def test_what_is_not_read_is_mentioned_and_a_damaged_photograph_stands_against_training(
-    check: Check, bare: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_not_read_is_mentioned_and_a_damaged_photograph_stands_against_training(check, bare, monkeypatch):
     monkeypatch.setattr(images, "can_read_heif", lambda: False)
     for name in ("a.HEIC", "b.MOV"):
         (bare / name).write_bytes(b"no JPEG")
@@ -285,8 +278,8 @@ HOPELESS = {
 
 @pytest.mark.parametrize("what", HOPELESS)
 def test_photographs_that_no_cameras_can_be_found_for_are_refused_by_check_and_training_alike(
-    pop: Pop, check: Check, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
-) -> None:
+    pop, check, tmp_path, monkeypatch, what
+):
     make, words = HOPELESS[what]
     for i in range(4):
         write_photograph(tmp_path / "photos" / f"{i}.png", make(i))
@@ -435,9 +428,6 @@ def test_data_check_says_what_training_will_do(check: Check, demo: Path, tmp_pat
     assert line.endswith("; lock the exposure, or train with --exposure")
 
 
-# `pop doctor`.
-
-
 def test_a_whole_install_is_found_whole(pop: Pop) -> None:
     out = pop.done("doctor").out
     for name in ("numpy", "torch", "pycolmap", "opencv-contrib-python-headless", "backend fast", "processor", "memory"):
@@ -449,9 +439,7 @@ def test_a_whole_install_is_found_whole(pop: Pop) -> None:
     ("missing", "words"),
     [(None, "ok       CUDA build"), ("nvcc", "nvcc was not found; install a CUDA toolkit"), ("cmake", "[cuda-build]")],
 )
-def test_what_building_the_cuda_extension_lacks_is_said(
-    pop: Pop, monkeypatch: pytest.MonkeyPatch, missing: str | None, words: str
-) -> None:
+def test_what_building_the_cuda_extension_lacks_is_said(pop, monkeypatch, missing, words):
     monkeypatch.setattr(build, "find_nvcc", lambda: None if missing == "nvcc" else "/opt/nvcc")
     monkeypatch.setattr(build, "_program", lambda name: None if name == missing else f"/bin/{name}")
     monkeypatch.setattr(build.importlib.util, "find_spec", lambda name: object())

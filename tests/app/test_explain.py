@@ -78,9 +78,7 @@ def test_the_oracle_on_a_few_gaussians_agrees_with_rasterization_of_all(changes:
     assert statuses == {"blended", "skipped", "stopped", "hidden", "clamped"}
 
 
-def test_weights_and_what_is_left_sum_to_one_and_rays_end_at_the_depth_of_who_stopped_them(
-    scene: ExplainedView,
-) -> None:
+def test_weights_and_what_is_left_sum_to_one_and_rays_end_at_the_depth_of_who_stopped_them(scene):
     depths, ended = termination_depths(scene), []
     for x, y in PIXELS:
         e = explain_pixel(scene, x, y)
@@ -125,7 +123,6 @@ def test_the_views_derivatives_are_those_of_the_loss_that_is_trained(scene: Expl
     with torch.enable_grad():
         image = rasterization(**given, **settings, sh_degree=3, backgrounds=scene.background[None])[0][0]
         prior = POPStrategy().regularizer(opacities, {"dominant_sum": None}, 0, {"dominant_counts": scene.counts[None]})
-        assert prior is not None
         (v,) = torch.autograd.grad(photometric_pop(image, target) + prior, opacities)
     rows = {row.id: row for x, y in PIXELS for row in explain_pixel(scene, x, y).rows}
     assert len(rows) > 60
@@ -210,7 +207,6 @@ def test_profiles_are_compared_over_the_view_and_the_oracle_over_the_tile(scene:
     assert parting.n_dominant == int((info["dominant_ids"] != scene.info["dominant_ids"]).sum())
     assert parting.largest == pytest.approx(float((inria - scene.image).abs().max()))
     assert parting.n_blended > 0
-    assert parting.flip is not None
     assert parting.maps[0].picture.shape == (VIEW.height, VIEW.width, 3)
     exact = difference(scene, "fast", "ref", 16, 12)
     assert exact.region == (16, 0, 16, 16)
@@ -222,7 +218,6 @@ def test_profiles_are_compared_over_the_view_and_the_oracle_over_the_tile(scene:
 
 @pytest.fixture
 def explain(pop: Pop, shared_result: Path) -> Callable[..., Outcome]:
-    """`pop explain` at one pixel of the tiny result."""
     return lambda *words, view="3": pop("explain", shared_result, "--view", view, "--pixel", "20,16", *words)
 
 
@@ -296,8 +291,8 @@ def test_a_pixel_is_explained_in_every_profile_and_its_view_may_be_named(explain
     ],
 )
 def test_bad_words_are_answered_by_one_line_that_names_field_and_fix(
-    pop: Pop, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, part: str
-) -> None:
+    pop, shared_result, tmp_path, monkeypatch, words, part
+):
     monkeypatch.chdir(tmp_path)
     says(pop("explain", shared_result, *words.split()), part)
 
@@ -324,9 +319,7 @@ def test_an_objective_is_the_papers_whatever_the_run_was_trained_with(equation: 
     assert all((row.v_opacity_pop == 0.0) == (name == "3dgs") for row in e.blended)
 
 
-def test_the_objective_of_the_command_line_changes_the_pull_and_not_the_picture(
-    explain: Callable[..., Outcome], tmp_path: Path
-) -> None:
+def test_the_objective_of_the_command_line_changes_the_pull_and_not_the_picture(explain, tmp_path):
     told = {}
     for objective in ("run", "pop", "3dgs"):
         plain, page = (tmp_path / f"{objective}.{kind}" for kind in ("json", "html"))
@@ -406,15 +399,12 @@ def fainter(gaussian: int, alpha: float, falloff: float) -> Change:
     return change
 
 
-def test_a_backend_that_skips_a_splat_is_shown_with_the_decision_that_flipped(
-    scene: ExplainedView, instead_of_cuda: Callable[[Change], None]
-) -> None:
+def test_a_backend_that_skips_a_splat_is_shown_with_the_decision_that_flipped(scene, instead_of_cuda):
     row, floor = explain_pixel(scene, 16, 12).blended[1], PAPER.alpha_floor
     instead_of_cuda(fainter(row.id, 0.999 * floor, row.falloff))
     found = difference(scene, "fast", "cuda", 16, 12)
     assert (found.names, found.at) == (("fast", "cuda"), (16, 12))
     assert found.region == (0, 0, VIEW.width, VIEW.height)
-    assert found.flip is not None
     assert (found.flip.decision, found.flip.gaussian) == ("D5", row.id)
     assert found.flip.first.startswith("blends it: alpha ")
     assert re.fullmatch(rf"skips it: alpha 0\.0039\d+, floor {floor:.9f}", found.flip.second)
@@ -422,9 +412,7 @@ def test_a_backend_that_skips_a_splat_is_shown_with_the_decision_that_flipped(
     assert found.largest > 0.0
 
 
-def test_a_backend_with_another_ceiling_parts_by_d6_and_the_worst_pixel_is_looked_up(
-    scene: ExplainedView, instead_of_cuda: Callable[[Change], None]
-) -> None:
+def test_a_backend_with_another_ceiling_parts_by_d6_and_the_worst_pixel_is_looked_up(scene, instead_of_cuda):
     instead_of_cuda(lambda given: {"profile": "gsplat_1_6"})
     image, info = scene.rasterized(torch.float32, get_backend("cuda"))
     sound, own = scene.rasterized(torch.float32, get_backend("fast"))
@@ -438,9 +426,7 @@ def test_a_backend_with_another_ceiling_parts_by_d6_and_the_worst_pixel_is_looke
     assert found.n_colors == int(((image - sound).abs().amax(dim=2) > 1.0 / 255.0).sum())
 
 
-def test_the_command_line_shows_where_two_backends_part(
-    explain: Callable[..., Outcome], tmp_path: Path, instead_of_cuda: Callable[[Change], None]
-) -> None:
+def test_the_command_line_shows_where_two_backends_part(explain, tmp_path, instead_of_cuda):
     assert explain("--json", tmp_path / "own.json").status == 0
     rows = json.loads((tmp_path / "own.json").read_text())["rows"]
     # away from its centre a splat may be too faint at the pixel and still be visible elsewhere

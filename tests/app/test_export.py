@@ -36,7 +36,6 @@ Said, Psnr = Callable[..., str], Callable[..., float]
 
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder that a test runs and writes in."""
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     return tmp_path / "here"
@@ -44,7 +43,6 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def export(pop: Pop, shared_result: Path) -> Said:
-    """Export the tiny result, and return what is said."""
     return lambda *words: pop.done("export", shared_result, *words).out
 
 
@@ -293,8 +291,8 @@ def test_sog_folders_and_ksplat_are_converted(pop: Pop, export: Said, psnr: Psnr
 
 
 def test_an_export_measures_as_its_run_moved_into_the_other_frame_and_back(
-    pop: Pop, export: Said, psnr: Psnr, own: Path, shared_result: Path, trained: Any
-) -> None:
+    pop, export, psnr, own, shared_result, trained
+):
     record = json.loads((shared_result / "capture.json").read_text())
     found = frame_of(own)
     assert found.name == "training"
@@ -312,8 +310,8 @@ def test_an_export_measures_as_its_run_moved_into_the_other_frame_and_back(
 
 
 def test_a_ply_that_says_nothing_is_taken_to_be_in_the_capture_s_frame_with_a_note(
-    pop: Pop, export: Said, psnr: Psnr, shared_capture: Path, trained: Any
-) -> None:
+    pop, export, psnr, shared_capture, trained
+):
     export("--out", "o.ply")
     save_ply("s.ply", load_ply("o.ply"))
     outcome = pop.done("eval", "s.ply", "--capture", shared_capture, "--json", "e.json")
@@ -327,9 +325,7 @@ def test_a_ply_that_says_nothing_is_taken_to_be_in_the_capture_s_frame_with_a_no
     assert frame_of(Path("t.ply")) is None
 
 
-def test_a_ply_of_a_trainer_that_moves_the_world_is_read_as_the_command_says(
-    pop: Pop, psnr: Psnr, shared_capture: Path, own: Path, trained: Any
-) -> None:
+def test_a_ply_of_a_trainer_that_moves_the_world_is_read_as_the_command_says(pop, psnr, shared_capture, own, trained):
     save_ply("s.ply", load_ply(own))
     about = ("--capture", shared_capture, "--training-frame")
     assert psnr("s.ply", "--training-frame") == trained
@@ -436,10 +432,14 @@ def test_an_export_shows_what_was_trained(pop: Pop, turned: Path, run: Path, nam
 
 
 @pytest.mark.parametrize("name", format_names())
-def test_a_conversion_shows_what_was_trained(pop: Pop, turned: Path, run: Path, name: str) -> None:
+def test_a_conversion_is_what_is_exported(pop: Pop, run: Path, name: str) -> None:
+    files = [Path(default_name(of, name)) for of in ("exported", "converted")]
+    pop.done("export", run, "--out", files[0], "--to", name)
     pop.done("export", run, "--out", "a.ply")
-    pop.done("convert", "a.ply", default_name("b", name), "--to", name)
-    assert_shows_the_same(pop, Path(default_name("b", name)), turned, run, name)
+    pop.done("convert", "a.ply", files[1], "--to", name)
+    exported, converted = map(load_splat_file, files)
+    assert (exported.frame, exported.antialiased) == (converted.frame, converted.antialiased)
+    assert all(torch.equal(exported.params[key], value) for key, value in converted.params.items())
 
 
 @pytest.mark.parametrize("name", ["splat", "sog"])

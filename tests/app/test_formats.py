@@ -244,9 +244,7 @@ def test_a_file_is_read_by_its_name_has_the_same_bytes_again_and_is_small(name: 
     kind=st.sampled_from(("capture", "training")),
 )
 @pytest.mark.parametrize("name", format_names())
-def test_a_file_says_the_frame_to_the_last_bit(
-    name: str, turn: np.ndarray, scale: float, move: np.ndarray, kind: Any
-) -> None:
+def test_a_file_says_the_frame_to_the_last_bit(name, turn, scale, move, kind):
     transform = np.eye(4)
     transform[:3, :3], transform[:3, 3] = scale * Rotation.from_rotvec(turn).as_matrix(), move
     for frame in (Frame(kind), Frame(kind, tuple(map(tuple, transform.tolist())))):

@@ -171,8 +171,8 @@ def test_nobody_else_gets_the_page(viewer: LiveViewer, path: str, headers: dict[
 
 
 def test_a_training_does_not_hear_of_hostile_clients_and_ends_with_the_same_bits(
-    pop: Pop, shared_capture: Path, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    pop, shared_capture, shared_result, tmp_path, monkeypatch
+):
     shared: list[str] = []
     for name in ("request_share_url", "disconnect_share_url"):
         monkeypatch.setattr(viser.ViserServer, name, lambda self, name=name: shared.append(name))
@@ -205,9 +205,7 @@ def test_a_training_does_not_hear_of_hostile_clients_and_ends_with_the_same_bits
         assert torch.equal(tensor, watched[name]), name
 
 
-def test_the_command_that_shows_a_splat_goes_on_after_hostile_clients(
-    pop: Pop, shared_result: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_that_shows_a_splat_goes_on_after_hostile_clients(pop, shared_result, monkeypatch):
     attacks: list[Attack] = []
 
     def wait(viewer: LiveViewer, *given: Any) -> None:
@@ -276,9 +274,7 @@ class Attack(threading.Thread):
             self.inside.append(Client(self.url))
 
 
-def test_an_error_in_a_view_closes_that_view_with_one_line(
-    viewer: LiveViewer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_error_in_a_view_closes_that_view_with_one_line(viewer, monkeypatch, capsys):
     def draw(state: Any) -> Any:
         if state.height == 31:
             raise RuntimeError("out of\nmemory")

@@ -19,7 +19,6 @@ from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
 from pop_fast.train.views import ViewTensors, render_view
 from pop_fast.view.html import PageCamera, camera_of_points, cameras_of, first_view, page_of, view_distances
 from tests.app.clouds import many
-from tests.app.conftest import Pop
 from tests.app.test_paths import walk
 from tests.app.tiny import look_at, tiny_capture
 from tests.browser import Browser, browser
@@ -80,9 +79,7 @@ def rendered(params: dict[str, torch.Tensor], view: ViewTensors, config: TrainCo
         (0, False, (0.0, 0.0, 0.0), "paper"),
     ],
 )
-def test_a_browser_draws_what_is_rendered(
-    tab: Browser, tmp_path: Path, bands: int, antialiased: bool, background: tuple, profile: str
-) -> None:
+def test_a_browser_draws_what_is_rendered(tab, tmp_path, bands, antialiased, background, profile):
     params, degree = many(1500, bands), (0, 3, 8, 15).index(bands)
     config = TrainConfig(antialiased=antialiased, background=background, profile=profile)
     views = [a_view(), a_view((3.0, 1.0, 4.0))]
@@ -100,9 +97,7 @@ def test_a_browser_draws_what_is_rendered(
     assert tab.errors == []
 
 
-def test_a_page_of_a_result_starts_at_a_training_camera_and_asks_for_nothing(
-    tab: Browser, pop: Pop, shared_result: Path, tmp_path: Path
-) -> None:
+def test_a_page_of_a_result_starts_at_a_training_camera_and_asks_for_nothing(tab, pop, shared_result, tmp_path):
     pop.done("export", shared_result, "--out", tmp_path / "x.html")
     tab.requests.clear()
     tab.open(tmp_path / "x.html", 40, 32, "#bare")

@@ -188,9 +188,7 @@ def test_a_recorded_path_is_rendered(pop: Pop, shared_result: Path, shown: Shown
     assert np.abs(first.astype(int) - scene.draw(state).image).max() <= 1
 
 
-def test_without_viser_one_line_says_how_to_get_it(
-    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_viser_one_line_says_how_to_get_it(pop, shared_result, shared_capture, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     for words in (("view", shared_result), ("train", shared_capture, "--out", tmp_path / "r", "--view")):
         says(pop(*words), "pip install 'viser>=1.1,<1.2'")
@@ -203,9 +201,7 @@ def test_a_port_that_cannot_be_is_refused(pop: Pop, shared_result: Path) -> None
 
 
 @pytest.mark.parametrize("lone", [False, True])
-def test_the_command_prints_its_address_serves_it_and_ends_with_ctrl_c(
-    pop: Pop, shared_result: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, lone: bool
-) -> None:
+def test_the_command_prints_its_address_serves_it_and_ends_with_ctrl_c(pop, shared_result, tmp_path, caplog, lone):
     pytest.importorskip("viser", reason="pip install 'viser>=1.1,<1.2'")
     from pop_fast.view.live.server import LiveViewer
 
@@ -269,9 +265,7 @@ def test_a_training_that_is_watched_has_the_same_bits_and_is_shown_as_it_is(tmp_
     assert not any(tensor.requires_grad for tensor in scene.params.values())
 
 
-def test_a_browser_shows_the_first_training_camera_and_moves_on(
-    shown: Shown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_browser_shows_the_first_training_camera_and_moves_on(shown, tmp_path, capsys):
     pytest.importorskip("viser", reason="pip install 'viser>=1.1,<1.2'")
     from pop_fast.view.live.server import LiveViewer
 
@@ -360,7 +354,6 @@ KEYS = {"ArrowRight": 39, "ArrowLeft": 37, "End": 35, "Home": 36}
 
 
 def click(tab: Any, name: str) -> None:
-    """Press the button of this name."""
     found = f"[...document.querySelectorAll('button, label')].find(b => b.innerText.trim() === {name!r})"
     tab.value(f"{found}.click()")
 

@@ -28,7 +28,7 @@ from pop_fast.density import DensificationStep, POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train import checkpoint as ckpt
-from tests.app.conftest import ROOT, TRAIN, Pop
+from tests.app.conftest import ROOT, TRAIN
 from tests.app.tiny import assert_same_run, records, run_until, tiny_capture, tiny_config
 from tests.fast.test_rasterization import cameras, scene
 
@@ -322,9 +322,7 @@ def test_a_registered_backend_is_known_by_its_name_and_draws_and_one_that_cannot
         backend.get_backend("broken")
 
 
-def test_a_name_that_nobody_registers_is_refused_before_anything_is_written(
-    installed: pytest.MonkeyPatch, pop: Pop, shared_capture: Path, tmp_path: Path
-) -> None:
+def test_a_name_that_nobody_registers_is_refused_before_anything_is_written(installed, pop, shared_capture, tmp_path):
     made = TrainConfig.of(backend="mine").to_json()
     installed.undo()
     BACKENDS.look_again()

@@ -43,7 +43,6 @@ from tests.app.damage import says
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """A capture of four photographs that a test may change."""
     return colmap_capture(tmp_path / "scene")
 
 

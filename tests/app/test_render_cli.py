@@ -38,11 +38,10 @@ from tests.app.captures import (
 from tests.app.conftest import Outcome, Pop
 from tests.app.damage import contents, says
 from tests.app.test_blocks import in_this_process
-from tests.app.test_strategies import engine_or_skip, tiny_method
-from tests.app.tiny import tiny_capture
+from tests.app.test_strategies import tiny_method
+from tests.app.tiny import skip_without, tiny_capture
 
 Render = Callable[..., Outcome]
-PATHS = "views, orbit, ellipse, interpolate"
 
 
 def read(path: Path) -> np.ndarray:
@@ -51,13 +50,10 @@ def read(path: Path) -> np.ndarray:
 
 @pytest.fixture
 def rendered(pop: Pop, shared_result: Path) -> Render:
-    """`pop render` of the tiny result."""
     return lambda *words: pop("render", shared_result, *words)
 
 
-def test_held_out_views_are_rendered_to_the_same_bytes_as_in_training(
-    rendered: Render, shared_result: Path, tmp_path: Path
-) -> None:
+def test_held_out_views_are_rendered_to_the_same_bytes_as_in_training(rendered, shared_result, tmp_path):
     assert "1 views of toy" in rendered("--out", tmp_path / "views").out
     assert sorted(os.listdir(tmp_path / "views")) == ["renders.json", "view_000.png"]
     kept = np.load(shared_result / "report_data" / "val_step29_0000.npz")
@@ -65,9 +61,7 @@ def test_held_out_views_are_rendered_to_the_same_bytes_as_in_training(
 
 
 @pytest.mark.parametrize("path", ["orbit", "ellipse", "interpolate"])
-def test_a_path_gives_as_many_pictures_and_frames_as_asked(
-    rendered: Render, shared_result: Path, tmp_path: Path, path: str
-) -> None:
+def test_a_path_gives_as_many_pictures_and_frames_as_asked(rendered, shared_result, tmp_path, path):
     words = ["--path", path, "--frames", "3", "--out", tmp_path / "frames", "--video", tmp_path / "clip.webm"]
     assert rendered(*words).status == 0
     pictures = sorted((tmp_path / "frames").glob("*.png"))
@@ -89,20 +83,15 @@ def test_a_path_gives_as_many_pictures_and_frames_as_asked(
     ("words", "part"),
     [
         ("", "give --out DIR for pictures, --video FILE"),
-        ("--video clip.gif", "must end in .webm, .mp4, .avi"),
         ("--video clip.webm --fps 0", "clip.webm: fps is 0.0; it must be a number from 0.5 to 600"),
         ("--video clip.webm --fps nan", "clip.webm: fps is nan; it must be a number from 0.5 to 600"),
         ("--out r --video r/clip.webm", "r/clip.webm: lies in --out r, which holds pictures only"),
-        ("--out r --path orbit --frames 0", "frames is 0; give --frames 1 or more"),
         ("--out r --test-every 0", "no view is held out"),
         ("--out r --path orbit --test-every 1", "needs 1 or more training views and there are 0"),
-        ("--out r --path spiral", f"give --path one of {PATHS}, or a file that 'pop view' saved"),
         ("--out .", "the folder that this command runs in; choose another output folder"),
     ],
 )
-def test_what_cannot_be_rendered_is_said_and_nothing_is_written(
-    rendered: Render, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, part: str
-) -> None:
+def test_what_cannot_be_rendered_is_said_and_nothing_is_written(rendered, tmp_path, monkeypatch, words, part):
     monkeypatch.chdir(tmp_path)
     says(rendered(*words.split()), part)
     assert list(tmp_path.iterdir()) == []
@@ -266,10 +255,8 @@ CASES = {
 
 @pytest.mark.parametrize("backend", ["fast", "compiled"])
 @pytest.mark.parametrize("case", CASES)
-def test_a_gaussian_at_half_of_inrias_near_plane_is_seen_where_the_world_was_shrunk(
-    case: str, backend: str, tmp_path: Path
-) -> None:
-    engine_or_skip(backend)
+def test_a_gaussian_at_half_of_inrias_near_plane_is_seen_where_the_world_was_shrunk(case, backend, tmp_path):
+    skip_without(backend)
     (scale, is_seen), capture = CASES[case], tiny_capture()
     eye, *others = capture.train_views(5)
     config = tiny_method(tmp_path, case.split()[0], backend=backend, test_every=5)
@@ -305,9 +292,7 @@ def test_a_run_writes_its_near_plane_down_and_goes_on_with_it(pop: Pop, shared_c
     assert own.renderer.near_plane == pytest.approx(0.2, rel=1e-12)
 
 
-def test_blocks_are_trained_with_the_near_plane_of_the_whole(
-    pop: Pop, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_blocks_are_trained_with_the_near_plane_of_the_whole(pop, shared_capture, tmp_path, monkeypatch):
     monkeypatch.setattr(jobs, "_run", in_this_process)
     monkeypatch.setattr(jobs, "has_snakemake", lambda: False)
     scale, out = load_capture(shared_capture).world_scale, tmp_path / "out"

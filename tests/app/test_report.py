@@ -155,9 +155,7 @@ def test_nothing_is_said_of_held_out_views_where_there_are_none(tmp_path: Path, 
     assert said is None or found.subtitle.split(" · ")[2] == said
 
 
-def test_the_report_reads_only_the_result_folder_and_that_of_a_run_that_was_killed_early(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_report_reads_only_the_result_folder_and_that_of_a_run_that_was_killed_early(tmp_path, monkeypatch):
     first = write_report(write_result(tmp_path / "r")).read_bytes()
     folder = (tmp_path / "r").rename(tmp_path / "moved")
     monkeypatch.chdir(tmp_path)
@@ -399,8 +397,8 @@ def test_a_veil_between_the_photographs_is_found(looked: Looked) -> None:
 
 
 def test_a_veil_that_reaches_in_from_outside_is_left_out_and_the_rest_is_tuned(
-    looked: Looked, pop: Pop, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    looked, pop, shared_capture, tmp_path, monkeypatch
+):
     capture, splat = looked.capture, looked.splat
     turn = checks.orbit_views(capture.train_views())[1]
     limit = near_limit(turn, capture.points)
@@ -429,9 +427,7 @@ def test_a_veil_that_reaches_in_from_outside_is_left_out_and_the_rest_is_tuned(
 
 
 @pytest.mark.parametrize("most", [3, 40])
-def test_veils_are_weighed_by_all_that_is_seen_in_an_even_selection_of_the_training_views(
-    looked: Looked, monkeypatch: pytest.MonkeyPatch, most: int
-) -> None:
+def test_veils_are_weighed_by_all_that_is_seen_in_an_even_selection_of_the_training_views(looked, monkeypatch, most):
     monkeypatch.setattr(checks, "_MOST_WEIGHED", most)
     capture, config, degree = looked.capture, looked.splat.config, looked.splat.sh_degree
     backend, drawn, whole = renderer("auto")[0], {}, Passes.contributions
@@ -461,9 +457,7 @@ def test_veils_are_weighed_by_all_that_is_seen_in_an_even_selection_of_the_train
     assert found[-1]
 
 
-def test_floaters_are_left_out_of_a_file_by_their_places(
-    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path
-) -> None:
+def test_floaters_are_left_out_of_a_file_by_their_places(pop, shared_result, shared_capture, tmp_path):
     params, view = load_splat(shared_result).params, load_capture(shared_capture).views[3]
     place = torch.from_numpy(view.camera_center + 0.05 * view.viewmat[2, :3]).float()
     planted = {name: torch.cat([t, (place if name == "means" else t[0])[None]]) for name, t in params.items()}

@@ -21,7 +21,6 @@ import pytest
 import torch
 
 import pop_fast.compiled
-from pop_fast.api.backend import get_backend
 from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun, training_run
 from pop_fast.train import checkpoint as ckpt
@@ -31,7 +30,15 @@ from pop_fast.train.torch_stepper import check_batch
 from tests.app.captures import PINHOLE, camera, photograph, ring, write_model, write_photograph
 from tests.app.conftest import ROOT, TRAIN, in_a_child, launched, wait_until
 from tests.app.damage import contents
-from tests.app.tiny import assert_same_run, interrupt, last_checkpoint, run_until, tiny_capture, tiny_config
+from tests.app.tiny import (
+    assert_same_run,
+    interrupt,
+    last_checkpoint,
+    run_until,
+    skip_without,
+    tiny_capture,
+    tiny_config,
+)
 
 
 def run_to(folder, stop_after=None, resume=False, method="pop"):
@@ -138,12 +145,8 @@ def test_a_run_in_batches_goes_on_from_a_checkpoint_within_a_window(tmp_path):
 
 
 @pytest.mark.parametrize("engine", ["fast", "compiled"])
-def test_a_measurement_that_is_left_is_made_by_who_resumes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: str
-) -> None:
-    reason = get_backend(engine).why_not()
-    if reason is not None:
-        pytest.skip(reason)
+def test_a_measurement_that_is_left_is_made_by_who_resumes(tmp_path, monkeypatch, engine):
+    skip_without(engine)
     whole = tiny_config(tmp_path / "whole", eval_steps=(12,), backend=engine)
     TrainingRun(whole, tiny_capture()).run()
     parts = replace(whole, result_dir=str(tmp_path / "parts"))
@@ -325,9 +328,7 @@ def test_sigkill_at_random_moments_changes_nothing(tmp_path):
         pytest.param(signal.SIGKILL, -signal.SIGKILL, marks=pytest.mark.slow),
     ],
 )
-def test_the_search_for_cameras_is_left_at_once_and_leaves_nothing(
-    tmp_path: Path, number: signal.Signals, status: int
-) -> None:
+def test_the_search_for_cameras_is_left_at_once_and_leaves_nothing(tmp_path, number, status):
     # photographs of noise that overlap: thousands of features each, minutes of matching
     wall = np.random.default_rng(0).integers(0, 256, (900, 3000, 3), dtype=np.uint8)
     for i in range(24):
@@ -348,9 +349,7 @@ def test_the_search_for_cameras_is_left_at_once_and_leaves_nothing(
 
 @posix
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_training_that_is_told_to_stop_writes_a_checkpoint(
-    shared_capture: Path, tmp_path: Path, number: signal.Signals
-) -> None:
+def test_training_that_is_told_to_stop_writes_a_checkpoint(shared_capture, tmp_path, number):
     folder = tmp_path / "r"
     words = ("--max-steps", "100000", "--checkpoint-every", "0", *TRAIN)
     process = start(tmp_path, "train", shared_capture, "--out", folder, *words)
@@ -418,12 +417,8 @@ def test_sigterm_while_a_capture_is_read_is_one_line_and_the_end(shared_capture:
 @pytest.mark.slow  # photographs of 12 megapixels
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_training_on_photographs_of_12_megapixels_is_gone_after_less_than_two_seconds_of_work(
-    tmp_path: Path, number: signal.Signals
-) -> None:
-    reason = get_backend("compiled").why_not()
-    if reason is not None:
-        pytest.skip(reason)
+def test_a_training_on_photographs_of_12_megapixels_is_gone_after_less_than_two_seconds_of_work(tmp_path, number):
+    skip_without("compiled")
     names, folder = [f"{i}.bmp" for i in range(6)], tmp_path / "r"
     for i, name in enumerate(names):
         write_photograph(tmp_path / "large" / "images" / name, photograph(i, 4000, 3000))
@@ -438,7 +433,6 @@ def test_a_training_on_photographs_of_12_megapixels_is_gone_after_less_than_two_
     _, status, used = os.wait4(process.pid, 0)
     assert os.waitstatus_to_exitcode(status) == 130
     ((step, _),) = ckpt.list_checkpoints(folder)
-    assert process.stderr is not None
     assert process.stderr.read() == f"pop: stopped after step {step + 1:,}; the same command with --resume continues\n"
     assert used.ru_utime + used.ru_stime - before / os.sysconf("SC_CLK_TCK") < 2.0
 

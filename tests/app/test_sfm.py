@@ -149,14 +149,7 @@ class Model:
         (14, [], [], None),
     ],
 )
-def test_photographs_are_searched_again_where_few_of_few_were_placed(
-    n: int,
-    first: list[int],
-    second: list[int] | None,
-    kept: int | None,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_photographs_are_searched_again_where_few_of_few_were_placed(n, first, second, kept, tmp_path, monkeypatch):
     results = {False: first, True: second}
 
     def models(job: sfm.Search, tell: object, thorough: bool) -> list[Model]:

@@ -82,9 +82,7 @@ FAILING: dict[str, tuple[str, ...]] = {
 
 
 @pytest.mark.parametrize("words", FAILING)
-def test_a_run_that_cannot_start_leaves_earlier_results_and_no_stub(
-    train: Callable[..., Outcome], result: Path, tmp_path: Path, words: str
-) -> None:
+def test_a_run_that_cannot_start_leaves_earlier_results_and_no_stub(train, result, tmp_path, words):
     before = contents(result)
     says(train(*words.split(), "--overwrite"), *FAILING[words])
     assert contents(result) == before
@@ -102,9 +100,7 @@ def test_a_camera_that_cannot_be_rendered_is_named_before_the_first_step(tmp_pat
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), PopError("view 3 is bad"), MemoryError()], ids=repr)
-def test_nothing_is_replaced_when_the_first_step_fails(
-    tmp_path: Path, error: BaseException, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_is_replaced_when_the_first_step_fails(tmp_path, error, monkeypatch):
     def failing(_: TrainingRun, last: int) -> None:
         raise error
 
@@ -143,9 +139,7 @@ def test_the_new_run_has_only_what_it_wrote_and_what_is_not_a_result(tmp_path: P
 
 @pytest.mark.parametrize("exists", [True, False])
 @pytest.mark.parametrize("room", [0, 2, 4], ids=["no cfg.json", "no capture.json", "no histogram"])
-def test_a_full_disk_while_results_are_replaced_brings_the_old_ones_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exists: bool, room: int
-) -> None:
+def test_a_full_disk_while_results_are_replaced_brings_the_old_ones_back(tmp_path, monkeypatch, exists, room):
     folder = old_results(tmp_path / "r") if exists else tmp_path / "r"
     fsync, done = os.fsync, 0
 
@@ -220,9 +214,7 @@ def test_results_that_a_kill_left_aside_come_back_with_a_note(train: Callable[..
     assert kept() == before
 
 
-def test_a_run_that_is_cut_off_can_be_looked_at_and_gone_on_with_in_few_words(
-    pop: Pop, capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_is_cut_off_can_be_looked_at_and_gone_on_with_in_few_words(pop, capture, tmp_path, monkeypatch):
     # photographs that are found by --images alone, and a command that is given from the folder that holds the capture
     (capture / "images").rename(capture / "shots")
     monkeypatch.chdir(tmp_path)
@@ -314,13 +306,13 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 REFUSED: dict[str, tuple[str, tuple[str, ...]]] = {
-    "no such path": ("render splat.ply --out o --path spiral", ("spiral", "orbit")),
-    "no frames": ("render splat.ply --out o --path orbit --frames 0", ("--frames 1",)),
+    "no such path": ("render splat.ply --out o --path spiral", ("spiral", "one of views, orbit, ellipse, interpolate")),
+    "no frames": ("render splat.ply --out o --path orbit --frames 0", ("frames is 0; give --frames 1 or more",)),
     "pictures where somebody's files are": ("render splat.ply --out folder --overwrite", ("folder", "thesis.txt")),
     "pictures where a folder is": ("render splat.ply --out folder", ("folder", "thesis.txt")),
     "pictures where a file is": ("render splat.ply --out file", ("file", "in the way")),
     "pictures under a file": ("render splat.ply --out file/o", ("file/o", "is a file")),
-    "a video of no kind": ("render splat.ply --video o.gif", ("o.gif", ".webm")),
+    "a video of no kind": ("render splat.ply --video o.gif", ("o.gif", "must end in .webm, .mp4, .avi")),
     "a video under a file": ("render splat.ply --video file/o.webm", ("file/o.webm", "is a file")),
     "numbers where a folder is": ("eval splat.ply --capture photos --json folder", ("folder", "in the way")),
     "numbers under a file": ("eval splat.ply --capture photos --json file/o.json", ("file/o.json", "is a file")),
@@ -398,9 +390,7 @@ def test_the_table_is_printed_and_the_report_shows_it(train: Callable[..., Outco
     assert table_lines([("a", "bb"), ("ccc", "d")]) == ["a    bb", "ccc   d"]
 
 
-def test_exports_are_written_with_the_limits_that_are_asked_for_and_go_with_their_run(
-    train: Callable[..., Outcome], result: Path
-) -> None:
+def test_exports_are_written_with_the_limits_that_are_asked_for_and_go_with_their_run(train, result):
     words = ("--export", "spz", "gltf-spz", "html", "--max-gaussians", "100", "--skip-sizes")
     said = done(train("--resume", *words))
     assert "highest sensitivity: 100 of" in said
@@ -416,18 +406,14 @@ def test_exports_are_written_with_the_limits_that_are_asked_for_and_go_with_thei
     assert (result / "viewer.html").is_file()
 
 
-def test_limits_without_a_format_make_a_ply_in_the_frame_of_the_capture(
-    pop: Pop, train: Callable[..., Outcome], result: Path, tmp_path: Path
-) -> None:
+def test_limits_without_a_format_make_a_ply_in_the_frame_of_the_capture(pop, train, result, tmp_path):
     done(train("--resume", "--final-prune", "0", "--min-opacity", "0", "--skip-sizes"))
     pop.done("export", result, "--out", tmp_path / "whole.ply")
     kept, whole = (load_ply(path)["means"] for path in (result / "export" / "result.ply", tmp_path / "whole.ply"))
     assert {tuple(row) for row in kept.tolist()} <= {tuple(row) for row in whole.tolist()}
 
 
-def test_an_export_that_cannot_be_written_leaves_the_results_and_says_so(
-    train: Callable[..., Outcome], result: Path
-) -> None:
+def test_an_export_that_cannot_be_written_leaves_the_results_and_says_so(train, result):
     outcome = train("--resume", "--export", "spz", "--target-mb", "1e-5")
     assert outcome.status == 1
     assert "a file without any Gaussian has" in outcome.err

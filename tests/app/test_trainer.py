@@ -7,7 +7,6 @@ import json
 import math
 import time
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ import torch
 from pop_fast.api.backends import FAST
 from pop_fast.data import Capture, View
 from pop_fast.data.gaussians import initialize_params
-from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.io import heartbeat
 from pop_fast.io.heartbeat import Heartbeat, bars, duration
@@ -30,7 +28,7 @@ from pop_fast.train.torch_stepper import PhotoLoss
 from pop_fast.train.views import ViewTensors
 from pop_ref.settings import Objective
 from tests.app.captures import assert_one_line, cloud, photograph, ring
-from tests.app.conftest import TRAIN, Pop, wait_until
+from tests.app.conftest import TRAIN, wait_until
 from tests.app.tiny import HEIGHT, WIDTH, records, tiny_capture, tiny_config
 
 
@@ -41,14 +39,6 @@ def finished(request, tmp_path_factory):
     trainer = TrainingRun(config, tiny_capture())
     stats = trainer.run()
     return trainer, stats, folder
-
-
-def test_training_brings_renders_nearer_to_the_photographs(tmp_path):
-    # fixed Gaussians: with one that changes every fourth step, thirty steps show mostly that
-    config = tiny_config(tmp_path, max_steps=60, strategy=POPStrategy(refine_stop_iter=0))
-    TrainingRun(config, tiny_capture()).run()
-    psnr = [record["psnr"] for record in records(tmp_path)]
-    assert np.mean(psnr[-4:]) > np.mean(psnr[:4]) + 2.0
 
 
 def test_what_a_run_starts_from_stays_the_callers(tmp_path):
@@ -350,9 +340,7 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_stages_that_report_are_told_with_the_time_that_is_left(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stages_that_report_are_told_with_the_time_that_is_left(capsys, monkeypatch):
     monkeypatch.setattr(heartbeat, "PERIOD", 0.01)
     with bars() as report:
         report("matching photographs", 64, 1225)
@@ -385,8 +373,8 @@ def test_a_terminal_and_a_quiet_run_are_told_nothing(monkeypatch: pytest.MonkeyP
 
 
 def test_bars_of_long_stages_and_of_steps_that_take_long_are_drawn_anew_in_a_terminal(
-    pop: Pop, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    pop, shared_capture, tmp_path, monkeypatch
+):
     monkeypatch.setattr("sys.stderr", stream := Terminal())
     monkeypatch.setattr(heartbeat, "TICK", 0.01)
     with bars() as report:
@@ -404,9 +392,7 @@ def test_bars_of_long_stages_and_of_steps_that_take_long_are_drawn_anew_in_a_ter
     assert pop("train", shared_capture, *words).status == 0
 
 
-def test_training_tells_how_far_it_is(
-    pop: Pop, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_training_tells_how_far_it_is(pop, shared_capture, tmp_path, monkeypatch):
     monkeypatch.setattr(heartbeat, "PERIOD", 0.01)
     words = [word for word in TRAIN if word != "--no-progress"]
     told = pop.done("train", shared_capture, "--out", tmp_path / "r", *words)

@@ -38,14 +38,12 @@ from tests.app.captures import (
     transforms_capture,
     write_photograph,
 )
-from tests.app.conftest import Pop
 
 Edit = Callable[[dict[str, Any]], object]
 
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """A capture of four photographs that a test may change."""
     return transforms_capture(tmp_path)
 
 
@@ -70,7 +68,6 @@ def test_the_views_are_those_of_the_same_scene_by_colmap(tmp_path: Path, terms: 
 
 
 def K_of(root: Path, index: int = 0) -> list[float]:
-    """Read fx, fy, cx, cy of a view."""
     K = raw(root).views[index].K
     return [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
 
@@ -395,8 +392,8 @@ def assert_same_cameras(found: Capture, expected: Capture) -> None:
 
 @pytest.mark.parametrize("program", PROGRAMS)
 def test_the_cameras_of_an_export_are_those_it_was_made_from_and_data_check_looks_it_over(
-    program: str, original: Capture, write: Callable[..., Path], pop: Pop
-) -> None:
+    program, original, write, pop
+):
     folder = write(program)
     for source in ({}, {"source": program}):
         found = raw(folder, points=20, **source)

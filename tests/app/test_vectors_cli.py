@@ -19,7 +19,6 @@ from tests.app.damage import contents, says, truncate
 
 @pytest.fixture(scope="session")
 def shared_vectors(made_once: Callable[..., Path]) -> Path:
-    """Vectors that tests only read."""
 
     def make(folder: Path) -> None:
         assert main(["vectors", "export", str(folder / "vectors")]) == 0
@@ -29,7 +28,6 @@ def shared_vectors(made_once: Callable[..., Path]) -> Path:
 
 @pytest.fixture
 def vectors(shared_vectors: Path, tmp_path: Path) -> Path:
-    """A copy of the vectors that a test may damage."""
     return Path(shutil.copytree(shared_vectors, tmp_path / "vectors"))
 
 
@@ -45,9 +43,7 @@ def port(shared_vectors: Path, made_once: Callable[..., Path]) -> Path:
 
 
 @pytest.mark.slow
-def test_a_port_written_from_the_index_passes_in_npz_and_in_json(
-    pop: Pop, shared_vectors: Path, port: Path, tmp_path: Path
-) -> None:
+def test_a_port_written_from_the_index_passes_in_npz_and_in_json(pop, shared_vectors, port, tmp_path):
     outcome = pop("vectors", "check", shared_vectors, port)
     drawn = len(list(port.iterdir()))
     assert outcome.status == 0, outcome.out
@@ -63,9 +59,7 @@ def test_a_port_written_from_the_index_passes_in_npz_and_in_json(
     pop.done("vectors", "check", shared_vectors, tmp_path)
 
 
-def test_a_broken_port_is_told_which_array_of_which_vector_and_where(
-    pop: Pop, shared_vectors: Path, tmp_path: Path
-) -> None:
+def test_a_broken_port_is_told_which_array_of_which_vector_and_where(pop, shared_vectors, tmp_path):
     own = run(shared_vectors, tmp_path / "results", shift=0.0)
     assert ("one_round_splat", "image") in own
     outcome = pop("vectors", "check", shared_vectors, tmp_path / "results")
@@ -90,9 +84,7 @@ def _split(text: str) -> list:
     return parts
 
 
-def test_one_wrong_entry_is_found_and_what_the_index_does_not_know_is_said(
-    pop: Pop, shared_vectors: Path, port: Path, tmp_path: Path
-) -> None:
+def test_one_wrong_entry_is_found_and_what_the_index_does_not_know_is_said(pop, shared_vectors, port, tmp_path):
     results = shutil.copytree(port, tmp_path / "results")
     (results / "notes.txt").write_text("mine")
     with np.load(results / "golden.npz") as stored:
@@ -115,9 +107,7 @@ def test_one_wrong_entry_is_found_and_what_the_index_does_not_know_is_said(
 
 
 @pytest.mark.slow  # it makes every vector
-def test_an_export_says_what_it_wrote_and_leaves_an_existing_folder_alone(
-    pop: Pop, vectors: Path, shared_vectors: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_export_says_what_it_wrote_and_leaves_an_existing_folder_alone(pop, vectors, shared_vectors, monkeypatch):
     (vectors / "mine.txt").write_text("keep")
     before = contents(vectors)
     says(pop("vectors", "export", vectors), str(vectors), "--overwrite")
@@ -189,9 +179,7 @@ def _without(name: str) -> Callable[[Path], None]:
     ],
     ids=lambda value: None if callable(value) else value[-1],
 )
-def test_damaged_vectors_are_refused_by_one_line(
-    pop: Pop, vectors: Path, port: Path, damage: Callable[[Path], object], parts: tuple[str, ...]
-) -> None:
+def test_damaged_vectors_are_refused_by_one_line(pop, vectors, port, damage, parts):
     damage(vectors)
     says(pop("vectors", "check", vectors, port), *parts)
 
@@ -216,9 +204,7 @@ def _result(**arrays: object) -> Callable[[Path], None]:
     ],
     ids=["no folder", "empty", "foreign", "shape", "type", "objects", "no bytes", "no json", "no object", "ragged"],
 )
-def test_results_that_cannot_be_read_are_refused_by_one_line(
-    pop: Pop, shared_vectors: Path, tmp_path: Path, damage: Callable[[Path], object], parts: tuple[str, ...]
-) -> None:
+def test_results_that_cannot_be_read_are_refused_by_one_line(pop, shared_vectors, tmp_path, damage, parts):
     results = tmp_path / "results"
     results.mkdir()
     damage(results)

@@ -128,9 +128,7 @@ def test_a_schedule_that_is_short_already_is_not_called_too_long(steps: int, nex
 @pytest.mark.parametrize("gap", [1.5, 10.0, None])
 @pytest.mark.parametrize("train", [40.0, 31.0, 24.0, 18.0])
 @pytest.mark.parametrize("apart", [4.0, 30.0])
-def test_no_verdict_contradicts_another_and_each_fault_ends_in_a_command(
-    gap: float | None, train: float, apart: float
-) -> None:
+def test_no_verdict_contradicts_another_and_each_fault_ends_in_a_command(gap, train, apart):
     held_out = None if gap is None else train - gap
     measured = {"train_psnr": train, "held_out_psnr": held_out, "matched_psnr": held_out}
     faults = {"neighbour_degrees": apart, "stops": {"a": -0.5, "b": 0.5}, "floaters": {"a": 0.5}, "steps": 3_000}
@@ -192,9 +190,7 @@ def test_views_that_few_steps_left_as_they_are_ask_for_more_steps(train: float, 
         (43, 300, None, ("--steps-scaler", "0.043")),
     ],
 )
-def test_a_run_of_few_steps_is_sent_to_one_that_is_several_times_as_long(
-    photographs: int, steps: int, seconds: float | None, words: tuple[str, ...]
-) -> None:
+def test_a_run_of_few_steps_is_sent_to_one_that_is_several_times_as_long(photographs, steps, seconds, words):
     checks = replace(GOOD, photographs=photographs, train_psnr=18.0, held_out_psnr=17.0, steps=steps)
     stats = {} if seconds is None else {"seconds_total": seconds}
     told = {one.about: one.next for one in verdict(stats, checks, None)}
@@ -339,9 +335,7 @@ def edited(demo: Path, folder: Path, change: Callable[[int, np.ndarray], np.ndar
 
 
 @pytest.mark.slow
-def test_more_steps_help_where_few_left_all_views_far_off_and_fewer_where_it_learned_them_by_heart(
-    pop: Pop, demo: Path, tmp_path: Path
-) -> None:
+def test_more_steps_help_where_few_left_all_views_far_off_and_fewer_where_it_learned_them_by_heart(pop, demo, tmp_path):
     # noise, which only so many steps learn by heart
     draw = np.random.default_rng(0)
     noisy = edited(demo, tmp_path / "noisy", lambda _, image: image + draw.normal(0.0, 25.0, image.shape))
@@ -385,9 +379,7 @@ def test_views_are_held_out_where_none_were(pop: Pop, demo: Path, tmp_path: Path
 
 
 @pytest.mark.slow
-def test_photographs_that_are_far_apart_are_looked_over_and_the_gaps_named(
-    pop: Pop, demo: Path, tmp_path: Path
-) -> None:
+def test_photographs_that_are_far_apart_are_looked_over_and_the_gaps_named(pop, demo, tmp_path):
     _, told = trained(pop, ["train", demo, "--out", tmp_path / "run", "--steps-scaler", "0.002"])
     assert "neighbours 27" in told["Photographs"].text
     assert told["Photographs"].next == ("data", "check", str(demo))

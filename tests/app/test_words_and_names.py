@@ -85,9 +85,7 @@ def test_messages_keep_letters_of_all_languages_and_are_no_longer_than_can_be_re
         ("--sfm.matcher exhaustive --sfm.seed -1", "seed is -1; it must be a whole number from 0"),
     ],
 )
-def test_numbers_out_of_range_are_refused(
-    pop: Pop, shared_capture: Path, tmp_path: Path, words: str, told: str
-) -> None:
+def test_numbers_out_of_range_are_refused(pop, shared_capture, tmp_path, words, told):
     outcome = pop("train", shared_capture, "--out", tmp_path / "r", *words.split())
     assert outcome.status == 2
     assert told in " ".join(outcome.err.replace("│", " ").split())
@@ -118,8 +116,8 @@ def test_how_cameras_are_found_can_be_said_to_train(pop: Pop, tmp_path: Path, mo
 
 
 def test_an_unfinished_run_is_marked_and_one_without_numbers_keeps_no_other_from_being_compared(
-    pop: Pop, shared_result: Path, shared_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    pop, shared_result, shared_capture, tmp_path, monkeypatch
+):
     interrupt(monkeypatch, at=10)
     begun, unfinished = tmp_path / "r", tmp_path / "u"
     for out, first in ((begun, "30"), (unfinished, "5")):
@@ -213,9 +211,7 @@ def test_a_bad_capture_and_bad_settings_are_named_before_the_work(pop: Pop, capt
 
 
 @pytest.mark.parametrize("command", ["train", "demo", "render", "export"])
-def test_a_full_disk_leaves_nothing_half_written(
-    pop: Pop, shared_capture: Path, shared_result: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
-) -> None:
+def test_a_full_disk_leaves_nothing_half_written(pop, shared_capture, shared_result, tmp_path, monkeypatch, command):
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -245,9 +241,7 @@ def test_a_full_disk_leaves_nothing_half_written(
         ("doctor --lpips-alex gone", ("gone", "LPIPS")),
     ],
 )
-def test_the_other_subcommands_name_what_is_wrong(
-    pop: Pop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, parts: tuple[str, ...]
-) -> None:
+def test_the_other_subcommands_name_what_is_wrong(pop, tmp_path, monkeypatch, words, parts):
     monkeypatch.chdir(tmp_path)
     says(pop(*words.split()), *parts)
     assert list(tmp_path.iterdir()) == []

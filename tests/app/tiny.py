@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 import torch
 
+from pop_fast.api.backend import get_backend
 from pop_fast.data.capture import Capture, View
 from pop_fast.density import GsplatStrategy, InriaStrategy, POPStrategy
 from pop_fast.train import LearningRates, TrainConfig, TrainingRun
@@ -57,6 +58,12 @@ def tiny_capture(seed: int = 0, n_views: int = 5, mask: np.ndarray | None = None
             image[(xs - u) ** 2 + (ys - v) ** 2 < (8.0 / cam[j, 2]) ** 2] = colors[j]
         views.append(View(f"{i:02d}.png", image, viewmat, K, mask, seen=np.arange(i % 3, N_POINTS, 3)))
     return Capture("tiny", tuple(views), points, colors, source="made up")
+
+
+def skip_without(backend: str) -> None:
+    reason = get_backend(backend).why_not()
+    if reason is not None:
+        pytest.skip(reason)
 
 
 def last_checkpoint(folder: Path, *without: str) -> dict[str, Any]:

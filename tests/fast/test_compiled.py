@@ -120,7 +120,6 @@ def as_splats(drawn: Splats) -> Rows:
 
 
 def sums(functions: tuple[Callable, Callable, Callable], drawn: Splats, profile: Profile) -> dict[str, Tensor]:
-    """Take all sums of a view."""
     of_view = (as_splats(drawn), drawn.lists, WIDTH, HEIGHT, drawn.lists.tile_size)
     contributions, sensitivities, screen_moments = functions
     found = contributions(*of_view, PIXEL_MAP, profile)
@@ -416,10 +415,7 @@ MASK = torch.tensor([True, False, True])
 @pytest.mark.parametrize(
     ("visible", "words"),
     [
-        (
-            MASK,
-            r"is a tensor of torch.bool and shape \[3\]; .* of a mask these are mask.nonzero\(\).squeeze\(1\)",
-        ),
+        (MASK, r"is a tensor of torch.bool and shape \[3\]; .* of a mask these are mask.nonzero\(\).squeeze\(1\)"),
         (MASK.nonzero(), r"shape \[2, 1\]; it must hold the numbers of the rows to evaluate, torch.int64 \[V\]"),
         (torch.tensor([0, 2], dtype=torch.int32), "visible is a tensor of torch.int32"),
         (torch.tensor([0, 3]), "visible names row 0 to 3; there are 3"),

@@ -26,12 +26,7 @@ ORACLE = [p for p in sorted((ROOT / "pop_ref").glob("*.py")) if p.name != "__ini
 VALUES = {"pop_ref.constants", "pop_ref.settings", "pop_ref.recipes"}
 SHARED_WITH_FAST = VALUES | {"pop_ref.notation", "pop_ref.records", "pop_ref.registry"}
 # rooms of the program whose work is to show what the oracle does
-SHOW_THE_ORACLE = (
-    "pop_fast/view/explain/",
-    "pop_fast/oracle.py",
-    "pop_fast/cli/vectors.py",
-    "pop_fast/cli/learn.py",
-)
+SHOW_THE_ORACLE = ("pop_fast/view/explain/", "pop_fast/oracle.py", "pop_fast/cli/vectors.py", "pop_fast/cli/learn.py")
 
 
 def _name(path: Path) -> str:
@@ -39,8 +34,13 @@ def _name(path: Path) -> str:
 
 
 @cache
+def text_of(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
+@cache
 def _tree(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
+    return ast.parse(text_of(path))
 
 
 @cache
@@ -154,15 +154,17 @@ def test_what_every_engine_shares_is_values_and_no_formula() -> None:
 
 @pytest.mark.parametrize("room", ["benchmarks", "paper_repro"])
 def test_users_of_the_packages_use_public_names(room: str) -> None:
+    packages = ("pop_ref", "pop_fast", "cuda_ext")
     for path in sorted((ROOT / room).rglob("*.py")):
-        for node in ast.walk(_tree(path)):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in (
-                "pop_ref",
-                "pop_fast",
-                "cuda_ext",
-            ):
+        for node in _nodes(path):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in packages:
                 private = [a.name for a in node.names if a.name.startswith("_")]
                 assert not private, f"{_name(path)} imports {private} from {node.module}"
+
+
+def _run(script: str) -> None:
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
 
 
 WATCHED = """
@@ -191,9 +193,7 @@ assert not happened, f"importing {package} does {{happened}}"
     ],
 )
 def test_importing_is_light_and_starts_nothing(package: str, heavy: tuple[str, ...]) -> None:
-    script = WATCHED.format(package=package, heavy=heavy)
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 0, done.stderr
+    _run(WATCHED.format(package=package, heavy=heavy))
 
 
 HEAVY = ("torch", "scipy", "cv2", "matplotlib", "pycolmap", "plyfile", "tqdm")
@@ -211,9 +211,7 @@ for words in {calls!r}:
 
 
 def _call(calls: list[list[str]], status: int, heavy: tuple[str, ...]) -> None:
-    script = CALLED.format(calls=calls, status=status, heavy=heavy)
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 0, done.stderr
+    _run(CALLED.format(calls=calls, status=status, heavy=heavy))
 
 
 def test_the_help_of_no_subcommand_loads_anything_heavy() -> None:
@@ -253,8 +251,7 @@ WITHOUT = [
 @pytest.mark.parametrize(("script", "heavy"), WITHOUT, ids=range(len(WITHOUT)))
 def test_a_run_begins_without_what_it_does_not_need(script: str, heavy: tuple[str, ...]) -> None:
     check = f"import sys; loaded = [m for m in {heavy!r} if m in sys.modules]; assert not loaded, loaded"
-    done = subprocess.run([sys.executable, "-c", f"{script}\n{check}"], capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 0, done.stderr
+    _run(f"{script}\n{check}")
 
 
 # where Python's path is read and no Python is started with it
@@ -287,7 +284,7 @@ def test_one_place_makes_the_commands_of_child_pythons() -> None:
         fix = "take python_command or module_command of pop_fast.children, which leave the current folder out"
         assert len(lines) == NAMES_THE_PYTHON.get(_name(path), 0), f"{_name(path)} starts a Python at {lines}: {fix}"
     for workflow in (ROOT / "pop_fast/blocks/Snakefile", ROOT / "paper_repro/Snakefile"):
-        text = workflow.read_text(encoding="utf-8")
+        text = text_of(workflow)
         assert "os.environ.update(SAFE_PATH)" in text
         assert "sys.executable" not in text
 
@@ -300,7 +297,7 @@ def test_a_python_that_is_started_elsewhere_is_seen(line: str) -> None:
 
 
 def _too_long(path: Path) -> Iterator[str]:
-    text = path.read_text(encoding="utf-8")
+    text = text_of(path)
     # the prose of a chapter is a page's, and no code
     lines = sum(not (line.startswith("#") and path.name.startswith("chapter_")) for line in text.splitlines())
     # a module holds one idea, and is not cut by length; beyond this there are surely two. A file of tests is read
@@ -347,7 +344,7 @@ def test_nothing_is_written_that_must_not_be() -> None:
     texts = sorted(_texts())
     assert len(texts) > len(FILES)
     for path in texts:
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        for number, line in enumerate(text_of(path).splitlines(), start=1):
             for what, pattern in FORBIDDEN.items():
                 assert not pattern.search(line), f"{_name(path)}:{number} has {what}: {line.strip()}"
 
@@ -395,12 +392,12 @@ def _printed(path: Path) -> Iterator[str]:
     """Yield the strings of a module that are no docstrings."""
     docs = {
         id(node.body[0].value)
-        for node in ast.walk(_tree(path))
+        for node in _nodes(path)
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
         and node.body
         and isinstance(node.body[0], ast.Expr)
     }
-    for node in ast.walk(_tree(path)):
+    for node in _nodes(path):
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docs:
             yield node.value
 
@@ -416,11 +413,10 @@ def test_what_the_program_prints_is_in_megabytes() -> None:
 
 # What words in backticks name is there: modules, what lies in them, and files of source.
 
-ALL_ROOMS = ("pop_ref", "pop_fast", "cuda_ext", "paper_repro", "benchmarks", "tests", "docs")
 SOURCES = (".py", ".h", ".cuh", ".cu", ".cpp")
 ALL_FILES = [
     path
-    for room in ALL_ROOMS
+    for room in ROOMS
     for path in (ROOT / room).rglob("*")
     if path.suffix in (*SOURCES, ".md") and not {"results", "build", "corpus", Path(__file__).name} & set(path.parts)
 ]
@@ -430,11 +426,6 @@ FILE = re.compile(r"`(\w+\.(?:py|h|cuh|cu|cpp))`")
 SENT_TO = re.compile(r"(?:[Ss]ee|\b(?:is|are|stands?) in|step of) `([a-z_]+)`")
 # of any number, in words on how files are called
 PATTERNS = {"chapter_NN_short_name.py"}
-
-
-@cache
-def text_of(path: Path) -> str:
-    return path.read_text(encoding="utf-8")
 
 
 @cache
@@ -492,12 +483,8 @@ def test_a_name_of_nothing_is_noticed(words: str) -> None:
     assert list(missing(ROOT / "pop_fast" / "stages" / "compositing.py", words))
 
 
-PACKAGES = ("pop_ref", "pop_fast", "cuda_ext", "paper_repro", "benchmarks", "docs", "tests")
-
-
 def _modules() -> dict[str, Path]:
-    files = (path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
-    paths = {path: path.relative_to(ROOT).with_suffix("").parts for path in files}
+    paths = {path: path.relative_to(ROOT).with_suffix("").parts for path in FILES}
     return {".".join(parts[:-1] if parts[-1] == "__init__" else parts): path for path, parts in paths.items()}
 
 

@@ -34,6 +34,7 @@ from pop_ref.conformance.torch_adapter import TorchAdapter
 from pop_ref.conformance.views import ASKED
 from pop_ref.constants import GSPLAT_1_5, GSPLAT_1_6, INRIA, PAPER, PROFILES, Profile
 from pop_ref.projection import project_means
+from tests.judged import here
 
 LAWS = every_law()
 FEW = 4
@@ -386,16 +387,9 @@ def test_an_adapter_is_found_by_its_path_and_must_be_one() -> None:
         made_by("no_such.module:Mine")
 
 
-def _here(name: str) -> Any:
-    backend = shipped_or_absent(name)
-    if isinstance(backend, Absent):
-        pytest.skip(backend.reason)
-    return backend
-
-
 @pytest.mark.parametrize("name", ["compiled64", "compiled32"])
 def test_what_the_compiled_backend_has_of_its_own_is_judged(name: str) -> None:
-    backend = _here(name)
+    backend = here(name)
     own = ("tile_lists", "contributions", "sensitivities", "fisher_blocks", "dominant_points", "adam_step")
     assert [stage for stage in own if not backend.has(stage)] == []
     assert all("compiled" in backend._stage(stage).__module__ for stage in own[:-1])
@@ -403,7 +397,7 @@ def test_what_the_compiled_backend_has_of_its_own_is_judged(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["compiled32"])
 def test_an_engines_own_adam_moves_what_strategies_edit(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    backend = _here(name)
+    backend = here(name)
     law = law_named("test_strategies:a_training_by_gsplat_is_the_oracles_at_every_step")
     assert obeys(law, backend) is None
     # an engine that takes steps of half the length is no longer the oracle's, whatever torch's own Adam does
@@ -468,9 +462,11 @@ def test_dominant_ids_are_judged_without_weights_and_counts() -> None:
     assert {path: broken for path in judged if (broken := obeys(LAWS[path], backend, 10))} == {}
 
 
-def _refuses_packed(error: Callable[[], Any]) -> Callable[..., Any]:
-    def rasterization(*args: Any, packed: bool = True, **options: Any) -> Any:
-        return error() if packed else sound(*args, packed=False, **options)
+def _refuses_packed(alone: Callable[[], Any], with_backgrounds: Callable[[], Any] | None = None) -> Callable[..., Any]:
+    def rasterization(*args: Any, packed: bool = True, backgrounds: Any = None, **options: Any) -> Any:
+        if packed:
+            return alone() if backgrounds is None or with_backgrounds is None else with_backgrounds()
+        return sound(*args, packed=False, backgrounds=backgrounds, **options)
 
     return rasterization
 
@@ -482,15 +478,6 @@ def _raises(error: Exception) -> Any:
 def _asserts() -> None:
     allowed = False
     assert allowed, "packed rows come later"
-
-
-def _refuses_packed_by(alone: Callable[[], Any], with_backgrounds: Callable[[], Any]) -> Callable[..., Any]:
-    def rasterization(*args: Any, packed: bool = True, backgrounds: Any = None, **options: Any) -> Any:
-        if packed:
-            return alone() if backgrounds is None else with_backgrounds()
-        return sound(*args, packed=False, backgrounds=backgrounds, **options)
-
-    return rasterization
 
 
 def _states() -> Any:
@@ -508,7 +495,7 @@ REFUSALS: dict[str, Callable[..., Any]] = {
     "a ValueError by a statement": _refuses_packed(lambda: _raises(ValueError("packed=True is not for me"))),
     "words of compiled code": _refuses_packed(lambda: _raises(RuntimeError("packed mode is not supported"))),
     "no such argument": without_packed,
-    "a statement, and an assertion with backgrounds": _refuses_packed_by(_states, _asserts),
+    "a statement, and an assertion with backgrounds": _refuses_packed(_states, _asserts),
 }
 DEFECTS: dict[str, Callable[..., Any]] = {
     "an assertion": _refuses_packed(_asserts),
@@ -516,7 +503,7 @@ DEFECTS: dict[str, Callable[..., Any]] = {
     "arrays that do not fit": _refuses_packed(lambda: np.zeros(2) + np.zeros(3)),
     "a key that is not there": _refuses_packed(lambda: {}["packed"]),
     "an argument of something inside": _refuses_packed(lambda: dict.fromkeys(values=())),  # type: ignore[call-arg]
-    "an assertion, and a statement with backgrounds": _refuses_packed_by(_asserts, _states),
+    "an assertion, and a statement with backgrounds": _refuses_packed(_asserts, _states),
     "a kernel that fails": _refuses_packed(lambda: _raises(RuntimeError("illegal memory access"))),
 }
 PACKED_LAW = "test_signature_arguments:packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same"

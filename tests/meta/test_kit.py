@@ -31,22 +31,14 @@ from pop_ref.activations import scales_from_log_scales
 from pop_ref.conformance import laws
 from pop_ref.conformance.adapter import OracleAdapter, View
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
-from pop_ref.conformance.backends import Absent, shipped, shipped_or_absent
+from pop_ref.conformance.backends import shipped
 from pop_ref.conformance.calls import Call, call_as_code
 from pop_ref.conformance.failure_report import failure_report
 from pop_ref.conformance.hypothesis_profiles import EXAMPLES
 from pop_ref.conformance.law import is_crash, missing
 from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, living
 from pop_ref.conformance.mutants.trial import every_law, law_named, obeys
-from pop_ref.conformance.pairs import (
-    FACTORS,
-    accepted,
-    call_of,
-    covering_rows,
-    judged_pairs,
-    pairs_of,
-    possible_pairs,
-)
+from pop_ref.conformance.pairs import FACTORS, accepted, call_of, covering_rows, judged_pairs, pairs_of, possible_pairs
 from pop_ref.conformance.scenes import (
     Scene,
     cotangents,
@@ -66,7 +58,7 @@ from pop_ref.constants import INRIA
 from pop_ref.covariance import covars_from_quats_scales
 from pop_ref.losses import l2
 from pop_ref.records import Camera, Gaussians
-from tests.judged import POISONED_INTEGER, poisoned_allocations
+from tests.judged import POISONED_INTEGER, here, poisoned_allocations
 
 ROOT = Path(__file__).resolve().parents[2]
 SEEN = settings(max_examples=200, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
@@ -143,9 +135,7 @@ def test_rounding_a_scene_twice_is_rounding_it_once() -> None:
     ],
     ids=["index", "values", "million", "nan", "inf", "-inf", "shape"],
 )
-def test_what_differs_is_told_with_index_values_and_units(
-    actual: Any, expected: Any, scale: float, dtype: Any, said: str
-) -> None:
+def test_what_differs_is_told_with_index_values_and_units(actual, expected, scale, dtype, said):
     with pytest.raises(AssertionError, match=said):
         assert_close("alpha.sigma", np.array(actual), np.array(expected), scale, dtype)
 
@@ -196,9 +186,11 @@ def test_the_scorecard_counts_by_backend_and_stage(tmp_path: Path) -> None:
     assert "differs &lt;by&gt; 3" in page
 
 
+KIT = ("-q", "-p", "no:cacheprovider", "--pyargs", "pop_ref.conformance")
+
+
 def _kit(*options: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
-    command += ["--pyargs", "pop_ref.conformance", *options]
+    command = [sys.executable, "-m", "pytest", *KIT, *options]
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT / "docs")
 
 
@@ -236,28 +228,49 @@ def test_a_session_that_judges_nothing_is_left_alone(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--rasterizer", "no_such.module:f"), "no_such.module:f needs no_such, which is not installed"),
-        (("--rasterizer", "numpy"), "'numpy' must be written module:name, as my.module:rasterization"),
-        (("--rasterizer", "math:exp"), "math:exp draws nothing on cpu: a first small picture raises TypeError"),
-        (("--rasterizer", "math:exp", "--profile", "gsplat_2"), "profile 'gsplat_2' is unknown; use one of paper"),
-        (("--adapter", "pathlib:Path"), "pathlib:Path makes no adapter: it has no dtype"),
-        (("--backend", "gsplt"), "backend 'gsplt' is unknown; use one of oracle, fast64"),
-        (("--scorecard", "card.txt"), "scorecard card.txt must end in .json or .html"),
-        (("--stage", "order"), "invalid choice: 'order' (choose from"),
-        (("--strategy", "nowhere.at_all:Strategy"), "needs nowhere, which is not installed"),
-        (("--strategy", "math:Strategy"), "module math has no function Strategy"),
-        (("--strategy", "math"), "must be written module:name"),
-    ],
-    ids=lambda value: value[1] if isinstance(value, tuple) else None,
-)
-def test_the_kit_refuses_what_it_cannot_judge(words: tuple[str, ...], said: str) -> None:
-    done = _kit(*words, "-k", "grid")
-    assert done.returncode == 4, done.stdout + done.stderr
-    assert said in done.stdout + done.stderr
-    assert len((done.stdout + done.stderr).strip().splitlines()) < 8
+# a run of the kit for each, in one process
+REFUSING = """
+import contextlib, io, json, sys
+import pytest
+told = []
+for words in json.loads(sys.argv[1]):
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text):
+        status = pytest.main(words)
+    told.append((status, text.getvalue()))
+print(json.dumps(told))
+"""
+
+
+REFUSED = {
+    ("--rasterizer", "no_such.module:f"): "no_such.module:f needs no_such, which is not installed",
+    ("--rasterizer", "numpy"): "'numpy' must be written module:name, as my.module:rasterization",
+    ("--rasterizer", "math:exp"): "math:exp draws nothing on cpu: a first small picture raises TypeError",
+    ("--rasterizer", "math:exp", "--profile", "gsplat_2"): "profile 'gsplat_2' is unknown; use one of paper",
+    ("--adapter", "pathlib:Path"): "pathlib:Path makes no adapter: it has no dtype",
+    ("--backend", "gsplt"): "backend 'gsplt' is unknown; use one of oracle, fast64",
+    ("--scorecard", "card.txt"): "scorecard card.txt must end in .json or .html",
+    ("--stage", "order"): "invalid choice: 'order' (choose from",
+    ("--strategy", "nowhere.at_all:Strategy"): "needs nowhere, which is not installed",
+    ("--strategy", "math:Strategy"): "module math has no function Strategy",
+    ("--strategy", "math"): "must be written module:name",
+}
+
+
+@pytest.fixture(scope="module")
+def refusals() -> dict[tuple[str, ...], tuple[int, str]]:
+    words = json.dumps([[*KIT, *words, "-k", "grid"] for words in REFUSED])
+    done = subprocess.run([sys.executable, "-c", REFUSING, words], capture_output=True, text=True, cwd=ROOT / "docs")
+    assert done.returncode == 0, done.stderr
+    return dict(zip(REFUSED, json.loads(done.stdout), strict=True))
+
+
+@pytest.mark.parametrize("words", REFUSED, ids=" ".join)
+def test_the_kit_refuses_what_it_cannot_judge(refusals, words):
+    status, text = refusals[words]
+    assert status == 4, text
+    assert REFUSED[words] in text
+    assert len(text.strip().splitlines()) < 8
 
 
 def test_a_backend_that_is_not_here_is_skipped_with_the_reason(tmp_path: Path) -> None:
@@ -316,9 +329,7 @@ def stranger(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Judged:
 
 
 @pytest.mark.parametrize("shift", [pytest.param(0.0, marks=pytest.mark.slow), 0.5])
-def test_a_stranger_with_gsplats_signature_is_judged_by_what_it_offers(
-    stranger: Judged, tmp_path: Path, shift: float
-) -> None:
+def test_a_stranger_with_gsplats_signature_is_judged_by_what_it_offers(stranger, tmp_path, shift):
     # nothing but gsplat's arguments and meta keys; with half a pixel's shift it must fail and say where
     done = stranger(STRANGER.format(shift=shift), "--dtype", "float64", "--profile", "gsplat_1_5", "-rs",
                     "-k", "round_splat or stop_itself or any_tile", "--failures", str(tmp_path / "broken"))  # fmt: skip
@@ -340,9 +351,7 @@ PACKED = STRANGER.replace("absgrad=False,", "sparse_grad=False, absgrad=False,")
 
 
 @pytest.mark.slow
-def test_one_cause_that_breaks_several_laws_is_told_once_with_where_it_was_raised(
-    stranger: Judged, tmp_path: Path
-) -> None:
+def test_one_cause_that_breaks_several_laws_is_told_once_with_where_it_was_raised(stranger, tmp_path):
     chosen = "packed_rows_are_those or arguments_that_are_taken_alone or sparse_gradients"
     options = ("--profile", "gsplat_1_5", "-v", "-k", chosen, "--failures", str(tmp_path))
     done = stranger(PACKED.format(shift=0.0), *options)
@@ -370,9 +379,7 @@ def test_who_has_gsplat_and_nothing_else_reads_first_what_is_judged_and_what_is_
 
 def _obeys_on(name: str, law: str, gaussians: Gaussians, K: Any, tile_size: int) -> None:
     """Hold a backend to a law on a scene of 4 x 4 pixels that a camera at the origin sees."""
-    backend = shipped_or_absent(name)
-    if isinstance(backend, Absent):
-        pytest.skip(backend.reason)
+    backend = here(name)
     scene = Scene(gaussians, Camera(np.eye(4), np.array(K), 4, 4), tile_size=tile_size)
     sentence = law_named(law).sentence
     settings(max_examples=1, database=None)(given(scene=st.just(scene))(lambda scene: sentence(backend, scene=scene)))()
@@ -573,9 +580,7 @@ def test_pairs_that_only_failing_calls_hold_are_named_and_count_as_not_judged() 
 
 @pytest.mark.slow  # all laws of the signature
 @pytest.mark.parametrize(("argument", "keys"), [("tile_size", ()), ("backend", ("camera_ids", "batch_ids"))])
-def test_a_sound_rasterizer_without_tile_size_or_camera_ids_breaks_no_law_of_the_signature(
-    argument: str, keys: tuple[str, ...]
-) -> None:
+def test_a_sound_rasterizer_without_tile_size_or_camera_ids_breaks_no_law_of_the_signature(argument, keys):
     def rasterization(*args: Any, **options: Any) -> Any:
         images, alphas, meta = shipped("fast32")._rasterization(*args, **options)
         return images, alphas, {key: meta[key] for key in meta if key not in keys}
@@ -658,11 +663,7 @@ def test_exploring_draws_by_the_seed(tmp_path: Path) -> None:
 # What laws are tried on before anything is drawn: enough to kill what random scenes kill by luck.
 
 IMAGE, GRADIENTS = "test_agreement:the_image_is_one_of_the_oracles_outcomes", "test_agreement:gradients_are_the_oracles"
-DYING = {
-    "sorted_by_distance": IMAGE,
-    "gradient_of_unit_quaternions": GRADIENTS,
-    "camera_in_world_axes": IMAGE,
-}
+DYING = {"sorted_by_distance": IMAGE, "gradient_of_unit_quaternions": GRADIENTS, "camera_in_world_axes": IMAGE}
 
 
 @pytest.mark.parametrize(("name", "path"), DYING.items())

@@ -1,6 +1,7 @@
 """What the kit notices: every mutant dies, teeth and the reach of laws are measured, every public function is guarded.
 
-A mutant dies by the law that its entry names, and that law holds on the oracle. Every line that no law reaches has a
+A mutant dies by the law that its entry names. That the checks hold while nothing is broken tests/laws says, on the
+oracle and on the program, and tests/oracle of itself, the ladder and the doctests. Every line that no law reaches has a
 reason. Every public function of the oracle is reached by a check that fails when the function is broken wherever it is
 used, the kit included: its results are scaled by 1 + 2^-10, integers are off by one, truths are negated. For each
 function one cheap check that notices is written down here: a law on the oracle itself, a test of `tests/oracle`, the
@@ -29,7 +30,6 @@ import pytest
 import pop_ref
 from pop_ref.conformance import teeth, tolerances
 from pop_ref.conformance.adapter import OracleAdapter, forget
-from pop_ref.conformance.backends import shipped
 from pop_ref.conformance.capabilities import STAGES
 from pop_ref.conformance.catalogue import FILE, catalogue
 from pop_ref.conformance.law_coverage import LIMITS, MODULES, PACKAGE, Log, Logged, code_lines, reason
@@ -71,16 +71,6 @@ def test_the_named_law_kills_the_mutant_in_either_precision(mutant: Mutant | Bla
     assert killed_by(mutant, dtype) is not None, f"{mutant.name} survives {mutant.law} in {dtype}"
 
 
-# a law that draws nothing is tried by tests/laws on the same backend with the same arguments
-DRAWING = sorted({mutant.law for mutant in OUTSIDE if law_named(mutant.law).strategies})
-
-
-@pytest.mark.slow  # together they are
-@pytest.mark.parametrize("law", DRAWING)
-def test_the_program_itself_obeys_what_its_mutants_break(law: str) -> None:
-    assert obeys(law_named(law), shipped("fast32")) is None
-
-
 def test_a_trial_says_who_dies_by_what(capsys: pytest.CaptureFixture[str]) -> None:
     assert command.main(["no_half_in_the_exponent"]) == 0
     assert capsys.readouterr().out.startswith(
@@ -102,9 +92,7 @@ class _Soft:
     name, law, precisions = "soft", "test_alpha:soft", ("float32", "float64")
 
 
-def test_a_mutant_that_lives_in_one_precision_is_kept_as_alive(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_mutant_that_lives_in_one_precision_is_kept_as_alive(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(command, "FAMILIES", {"soft ones": (_Soft,)})
     monkeypatch.setattr(command, "killed_by", lambda mutant, dtype: "broken" if dtype == "float32" else None)
     assert command.main(["--json", str(tmp_path / "kills.json")]) == 1
@@ -114,9 +102,7 @@ def test_a_mutant_that_lives_in_one_precision_is_kept_as_alive(
     }
 
 
-def test_named_mutants_alone_are_kept_anew_and_those_that_are_gone_are_dropped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_named_mutants_alone_are_kept_anew_and_those_that_are_gone_are_dropped(tmp_path, monkeypatch):
     class New(_Soft):
         name = "new"
 
@@ -257,7 +243,6 @@ NUDGE = 1.0 + 2.0**-10
 
 
 def public_functions() -> dict[str, Callable[..., Any]]:
-    """Return the oracle's public functions as `module.function`."""
     found = {}
     for info in pkgutil.iter_modules(pop_ref.__path__):
         if info.ispkg or info.name.startswith("_"):
@@ -563,18 +548,3 @@ def test_a_broken_function_is_noticed(name: str) -> None:
     check = _check_of(name)
     with broken(FUNCTIONS[name]), pytest.raises(Exception):  # noqa: B017, PT011
         check()
-
-
-# tests/oracle calls the tests themselves, and tests/laws a law that draws nothing, on the oracle as here
-GUARDING = sorted({law for law in LAWS.values() if law_named(f"test_{law}").strategies})
-
-
-@pytest.mark.parametrize("law", GUARDING)
-def test_the_law_holds_while_nothing_is_broken(law: str) -> None:
-    _law(law)
-
-
-def test_the_ladder_and_the_doctests_hold_while_nothing_is_broken() -> None:
-    _ladder()
-    for name in DOCTESTS:
-        _doctest(name)

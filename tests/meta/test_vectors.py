@@ -27,9 +27,7 @@ from pop_ref.conformance.corpus import (
     weighted_blocks,
     weighted_runs,
 )
-from pop_ref.conformance.corpus import (
-    answer as corpus_answer,
-)
+from pop_ref.conformance.corpus import answer as corpus_answer
 from pop_ref.conformance.mutants import FAMILIES, MUTANTS, living
 from pop_ref.conformance.scenes import Scene, cotangents
 from pop_ref.conformance.strategies import corners, wide_scene
@@ -156,9 +154,7 @@ def test_one_wrong_pixel_of_thousands_is_found_by_the_sums(folder: Path, tmp_pat
     assert f"at [{101 // 8 * 25 + 77 // 8}, 2] of its sums" in failed.where
 
 
-def test_inputs_are_exact_in_float32_and_masks_leave_most_of_every_vector_to_be_compared(
-    folder: Path, index: dict[str, Any]
-) -> None:
+def test_inputs_are_exact_in_float32_and_masks_leave_most_of_every_vector_to_be_compared(folder, index):
     for vector in index["vectors"].values():
         arrays = index["kinds"][vector["kind"]]["arrays"]
         with np.load(folder / vector["file"]) as stored:
@@ -236,8 +232,7 @@ def test_the_images_of_the_answers_are_the_oracles(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(n, marks=pytest.mark.slow) if n in LARGE else n for n in sorted(set(PLANS) - set(QUICK))],
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n in LARGE else n for n in sorted(set(PLANS) - set(QUICK))]
 )
 def test_two_windows_of_the_answers_are_the_oracles(name: str) -> None:
     windows = slice(40, 42) if name in LARGE else slice(1, 3)

@@ -37,7 +37,6 @@ def test_d1_is_near_for_a_gaussian_next_to_the_near_plane() -> None:
         z = PAPER.near_plane * (1.0 + side * TINY)
         got = margins(grey([0.5], means=[[0.003, 0.0, z]]), dyadic_camera(3, 3))
         assert got.gaussians["D1"][0] < 10.0 * TINY
-        assert got.nearest is not None
         assert got.nearest.decision == "D1"
         assert got.nearest.where == (0,)
         # whether it is there or not, it would cover every pixel
@@ -286,9 +285,7 @@ def test_d4_touches_the_pixels_that_see_both_splats_and_not_those_that_stopped_b
 @pytest.mark.parametrize(
     ("mean", "eye"), [([0.0] * 3, [0.0] * 3), ([0.0, 0.0, -3.0], [0.0] * 3), ([0.5, 0.25, -1.0], [0.5, 0.25, -1.0])]
 )
-def test_a_gaussian_at_or_behind_the_camera_is_surely_culled_and_leaves_the_others_alone(
-    mean: list[float], eye: list[float], profile: Profile
-) -> None:
+def test_a_gaussian_at_or_behind_the_camera_is_surely_culled_and_leaves_the_others_alone(mean, eye, profile):
     moved = np.eye(4)
     moved[:3, 3] = -np.array(eye)
     view = replace(dyadic_camera(3, 3), viewmat=moved)

@@ -34,9 +34,6 @@ def test_jacobians_are_the_pinhole_s_derivative_to_mpmath_s_digits(point: tuple[
     np.testing.assert_allclose(centre, (K @ p)[:2] / z, rtol=1e-14)
 
 
-# Activations.
-
-
 @given(st.floats(-700.0, 700.0))
 def test_opacities_are_the_logistic_function_to_the_last_bits(logit: float) -> None:
     with mpmath.workdps(40):
@@ -56,8 +53,6 @@ def test_quaternions_whose_squares_underflow_or_overflow_are_still_normalised() 
         np.testing.assert_allclose(unit, 0.5, rtol=1e-15)
 
 
-# Rotations.
-
 # multiples of 1/1024, so that no square underflows where bits are compared
 covariance_lattice = st.integers(-4096, 4096).map(lambda k: k / 1024.0)
 quat_lists = st.lists(covariance_lattice, min_size=4, max_size=4).filter(any)
@@ -68,9 +63,6 @@ def test_rotations_are_those_of_scipy(quat: list[float]) -> None:
     w, x, y, z = quat
     want = Rotation.from_quat([x, y, z, w]).as_matrix()
     np.testing.assert_allclose(covariance.rotmats_from_quats(np.array([quat]))[0], want, atol=2e-15)
-
-
-# The footprint at its edges.
 
 
 def test_an_opacity_under_the_floor_has_no_extent_and_one_at_the_floor_a_zero_one() -> None:
@@ -95,8 +87,6 @@ def test_a_huge_splat_s_extent_fits_an_int32() -> None:
     radii = footprint.radii_from_covars2d(np.diag([1e30, 1e30])[None], np.ones(1))
     assert radii.tolist() == [[2**31 - 1, 2**31 - 1]]
 
-
-# Spherical harmonics.
 
 HARMONICS_RNG = np.random.default_rng(8)
 DIRS = HARMONICS_RNG.normal(size=(40, 3))

@@ -177,9 +177,7 @@ AT_THE_STOP = [(7 / 8, 1.0), (1 / 16, 3.0), (7 / 8, 2.0), (1 / 2, 4.0)]
 @given(stacks, backgrounds, profiles)
 @example(AT_THE_STOP, 1.0, DYADIC)
 @example(AT_THE_STOP, 1.0, DYADIC_STRICT)
-def test_a_pixel_equals_the_exact_rational_one(
-    stack: list[tuple[float, float]], background: float, profile: Profile
-) -> None:
+def test_a_pixel_equals_the_exact_rational_one(stack, background, profile):
     pixel, _ = blend(stack, background, profile)
     exact = Exact(stack, background, profile)
     assert pixel.ids == exact.ids
@@ -191,9 +189,7 @@ def test_a_pixel_equals_the_exact_rational_one(
 
 
 @given(stacks, backgrounds, profiles)
-def test_a_pixel_s_gradient_equals_the_exact_rational_one(
-    stack: list[tuple[float, float]], background: float, profile: Profile
-) -> None:
+def test_a_pixel_s_gradient_equals_the_exact_rational_one(stack, background, profile):
     pixel, rows = blend(stack, background, profile)
     exact = Exact(stack, background, profile)
     totals = zero_gradients(len(stack), 1)

@@ -155,9 +155,6 @@ def test_a_population_may_die_out_during_training() -> None:
     assert np.all(np.isfinite(losses))
 
 
-# Adam and its schedules.
-
-
 def test_an_update_decays_second_moments_as_its_recipe_says() -> None:
     before, gradient = start({"means": np.zeros((1, 3))}), {"means": np.full((1, 3), 2.0)}
     for beta2 in (0.999, 0.75):
@@ -179,9 +176,7 @@ def test_updates_count_from_one() -> None:
 
 
 @pytest.mark.parametrize(("opacity", "steps"), [(0.1, 130), (0.5, 380), (0.99, 430)])
-def test_an_opacity_that_only_pop_touches_falls_under_the_pruning_threshold_in_so_many_steps(
-    opacity: float, steps: int
-) -> None:
+def test_an_opacity_that_only_pop_touches_falls_under_the_pruning_threshold_in_so_many_steps(opacity, steps):
     logit = {"o": np.log(np.array([opacity]) / (1.0 - opacity))}
     m = v = {"o": np.zeros(1)}
     taken = 0
@@ -342,9 +337,6 @@ def test_3dgs_is_inrias_code_of_october_2024() -> None:
 def test_gsplat_is_its_default_strategy() -> None:
     assert_same_step(RECIPES["gsplat"], ByHand(**L1, weights={"lambda_ssim": 0.2}, important=None))
     assert not RECIPES["gsplat"].density.inclusive
-
-
-# Density control.
 
 
 def population(logits: list[float]) -> Rows:

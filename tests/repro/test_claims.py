@@ -55,7 +55,6 @@ _OFF = ((42, -0.01), (43, 0.01))
 
 
 def judged(id: str, results: list[Result], scale: str = "small") -> Claim:
-    """Judge one claim."""
     return next(claim for claim in claims(scale, results) if claim.id == id)
 
 
@@ -109,13 +108,7 @@ def test_one_seed_decides_nothing_where_no_row_has_two_and_else_beyond_the_noise
 def test_every_command_that_would_decide_is_one(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     # of a folder without results, so that no row which is done here is missing from the list
     empty = ["--results", str(tmp_path)]
-    found = [
-        whole("pop", psnr=30.01),
-        whole("reset"),
-        *two("l2"),
-        *two("gsplat", "bear_512"),
-        whole("pop_size_prune"),
-    ]
+    found = [whole("pop", psnr=30.01), whole("reset"), *two("l2"), *two("gsplat", "bear_512"), whole("pop_size_prune")]
     for claim in claims("small", found):
         for told in (claim.told, *claim.others):
             for line in told.deciders:
@@ -486,12 +479,10 @@ RESET = next(question for question in questions(paper()) if question.id == "rese
 
 
 def runs(row: str, *psnr: float, scene: str = "fox", n: int = 1000) -> list[Result]:
-    """Make the runs of a row, a seed each."""
     return [whole(row, scene, seed=seed, n=n, psnr=value) for seed, value in zip(count(42), psnr, strict=False)]
 
 
 def compared(pop: list[Result], reset: list[Result], more: Sequence[Result] = ()) -> Comparison:
-    """Compare PSNR of two rows on fox."""
     found = compare(
         "PSNR", groups([*pop, *reset])["fox"], noise_of([*pop, *reset, *more]), PSNR, {"pop": 1.0, "reset": -1.0},
         "at least",
@@ -503,7 +494,6 @@ def compared(pop: list[Result], reset: list[Result], more: Sequence[Result] = ()
 def test_the_spread_is_pooled_over_rows_and_scenes_about_each_mean() -> None:
     found = noise_of([*runs("pop", 1.0, 3.0), *runs("l2", 5.0, 5.0, 8.0, scene="bear_512"), *runs("reset", 77.0)])
     spread = found.of(PSNR)
-    assert spread is not None
     # 2 and 6, over one and two degrees of freedom
     assert (spread.s, spread.df, spread.groups) == (pytest.approx(sqrt(8.0 / 3.0)), 3, 2)
     assert (spread.least, spread.largest) == (pytest.approx(sqrt(2.0)), pytest.approx(sqrt(3.0)))
@@ -514,12 +504,10 @@ def test_the_spread_is_pooled_over_rows_and_scenes_about_each_mean() -> None:
 def test_counts_vary_by_their_ratios_and_times_on_each_machine_alone() -> None:
     two = [whole(seed=s, n=n, machine=m) for s, n, m in ((1, 1000, "a"), (2, 2000, "b"))]
     spread = noise_of(two).of(COUNT)
-    assert spread is not None
     assert exp(spread.s * sqrt(2.0)) == pytest.approx(2.0)
     assert noise_of(two).of(SECONDS) is None
     same = [replace(r, machine="a", seconds={**r.seconds, "cpu": 100.0 * r.seed}) for r in two]
     known = noise_of(same).of(SECONDS)
-    assert known is not None
     assert exp(known.s * sqrt(2.0)) == pytest.approx(2.0)
     # a CPU's time by the clock is no time of a method
     by_clock = [replace(r, seconds={"load": 1.0, "train": 100.0 * r.seed, "evaluate": 1.0}) for r in same]
@@ -606,8 +594,8 @@ def test_without_a_difference_a_verdict_is_as_rare_as_stated(scenes: tuple[str, 
     seed=st.integers(0, 10**6),
 )
 def test_a_difference_far_beyond_the_noise_is_decided_by_its_sign_in_results_of_any_shape(
-    effects: dict[str, float], seeds: dict[str, int], repeated: int, sigma: float, seed: int
-) -> None:
+    effects, seeds, repeated, sigma, seed
+):
     rng = random.Random(seed)
     found = drawn(rng, {scene: effect * sigma for scene, effect in effects.items()}, seeds, sigma)
     # without this row shapes of one seed each have no noise floor

@@ -218,7 +218,6 @@ def test_the_star_of_figure_6b_lies_on_that_side_of_the_curve_that_the_claim_say
         star = axes.transData.transform(axes.collections[-1].get_offsets())[0]
         above = star[1] - np.interp(star[0], curve_drawn[:, 0], curve_drawn[:, 1])
         told = re.search(r"L2 less L1 / n ([+-]\d+\.\d\d)", axes.get_title(loc="left"))
-        assert told is not None
         if abs(float(told[1])) > 0.05:
             assert (above > 0.0) == (float(told[1]) > 0.0), scene
         verdict = verdicts[scene].verdict

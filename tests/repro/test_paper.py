@@ -245,12 +245,6 @@ def test_every_open_question_is_listed_with_its_default() -> None:
     assert all(a.default in lines[a.id] for a in AMBIGUITIES)
 
 
-@pytest.mark.parametrize("name", ["README.md", "protocol.md", "claims.md"])
-def test_every_link_leads_somewhere(name: str) -> None:
-    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", (HERE / name).read_text(encoding="utf-8")):
-        assert (HERE / target).exists(), target
-
-
 @pytest.mark.parametrize(
     ("path", "text"), files(FOUND).items(), ids=lambda value: value.name if isinstance(value, Path) else ""
 )
@@ -299,9 +293,7 @@ def test_marks_that_are_absent_are_told() -> None:
         with_part("a", "y", "new")
 
 
-def test_the_script_writes_and_checks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_script_writes_and_checks(tmp_path, monkeypatch, capsys):
     for name in ("README.md", "protocol.md", "claims.md"):
         (tmp_path / name).write_text((HERE / name).read_text(encoding="utf-8"), encoding="utf-8")
     make = status.files
@@ -328,7 +320,6 @@ def on_paper(row: str, scene: str, seed: int = 42, n: int = 268_000, **changes: 
 
 
 def line_of(made: Table, block: int, row: str) -> Line:
-    """Find a line."""
     return next(line for line in made.blocks[block].lines if line.row == row)
 
 
@@ -441,7 +432,6 @@ def test_other_data_never_stands_beside_a_number_of_the_paper(number: int, scale
 
 def test_ratios_stand_beside_the_papers_own() -> None:
     ratios = table(1, "small", DEV).ratios
-    assert ratios is not None
     assert ratios.columns == (
         "fox",
         "bear_512",
@@ -450,12 +440,9 @@ def test_ratios_stand_beside_the_papers_own() -> None:
         "paper, Mip-NeRF 360",
         "paper, Deep Blending",
     )
-    assert ratios.relative is not None
     assert ratios.relative["pop"] == ["51.0%, -0.30 dB", *["not run"] * 3, "8.5%, -0.65 dB", "3.9%, -0.95 dB"]
     assert ratios.relative["taming"][:2] == ["not run", "not run"]
     blur = table(3, "small", DEV).ratios
-    assert blur is not None
-    assert blur.relative is not None
     assert blur.relative["pop"] == [
         "46.4%, -0.20 dB",
         *["not run"] * 3,
@@ -468,8 +455,6 @@ def test_ratios_stand_beside_the_papers_own() -> None:
 
 def test_a_ratio_without_its_base_says_so_and_every_base_is_in_its_table() -> None:
     ratios = table(1, "small", DEV[:1]).ratios
-    assert ratios is not None
-    assert ratios.relative is not None
     assert ratios.relative["pop"][0] == "gsplat not run"
     assert {number: base for number, base in REFERENCES.items() if paper().table(number).row(base)} == REFERENCES
     assert set(REFERENCES) == {1, 2, 3, 4, 5}

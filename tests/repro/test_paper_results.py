@@ -156,9 +156,7 @@ DISAGREEING = [
 @pytest.mark.parametrize(
     ("change", "message"), [*DAMAGE, *DISAGREEING], ids=[message[:40] for _, message in [*DAMAGE, *DISAGREEING]]
 )
-def test_a_result_that_was_damaged_or_edited_is_told_by_file_line_and_field(
-    change: Callable[[dict[str, Any]], None], message: str, tmp_path: Path
-) -> None:
+def test_a_result_that_was_damaged_or_edited_is_told_by_file_line_and_field(change, message, tmp_path):
     settings = {**PLAIN.schedule, "pop.lambda_pop": 0.01}
     write(result(scene="bear_512"), tmp_path)
     path = write(result(curve=curve({0: 1000, 9_999: 1000}, **STEPS), schedule=settings), tmp_path)
@@ -245,7 +243,6 @@ def test_a_result_comes_out_again_to_the_last_bit_on_the_same_machine(trained, t
 def altered(folder: Path, to: Path, **changes) -> Result:
     """Write the folder's result with changes to another one; the result agrees with itself all the same."""
     result = find("toy", "pop", "demo", 42, folder / "results")
-    assert result is not None
     write(replace(result, **changes), to / "results")
     return result
 

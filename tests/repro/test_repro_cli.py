@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,6 +18,7 @@ from paper_repro.cli import COMMANDS, main
 from paper_repro.jobs import ROWS, job_named, jobs_of, load_row, trainable
 from paper_repro.paper import paper
 from paper_repro.results import read_all
+from tests.app.conftest import wait_until
 
 ROOT = Path(__file__).parents[2]
 HEAVY = ("torch", "scipy", "cv2", "matplotlib", "pycolmap", "tyro", "snakemake")
@@ -172,9 +172,7 @@ def queued(tmp_path_factory):
     how = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "cwd": folder, "env": environment}
     process = subprocess.Popen(command, **how)
     metrics = folder / "work" / "toy" / "l1_div_100" / "demo_42" / "metrics.jsonl"
-    end = time.monotonic() + 120.0
-    while not (metrics.is_file() and metrics.stat().st_size > 0) and time.monotonic() < end and process.poll() is None:
-        time.sleep(0.05)
+    wait_until(lambda: metrics.is_file() and metrics.stat().st_size > 0, process)
     process.send_signal(signal.SIGTERM)
     stopped = process.communicate(timeout=120)[0], process.returncode
     left = sorted(path.parent.name for path in folder.rglob("ckpts/*.pt"))
@@ -287,7 +285,6 @@ needs_snakemake = pytest.mark.skipif(
 
 
 def workflow(folder: Path, *words: str, profile: Path | None = None, **config: object) -> str:
-    """Run the workflow in a folder and return what it printed."""
     settings = {"results": folder / "results", "work": folder / "work", "data": folder, "out": folder / "out", **config}
     chosen = [] if profile is None else ["--profile", str(profile)]
     command = [sys.executable, "-m", "snakemake", "-s", str(SNAKEFILE), *chosen, *words, "--config"]

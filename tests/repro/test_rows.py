@@ -12,7 +12,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -54,11 +54,10 @@ from pop_fast.io.images import read_image, write_png
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.model import KEYS
 from pop_fast.train.presets import METHODS
-from pop_ref.constants import PROFILES
 from pop_ref.recipes import BASELINES, L1_DIVIDED, RECIPES, Recipe
-from pop_ref.settings import DensityConfig, PopTerm
-from tests.app.test_strategies import engine_or_skip, tiny_method
-from tests.app.tiny import tiny_capture
+from tests.app.test_config import assert_trains
+from tests.app.test_strategies import tiny_method
+from tests.app.tiny import skip_without, tiny_capture
 
 # rows that are a recipe of the oracle
 OF_RECIPES = {
@@ -126,15 +125,7 @@ def test_rows_have_the_names_and_bytes_that_the_paper_has_for_them():
 
 @pytest.mark.parametrize("name", [*NAMED, *OTHERS])
 def test_a_row_trains_what_the_recipe_of_its_name_says(name):
-    recipe, config = {**NAMED, **OTHERS}[name], job_named(name, "garden", "paper").config()
-    for kind, said in ((DensityConfig, recipe.density), (PopTerm, recipe)):
-        for field in fields(kind):
-            assert getattr(config.strategy, field.name) == getattr(said, field.name), field.name
-    photometric = (config.photometric, config.lambda_ssim, config.l2_stop_iter, config.ssim_padding)
-    assert photometric == (recipe.pixelwise, recipe.lambda_ssim, recipe.l2_stop_iter, recipe.padding)
-    assert config.photometric_divisor == pytest.approx(1.0 / recipe.pixel_scale, rel=1e-15)
-    assert (config.lr, PROFILES[config.profile]) == (recipe.lr, recipe.profile)
-    assert (config.max_steps, config.sh_interval) == (recipe.max_steps, recipe.sh_interval)
+    assert_trains(job_named(name, "garden", "paper").config(), {**NAMED, **OTHERS}[name])
 
 
 @pytest.mark.parametrize("name", READINGS)
@@ -351,11 +342,7 @@ def test_a_scene_is_one_file_and_nothing_else_is_edited_to_add_one(tmp_path: Pat
         ('folder = "fox"', "", "has no folder"),
         ("shrunk = 1", "shrunk = 0", "shrunk is 0; it must be a whole number of at least 1"),
         ("verified = true", "verified = 1", "verified is 1; it must be true or false"),
-        (
-            'dataset = "further"',
-            'dataset = "moon"',
-            "dataset is 'moon'; it must be one of mipnerf360, tandt",
-        ),
+        ('dataset = "further"', 'dataset = "moon"', "dataset is 'moon'; it must be one of mipnerf360, tandt"),
         ("size = [1080, 1920]", "size = [1080]", r"size is \[1080\]; it must be \[width, height\] in pixels"),
         ("small = 4", "small = 0", "factors is .*; it must be a table of whole numbers of at least 1, by scale"),
         ("shrunk = 1", "shrunken = 1", "shrunk"),
@@ -432,7 +419,7 @@ def test_a_scene_other_than_published_is_refused(root: Path, monkeypatch, what: 
     assert says in found.reason
 
 
-def test_a_capture_with_a_split_of_its_own_is_refused(root: Path, monkeypatch):
+def test_a_capture_with_a_split_of_its_own_is_refused(root: Path):
     job = job_named("pop", "bonsai", "paper")
     config = job.config()
     capture = load_capture(root / "360_v2" / "bonsai", images="images_2")
@@ -585,9 +572,9 @@ def traced(run: TrainingRun, patch: pytest.MonkeyPatch) -> list[str]:
 @pytest.mark.parametrize("backend", ["fast", "compiled"])
 @pytest.mark.parametrize("method", METHODS)
 def test_what_happens_to_the_gaussians_in_a_step_has_the_order_of_the_methods_table(
-    method: str, backend: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    engine_or_skip(backend)
+    method, backend, tmp_path, monkeypatch
+):
+    skip_without(backend)
     order = load_pinned(method).order
     kinds = {**{kind: USUAL[kind] for kind in USUAL if kind in order}, **KINDS.get(method, {})}
     assert set(kinds) <= order.keys()

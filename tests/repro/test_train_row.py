@@ -10,7 +10,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -46,6 +45,7 @@ from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.checkpoint import capture_fingerprint
 from pop_fast.train.choose import choose_backend
 from tests.app.captures import colmap_capture
+from tests.app.conftest import wait_until
 from tests.app.tiny import interrupt, interrupted
 from tests.repro.made import options, toy, values
 
@@ -150,7 +150,7 @@ def test_a_row_that_was_interrupted_ends_with_the_same_result(made, tmp_path):
     assert values(again) == values(made[1])
 
 
-def test_what_was_asked_to_be_kept_is_kept(made, tmp_path):
+def test_what_was_asked_to_be_kept_is_kept(tmp_path):
     how = options(tmp_path, keep_ply=True, keep_checkpoints=True)
     job = toy("l1_div_10", steps_scaler=0.002)
     result = train_row(job, how)
@@ -160,12 +160,12 @@ def test_what_was_asked_to_be_kept_is_kept(made, tmp_path):
     assert (result.schedule["max_steps"], result.schedule["photometric_divisor"]) == (60, 10.0)
 
 
-@pytest.mark.parametrize("row", ["3dgs", "gsplat", "reset", "l1_div_10"])
+@pytest.mark.parametrize("row", ["3dgs", "gsplat", "reset"])
 def test_rows_of_other_methods_and_losses_are_trained(row, tmp_path, made):
-    job = toy(row, steps_scaler=0.003)
+    job = toy(row, steps_scaler=0.001)
     result = train_row(job, options(tmp_path))
     assert result.schedule["method"] == job.row.method
-    assert {point["step"] for point in result.curve} >= {0, 89}
+    assert {point["step"] for point in result.curve} >= {0, 29}
     assert result.run != made[1].run
     assert result.data_hash == made[1].data_hash
     loss = "l2" if row == "reset" else "l1"
@@ -174,13 +174,13 @@ def test_rows_of_other_methods_and_losses_are_trained(row, tmp_path, made):
 
 def test_a_run_is_known_by_settings_data_and_seed_and_not_by_how_it_ran(tmp_path):
     job = toy("pop", steps_scaler=0.001)
-    one, other = (train_row(job, options(tmp_path / name)) for name in ("a", "b"))
-    assert (one.run, one.config_hash, one.data_hash) == (other.run, other.config_hash, other.data_hash)
-    threads = train_row(job, options(tmp_path / "c", threads=2, checkpoint_every=7, log_every=5))
-    assert (threads.run, threads.threads) == (one.run, 2)
+    one = train_row(job, options(tmp_path / "a"))
+    threads = train_row(job, options(tmp_path / "b", threads=2, checkpoint_every=7, log_every=5))
+    assert (threads.run, threads.config_hash, threads.data_hash) == (one.run, one.config_hash, one.data_hash)
+    assert threads.threads == 2
     logged = [{point["step"] for point in result.curve if "psnr" in point} for result in (one, threads)]
     assert logged == [{0, 10, 20}, {0, 5, 10, 15, 20, 25}]
-    seed = train_row(replace(job, seed=43), options(tmp_path / "d"))
+    seed = train_row(replace(job, seed=43), options(tmp_path / "c"))
     assert (seed.config_hash, seed.seed) == (one.config_hash, 43)
     assert seed.run != one.run
 
@@ -200,7 +200,7 @@ def test_a_result_whose_row_has_changed_is_refused_and_new_settings_are_not(made
     assert read(path) == (other,)
 
 
-def test_a_row_that_another_process_trains_is_left_to_it(made, tmp_path):
+def test_a_row_that_another_process_trains_is_left_to_it(tmp_path):
     job, how = toy("l2"), options(tmp_path)
     with (
         only_one(job.work(how.work).with_suffix(".lock"), "taken"),
@@ -241,21 +241,14 @@ def test_what_an_earlier_training_left_does_not_reach_a_result(tmp_path):
     assert values(train_row(job, how)) == first
 
 
-def _waiting_for(path: Path, process: subprocess.Popen, seconds: float = 120.0) -> None:
-    end = time.monotonic() + seconds
-    while not (path.is_file() and path.stat().st_size > 0):
-        assert process.poll() is None, "it ended before its first step"
-        assert time.monotonic() < end, f"{path} was not written"
-        time.sleep(0.05)
-
-
 @pytest.mark.slow  # a row is trained twice
 def test_sigterm_leaves_a_checkpoint_and_the_same_command_goes_on(made, tmp_path):
     how, job = options(tmp_path), toy("pop")
     words = ["run", "pop", "demo", "--scale", "toy", "--results", str(how.results), "--work", str(how.work)]
     command = [sys.executable, "-m", "paper_repro", *words]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, cwd=ROOT)
-    _waiting_for(job.work(how.work) / "metrics.jsonl", process)
+    metrics = job.work(how.work) / "metrics.jsonl"
+    wait_until(lambda: metrics.is_file() and metrics.stat().st_size > 0, process)
     process.send_signal(signal.SIGTERM)
     _, said = process.communicate(timeout=120)
     assert (process.returncode, said) == (
@@ -280,14 +273,20 @@ def test_a_finished_row_leaves_its_splat_and_two_renders_with_their_hashes(made)
         assert np.array_equal(read_image(place / "held_out_0002.png"), kept["render"])
 
 
+def steps_taken(monkeypatch) -> list[int]:
+    """Note from now on the steps before which runs are asked to take some."""
+    steps, take = [], TrainingRun.take_steps
+    monkeypatch.setattr(TrainingRun, "take_steps", lambda run, last: steps.append(run.step) or take(run, last))
+    return steps
+
+
 def test_a_finished_row_is_trained_again_where_that_is_asked_for_and_its_result_replaced(tmp_path, monkeypatch):
     # with its last checkpoint, from which it would continue with nothing left to do
     how, job = options(tmp_path, keep_checkpoints=True, published=tmp_path / "shown"), toy("pop", steps_scaler=0.001)
     first = train_row(job, how)
     write(replace(first, machine="another"), how.results)
     assert train_row(job, how).machine == "another"
-    steps, take = [], TrainingRun.take_steps
-    monkeypatch.setattr(TrainingRun, "take_steps", lambda run, last: steps.append(run.step) or take(run, last))
+    steps = steps_taken(monkeypatch)
     assert values(train_row(job, replace(how, again=True))) == values(first)
     assert min(steps) == 0
     assert values(job.result(how.results)) == values(first)
@@ -319,8 +318,7 @@ def test_a_row_that_begins_from_its_base_comes_to_what_it_comes_to_alone(
     assert [path.name for path in kept.parent.iterdir()] == [kept.name]
     assert not (of_base.work(how.work) / "ckpts").exists()
 
-    steps, take = [], TrainingRun.take_steps
-    monkeypatch.setattr(TrainingRun, "take_steps", lambda run, last: steps.append(run.step) or take(run, last))
+    steps = steps_taken(monkeypatch)
     with interrupted(at=stop):
         train_row(job, how)
     assert kept.is_file()
@@ -464,9 +462,6 @@ def test_gradients_are_those_of_autograd_in_units_of_the_slope_of_l1():
         assert found["grad_l1"] == pytest.approx(1.0, rel=1e-12)
 
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-
-
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     """A capture with a mask, a split of its own, tracks and notes."""
@@ -556,7 +551,7 @@ def test_a_row_of_what_was_prepared_is_the_row_of_the_photographs(tmp_path, monk
 
 
 def test_the_pack_holds_what_rows_see_of_a_scene(tmp_path, monkeypatch, capsys):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     import gpu_pack
 
     data = tmp_path / "data"

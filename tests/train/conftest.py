@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 import torch
 
-from pop_fast.api.backend import get_backend
 from pop_fast.train.engines import torch_engine, whole_engine
+from tests.app.tiny import skip_without
 
 ENGINES = ("fast", "compiled", "native")
 
@@ -19,9 +19,7 @@ ENGINES = ("fast", "compiled", "native")
 @pytest.fixture(params=ENGINES)
 def engine(request: pytest.FixtureRequest) -> Any:
     """Return what takes the steps, or skip with the reason why it cannot here."""
-    reason = get_backend("fast" if request.param == "fast" else "compiled").why_not()
-    if reason is not None:
-        pytest.skip(reason)
+    skip_without("fast" if request.param == "fast" else "compiled")
     return whole_engine() if request.param == "native" else torch_engine(request.param)
 
 

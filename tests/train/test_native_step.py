@@ -37,7 +37,7 @@ from pop_ref.settings import PARAMETERS
 from tests.app.tiny import HEIGHT, WIDTH, interrupted, last_checkpoint, tiny_capture, tiny_config
 
 REASON = get_backend("compiled").why_not()
-needs_compiled = pytest.mark.skipif(REASON is not None, reason=REASON or "")
+pytestmark = pytest.mark.skipif(REASON is not None, reason=REASON or "")
 
 STEPS = 6
 # statistics and dominance are collected at every step, and nothing is changed
@@ -106,7 +106,6 @@ def put_where(run: TrainingRun, other: TrainingRun) -> None:
             moment.copy_(other.optimizers[key].state[other.params[key]][name])
 
 
-@needs_compiled
 @pytest.mark.parametrize("what", SETTINGS)
 def test_six_steps_are_torchs(what: str, tmp_path: Path) -> None:
     mine, its = (run_of(tmp_path, engine, SETTINGS[what]) for engine in (whole_engine(), torch_engine("fast")))
@@ -141,7 +140,6 @@ def test_six_steps_are_torchs(what: str, tmp_path: Path) -> None:
         assert found is None or torch.equal(found.to(wanted.dtype), wanted), name
 
 
-@needs_compiled
 def test_gaussians_of_one_depth_are_blended_row_by_row_however_many_there_are(tmp_path: Path) -> None:
     # on four planes before cameras that look along z: buckets of depths are sorted digit by digit, ties by row
     n, found = 6000, []
@@ -176,11 +174,8 @@ def test_gaussians_of_one_depth_are_blended_row_by_row_however_many_there_are(tm
     assert int((wanted > 0).sum()) > 50
 
 
-@needs_compiled
 @pytest.mark.parametrize("what", ["on grey, with a mask", "antialiased", "all for few photographs"])
-def test_the_bits_depend_neither_on_threads_nor_on_how_many_steps_are_asked_for_at_once(
-    what: str, tmp_path: Path
-) -> None:
+def test_the_bits_depend_neither_on_threads_nor_on_how_many_steps_are_asked_for_at_once(what, tmp_path):
     found = []
     for threads, pace in ((1, 1), (2, STEPS), (3, 2), (7, STEPS)):
         torch.set_num_threads(threads)
@@ -192,7 +187,6 @@ def test_the_bits_depend_neither_on_threads_nor_on_how_many_steps_are_asked_for_
         assert all(torch.equal(params[key], found[0][1][key]) for key in params)
 
 
-@needs_compiled
 def test_a_step_that_is_left_changes_nothing_and_is_taken_by_whoever_goes_on(tmp_path: Path) -> None:
     last, settings = 24, {**SETTINGS["blur of summed counts"], "sh_interval": 100}
 
@@ -226,11 +220,8 @@ def test_a_step_that_is_left_changes_nothing_and_is_taken_by_whoever_goes_on(tmp
     assert len(stopped) > 1, "nothing was left half way"
 
 
-@needs_compiled
 @pytest.mark.parametrize("method", ["pop", "gsplat"])
-def test_how_many_steps_are_taken_at_a_time_changes_no_bit(
-    method: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_how_many_steps_are_taken_at_a_time_changes_no_bit(method, tmp_path, monkeypatch):
     found: list[dict[str, Any]] = []
     blocks: list[int] = []
     own, took = CompiledBackend.whole_step, TrainingRun.take_steps
@@ -252,7 +243,6 @@ def test_how_many_steps_are_taken_at_a_time_changes_no_bit(
     assert [name for other in found[1:] for name, value in found[0].items() if not same(value, other[name])] == []
 
 
-@needs_compiled
 @pytest.mark.parametrize("method", ["pop", "gsplat"])
 def test_a_run_goes_on_with_another_number_of_threads_to_the_same_bits(method: str, tmp_path: Path) -> None:
     # so many Gaussians that torch shares them out: those of the densification steps between the native ones too
@@ -277,11 +267,8 @@ def test_a_run_goes_on_with_another_number_of_threads_to_the_same_bits(method: s
         assert same(whole[part], parts[part]), part
 
 
-@needs_compiled
 @pytest.mark.parametrize("most", [1_000_000, 10])
-def test_a_step_whose_lists_cannot_be_numbered_is_told_before_it_is_taken(
-    most: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_step_whose_lists_cannot_be_numbered_is_told_before_it_is_taken(most, tmp_path, monkeypatch):
     monkeypatch.setattr(native_step, "MOST_ENTRIES", most)
     run = run_of(tmp_path, whole_engine(), {})
     before = {key: param.detach().clone() for key, param in run.params.items()}
@@ -294,14 +281,12 @@ def test_a_step_whose_lists_cannot_be_numbered_is_told_before_it_is_taken(
     assert all(torch.equal(param, before[key]) for key, param in run.params.items())
 
 
-@needs_compiled
 def test_memory_for_photographs_changes_no_bit(tmp_path: Path) -> None:
     runs = [run_of(tmp_path, whole_engine(), {"target_cache_mb": room}) for room in (0, 1024)]
     first, second = ([stats[:5] for stats in taken(run)] for run in runs)
     assert first == second
 
 
-@needs_compiled
 def test_photographs_of_several_sizes_are_trained_on(tmp_path: Path) -> None:
     capture = tiny_capture()
     views = tuple(
@@ -316,7 +301,6 @@ def test_photographs_of_several_sizes_are_trained_on(tmp_path: Path) -> None:
         assert found.objective == pytest.approx(wanted.objective, rel=2e-5)
 
 
-@needs_compiled
 @pytest.mark.parametrize("key", ["means", "scales", "quats", "opacities", "sh0"])
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 def test_a_row_that_is_not_finite_is_named_and_nothing_moves(key: str, value: float, tmp_path: Path) -> None:
@@ -332,7 +316,6 @@ def test_a_row_that_is_not_finite_is_named_and_nothing_moves(key: str, value: fl
         torch.testing.assert_close(param.detach(), before[name], rtol=0.0, atol=0.0, equal_nan=True)
 
 
-@needs_compiled
 def test_a_run_trains_natively_where_it_can_and_says_so(tmp_path: Path) -> None:
     config = replace(tiny_config(tmp_path), backend="compiled")
     assert TrainingRun(config, tiny_capture()).stepper.name == "native"
@@ -343,7 +326,6 @@ def test_a_run_trains_natively_where_it_can_and_says_so(tmp_path: Path) -> None:
     assert engine_of(config, own_strategy=False).make_stepper is not None
 
 
-@needs_compiled
 def test_a_stepper_takes_rows_on_the_cpu_in_single_precision_only(tmp_path: Path) -> None:
     run = run_of(tmp_path, whole_engine(), {})
     fused: Any = run.stepper
@@ -422,7 +404,6 @@ def walked(splats: dict[str, np.ndarray], lists: TileLists) -> dict[str, int]:
     return did
 
 
-@needs_compiled
 def test_counts_are_those_of_a_walk_through_the_lists() -> None:
     params = gaussians()
     splats, lists = listed(params)
@@ -441,7 +422,6 @@ def test_counts_are_those_of_a_walk_through_the_lists() -> None:
     assert found["walked"] < found["entries"]
 
 
-@needs_compiled
 @pytest.mark.parametrize(
     ("name", "change"),
     [
@@ -450,9 +430,7 @@ def test_counts_are_those_of_a_walk_through_the_lists() -> None:
         ("blurred", lambda found: found & False),
     ],
 )
-def test_laws_notice_statistics_that_a_whole_step_hands_on_wrongly(
-    name: str, change: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_laws_notice_statistics_that_a_whole_step_hands_on_wrongly(name, change, monkeypatch):
     law = law_named("test_collected:a_training_collects_the_oracles_gradients_views_and_blur_flags")
     backend = shipped("compiled32")
     assert obeys(law, backend) is None

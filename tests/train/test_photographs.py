@@ -34,7 +34,7 @@ from pop_ref.losses import photometric_pop, photometric_pop_vjp
 from pop_ref.records import Camera
 from pop_ref.render import render, render_vjp
 from pop_ref.training import gaussians_from_params
-from tests.app.tiny import last_checkpoint, run_until, tiny_capture, tiny_config
+from tests.app.tiny import last_checkpoint, run_until, skip_without, tiny_capture, tiny_config
 
 ALL = {"exposure": True, "random_background": True, "refine_cameras": True}
 RNG = np.random.default_rng(21)
@@ -61,9 +61,7 @@ def learned(run: TrainingRun) -> dict[str, torch.Tensor]:
 @pytest.mark.parametrize("backend", ["fast", "compiled"])
 @pytest.mark.parametrize("transparent", [False, True])
 def test_the_gradients_of_a_step_are_the_oracles(tmp_path: Path, backend: str, transparent: bool) -> None:
-    reason = get_backend(backend).why_not()
-    if reason is not None:
-        pytest.skip(reason)
+    skip_without(backend)
     # l2 and half the light, with a hole in the scene: the background counts
     config = tiny_config(tmp_path / "run", l2_stop_iter=None, **ALL)
     capture = tiny_capture()
@@ -128,9 +126,7 @@ def tiny_may_shrink(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("what", STOPPED)
 def test_a_run_that_was_stopped_goes_on_to_the_same_bits(what: str, tmp_path: Path) -> None:
     settings = STOPPED[what]
-    reason = get_backend(settings.get("backend", "fast")).why_not()
-    if reason is not None:
-        pytest.skip(reason)
+    skip_without(settings.get("backend", "fast"))
     # on either side of where photographs become whole
     for name, stops in (("whole", (None,)), ("parts", (7, 17 if what == "all" else 12, None))):
         for place, stop in enumerate(stops):
@@ -244,15 +240,11 @@ def test_transparency_matters_to_a_random_background_alone(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("name", sorted(ALL))
-def test_the_fused_step_refuses_each_setting_and_the_native_one_takes_exposures_alone(
-    tmp_path: Path, name: str
-) -> None:
+def test_the_fused_step_refuses_each_setting_and_the_native_one_takes_exposures_alone(tmp_path, name):
     config = tiny_config(tmp_path, **{name: True})
     assert name in str(why_not_trained(CUDA, config))
     assert why_not_trained(CUDA, tiny_config(tmp_path)) is None
-    reason = get_backend("compiled").why_not()
-    if reason is not None:
-        pytest.skip(reason)
+    skip_without("compiled")
     run = TrainingRun(replace(config, backend="compiled"), tiny_capture())
     assert run.stepper.name == ("native" if name == "exposure" else "torch")
     assert engine_of(replace(config, backend="compiled")).name == "compiled"
@@ -320,7 +312,6 @@ def test_the_transparency_of_a_shrunk_view_is_the_mean_over_its_areas(factor: in
     alpha = torch.randint(0, 256, (160, 256), generator=generator).to(torch.uint8)
     view = made_view(160, 256, alpha=alpha)
     small = shrunk(view, factor)
-    assert small.alpha is not None
     opacity = alpha.numpy().reshape(160 // factor, factor, 256 // factor, factor).mean((1, 3))
     assert np.abs(small.alpha.numpy() - opacity).max() <= 0.5 + 1e-4
     assert (small.name, small.viewmat.tolist()) == (view.name, view.viewmat.tolist())

@@ -561,7 +561,3 @@ def test_ten_losses_are_the_oracles(engine: Any, tmp_path: Path) -> None:
 @pytest.mark.parametrize("backend", ["fast", "ref"])
 def test_ten_losses_in_double_precision_are_the_oracles(backend: Any, tmp_path: Path) -> None:
     ladder_agree(climb(torch_engine(backend), tmp_path, torch.float64), torch.float64)
-
-
-def test_two_climbs_give_the_same_bits(engine: Any, tmp_path: Path) -> None:
-    assert climb(engine, tmp_path / "one") == climb(engine, tmp_path / "two")
