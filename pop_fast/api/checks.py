@@ -230,10 +230,9 @@ class Checks:
                 raise ValueError(
                     f"colors has shape {list(colors.shape)}; sh_degree={sh_degree} needs [..., N, >={need}, 3]"
                 )
-        self.finite(
-            "colors", self.tensor("colors", colors, per_camera if tuple(colors.shape) == per_camera else shared)
-        )
-        return tuple(colors.shape) == per_camera
+        is_per_camera = tuple(colors.shape) == per_camera
+        self.finite("colors", self.tensor("colors", colors, per_camera if is_per_camera else shared))
+        return is_per_camera
 
     def values(self) -> None:
         """Check what was left to be asked of values, in one go."""

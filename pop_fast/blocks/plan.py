@@ -57,7 +57,7 @@ import numpy as np
 from pop_fast.data.capture import Capture, Listing, SparsePoints
 from pop_fast.data.load import in_picture, write_block
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import write_atomically
+from pop_fast.io.atomic import write_json
 from pop_fast.io.read_back import read_json
 
 FOLDER: Final = "blocks"
@@ -232,8 +232,7 @@ def write_plan(folder: Path, plan: Plan, listing: Listing, transform: np.ndarray
         shots = [replace(shot, split="test" if shot.name in held else "train") for shot in listing.shots]
         write_block(folder / FOLDER / COARSE, replace(listing, shots=shots, transform=transform))
     content = {"blocks": [entry_of(block) for block in plan.blocks], "partition": plan.partition.plain()}
-    text = json.dumps(content, indent=2) + "\n"
-    write_atomically(folder / FOLDER / _PLAN, lambda file: file.write(text.encode()))
+    write_json(folder / FOLDER / _PLAN, content)
 
 
 def entry_of(block: Block) -> dict[str, Any]:

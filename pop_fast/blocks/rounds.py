@@ -16,7 +16,6 @@ So every step draws the very bits that were given, and their moments, which say 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,7 +33,7 @@ from pop_fast.data.capture import Capture, View
 from pop_fast.data.load import find_block, in_picture, load_capture, read_block, write_block
 from pop_fast.density.protocol import State
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import write_atomically
+from pop_fast.io.atomic import write_json
 from pop_fast.io.read_back import read_json
 from pop_fast.stages.covariance import opacities_from_logits, scales_from_log_scales
 from pop_fast.stages.splatting import ProjectionSettings, covariances, project
@@ -130,8 +129,7 @@ def write_counts(folder: Path, name: str, number: int, start: Start) -> None:
     """Write what a block starts from in a round, in numbers, as `own_of` reads them."""
     seen = len(start.params["means"])
     counts = {"own": start.own, "fixed": seen - start.own, "merged": start.merged}
-    text = json.dumps(counts) + "\n"
-    write_atomically(block_folder(folder, name, number) / _COUNTS, lambda file: file.write(text.encode()))
+    write_json(block_folder(folder, name, number) / _COUNTS, counts, indent=None)
 
 
 def own_of(folder: Path, name: str, number: int) -> dict[str, int]:

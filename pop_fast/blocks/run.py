@@ -9,13 +9,13 @@ last merge makes the run's result, and every other merge the start of the next r
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ from pop_fast.blocks.rounds import own_of
 from pop_fast.data.capture import Capture, Listing, Progress, SfmOptions
 from pop_fast.data.load import Photographs, list_capture, load_capture, read_block
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import write_atomically
+from pop_fast.io.atomic import write_atomically, write_json
 from pop_fast.io.ply import Frame, save_ply
 from pop_fast.io.read_back import read_json
 from pop_fast.train.checkpoint import checkpoint_path, load_splats, save_checkpoint
@@ -75,13 +75,8 @@ def write_map(path: Path, capture: Capture, plan: Plan) -> None:
     axes.set_title(
         f"{capture.name} in {plan.job.blocks}: points, cameras (triangles), cores, margins (dashed)", fontsize=9
     )
-    canvas = FigureCanvasAgg(figure)
-
-    def write(file: BinaryIO) -> None:
-        # without the date and version that matplotlib would add, so that the same plan is the same file
-        canvas.print_png(file, metadata={"Software": None})
-
-    write_atomically(path, write)
+    # without the date and version that matplotlib would add, so that the same plan is the same file
+    write_atomically(path, partial(FigureCanvasAgg(figure).print_png, metadata={"Software": None}))
 
 
 def _draw_points(axes: Axes, capture: Capture, plan: Plan) -> None:
@@ -383,8 +378,7 @@ def _hand_on(
         content = {"step": config.max_steps - 1, "splats": kept_of(partition, number, params)}
         save_checkpoint(core_of(folder, name, part.round), content)
     stats = _of_round(part.round, _evaluated(config, capture, params), params, rows)
-    text = json.dumps(stats, indent=2) + "\n"
-    write_atomically(_stats_path(folder, part.round), lambda file: file.write(text.encode()))
+    write_json(_stats_path(folder, part.round), stats)
     return stats
 
 

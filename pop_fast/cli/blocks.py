@@ -14,7 +14,7 @@ import tyro
 from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED, parse
 from pop_fast.cli.train_blocks import merged_lines, plan_lines, round_lines
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import write_atomically
+from pop_fast.io.atomic import write_file
 from pop_fast.io.heartbeat import bars
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.config import TrainConfig
@@ -102,8 +102,7 @@ def _partition(folder: Path, config: TrainConfig, record: CaptureRecord, job: Jo
     with bars(config.progress) as progress:
         division = divide_capture(config, record, job, progress=progress)
     division.write(folder)
-    for line in plan_lines(folder):
-        print(line)
+    print("\n".join(plan_lines(folder)))
     return 0
 
 
@@ -122,7 +121,7 @@ def _train(folder: Path, config: TrainConfig, job: Job, block: str, argv: Sequen
     status = train_capture(own, options, chosen, ["blocks", *argv])
     if status in (0, EXIT_INCOMPLETE):
         # what is incomplete then is the block's report, and it has been said
-        write_atomically(marker_of(folder, block), lambda file: file.write(b""))
+        write_file(marker_of(folder, block), b"")
         return 0
     return status
 
@@ -183,7 +182,7 @@ def _train_round(folder: Path, config: TrainConfig, record: CaptureRecord, job: 
         except KeyboardInterrupt:
             print(f"pop: {stopped(place, training.step)}", file=sys.stderr)
             return EXIT_INTERRUPTED
-    write_atomically(marker_of(folder, part.block, part.round), lambda file: file.write(b""))
+    write_file(marker_of(folder, part.block, part.round), b"")
     return 0
 
 
@@ -201,13 +200,13 @@ def _merge(folder: Path, config: TrainConfig, record: CaptureRecord, job: Job, p
     if not part.last:
         for line in round_lines([stats]):
             print(line, flush=True)
-        write_atomically(part.marker(folder), lambda file: file.write(b""))
+        write_file(part.marker(folder), b"")
         return 0
     for line in merged_lines(stats):
         print(line)
     print(summary(stats), flush=True)
     status = finish(folder, capture, options) or report(folder)
     if status == 0:
-        write_atomically(part.marker(folder), lambda file: file.write(b""))
+        write_file(part.marker(folder), b"")
         print(f"pop report {folder} --check adds the parts that need all photographs", file=sys.stderr)
     return status

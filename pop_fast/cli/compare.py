@@ -68,17 +68,12 @@ def _of_results(args: Args) -> dict[str, Any]:
 
 def _stats(path: Path, args: Args) -> dict[str, Any]:
     """Return what a result's training left of numbers, or measure the file of a splat."""
+    from pop_fast.cli.eval import measured
     from pop_fast.view.report.source import read_last_stats
 
     if path.is_file():
-        return _measured(path, args)
+        capture, stats = measured(load_splat(path), args, [])
+        return {**stats, "capture": capture, "method": path.name}
     config = read_config(path)
     stats = read_last_stats(path) or {"capture": Path(config.data).name, "method": config.method}
     return {**stats, "max_steps": config.max_steps}
-
-
-def _measured(path: Path, args: Args) -> dict[str, Any]:
-    from pop_fast.cli.eval import measured
-
-    capture, stats = measured(load_splat(path), args, [])
-    return {**stats, "capture": capture, "method": path.name}

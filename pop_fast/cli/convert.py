@@ -11,10 +11,9 @@ import numpy as np
 import tyro
 
 from pop_fast.cli import parse
-from pop_fast.cli.export import HTML, check_file, file_format, note_lost_frame, say_written
+from pop_fast.cli.export import HTML, check_file, file_format, note_lost_frame, page_output
 from pop_fast.cli.options import FormatName, LimitOptions, Output, Shown, limited
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import write_atomically
 from pop_fast.train.config import TrainConfig
 
 if TYPE_CHECKING:
@@ -60,22 +59,13 @@ def run(argv: Sequence[str]) -> int:
     output = _output(args, name, stored, config)
     move = _training_frame(args.source, stored) if args.crop is not None else None
     shown = Shown(params=stored.params, sh_degree=_MOST_BANDS, config=config, world_transform=move, photographed=None)
-    left = limited(shown, args, output)
-    for line in left.said:
-        print(line)
-    data = output.write(left.params, left.level)
-    write_atomically(args.out, lambda file: file.write(data))
-    say_written(args.out, len(left.params["means"]), len(data))
+    limited(shown, args, output).write(args.out, output)
     return 0
 
 
 def _output(args: Args, name: str, stored: Stored, config: TrainConfig) -> Output:
     if name == HTML:
-        from pop_fast.view.html import page_of
-
-        # no capture is known: it starts at a camera that sees most of the splat
-        rest = ([], config, _MOST_BANDS, args.source.resolve().name)
-        return Output(HTML, stored.antialiased, page=lambda params, level: page_of(params, *rest, level))
+        return page_output((), config, _MOST_BANDS, args.source)
     return Output(name, stored.antialiased, stored.frame)
 
 

@@ -73,11 +73,8 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
         folder = photo_folder(root)
         files = photographs(folder)
         shown, damage = _each(files, lambda path: measure_file(path, path.relative_to(folder).as_posix()), lambda p: p)
-        findings = [
-            *check_dataset.about_bare(root, shown),
-            *(bad("photographs", problem) for problem in damage),
-        ]
-        return [*findings, *about_quality(shown)]
+        damaged = [bad("photographs", problem) for problem in damage]
+        return [*check_dataset.about_bare(root, shown), *damaged, *about_quality(shown)]
     shots, cloud = listing.shots, listing.cloud
     where = listing.path.relative_to(root).as_posix()
     inside = "" if listing.made_from == where else f" in {where}"

@@ -22,14 +22,6 @@ from pop_fast.machine import machine_name, memory_bytes
 _LIBRARIES: Final = ("libtorch_python.so", "libtorch_python.dylib", "torch_python.dll")
 
 
-def why_torch_fails() -> str | None:
-    """Tell whether torch can be imported, from whether its library loads: the error, or None where it does.
-
-    Where the library does not load by itself, torch is imported: it knows more places to look for what it needs.
-    """
-    return None if _loads() else _why_not_imported("torch")
-
-
 def cuda_version() -> str | None:
     """Return the version of CUDA that torch was built with, None for a CPU build."""
     spec = importlib.util.spec_from_file_location("torch_version", _folder() / "version.py")
@@ -120,7 +112,8 @@ def packages() -> Iterator[DoctorLine]:
     """Import every package that pop uses, all but torch, whose library is loaded, and tell its version."""
     for distribution, module, purpose, needed in _PACKAGES:
         version = _installed(distribution)
-        fault = why_torch_fails() if module == "torch" else _why_not_imported(module)
+        # where torch's library does not load by itself, importing it does: it knows more places to look
+        fault = None if module == "torch" and _loads() else _why_not_imported(module)
         if fault is not None:
             reason = f"{purpose}; import fails: {fault}" if version else purpose
             fix = f"pip install --force-reinstall {distribution}" if version else f"pip install {distribution}"
@@ -194,7 +187,5 @@ def _why_not_imported(module: str) -> str | None:
 def _installed(distribution: str) -> str | None:
     from importlib.metadata import PackageNotFoundError, version
 
-    try:
+    with contextlib.suppress(PackageNotFoundError):
         return version(distribution)
-    except PackageNotFoundError:
-        return None

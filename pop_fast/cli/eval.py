@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,7 +13,7 @@ import tyro
 from pop_fast.cli import parse
 from pop_fast.cli.options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import check_file, write_atomically
+from pop_fast.io.atomic import check_file, write_json
 from pop_fast.io.heartbeat import Heartbeat
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import CaptureOptions, Splat, load_splat
@@ -64,11 +63,9 @@ def run(argv: Sequence[str]) -> int:
     if args.per_view:
         for name, numbers in stats["per_view"].items():
             print(f"{name}: " + ", ".join(f"{key} {value:.4f}" for key, value in numbers.items()))
-    for line in _lines(stats):
-        print(line)
+    print("\n".join(_lines(stats)))
     if args.json is not None:
-        text = json.dumps(stats, indent=2) + "\n"
-        write_atomically(args.json, lambda file: file.write(text.encode()))
+        write_json(args.json, stats)
     if args.splat.is_dir() and splat.step is not None and args.capture is None:
         _record(args.splat, splat.step, stats)
     return 0
@@ -116,19 +113,14 @@ def _record(folder: Path, step: int, stats: dict[str, Any]) -> None:
 
 
 def _lines(stats: dict[str, Any]) -> list[str]:
-    lines = [
+    variants = [f"LPIPS      {value:.4f} ({variant})" for variant, value in stats["lpips_variants"].items()]
+    return [
         f"views      {stats['views']}",
         f"PSNR       {stats['psnr']:.3f} dB",
         *([f"cc PSNR    {stats['cc_psnr']:.3f} dB, colours fitted to each photograph"] if "cc_psnr" in stats else []),
         f"SSIM       {stats['ssim']:.4f}",
-    ]
-    for variant, value in stats["lpips_variants"].items():
-        lines.append(f"LPIPS      {value:.4f} ({variant})")
-    if not stats["lpips_variants"]:
-        lines.append("LPIPS      not measured: give --lpips-alex or --lpips-vgg FILE")
-    lines += [
+        *(variants or ["LPIPS      not measured: give --lpips-alex or --lpips-vgg FILE"]),
         f"Gaussians  {stats['num_GS']:,} ({stats['num_GS_above_floor']:,} with opacity >= 1/255)",
         f"per pixel  {stats['n_blended']:.1f} blended, {stats['n_traversed']:.1f} traversed",
         f"opacity    {stats['opacity_below_0.1']:.1%} under 0.1, {stats['opacity_above_0.9']:.1%} over 0.9",
     ]
-    return lines

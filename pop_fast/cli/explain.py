@@ -14,7 +14,7 @@ import tyro
 from pop_fast.cli import parse
 from pop_fast.cli.options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import check_file, check_folder, folder_atomically, write_atomically
+from pop_fast.io.atomic import check_file, check_folder, folder_atomically, write_file, write_json
 from pop_fast.train.load_result import load_splat
 from pop_ref.constants import PROFILES
 
@@ -100,9 +100,10 @@ def _explain(args: Args, at: tuple[int, int] | None) -> int:
             )
         if args.json is not None:
             plain = json.loads(explanation.to_json()) | ({"difference": parting.plain()} if parting else {})
-            _write(args.json, json.dumps(plain, indent=1) + "\n")
+            write_json(args.json, plain, indent=1)
         if args.html is not None:
-            _write(args.html, page(explanation, maps, parting.lines if parting else ()))
+            text = page(explanation, maps, parting.lines if parting else ())
+            write_file(args.html, text.encode("utf-8", "backslashreplace"))
     if args.maps is not None:
         with folder_atomically(args.maps, args.overwrite) as folder:
             write_maps(maps, folder)
@@ -130,7 +131,3 @@ def chosen_view(capture: Capture, which: str) -> View:
     if not 0 <= int(which) <= last:
         raise PopError(f"view is {which}; {capture.name} has views {span}")
     return capture.views[int(which)]
-
-
-def _write(path: Path, text: str) -> None:
-    write_atomically(path, lambda file: file.write(text.encode("utf-8", "backslashreplace")))

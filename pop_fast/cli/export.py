@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -15,7 +14,7 @@ import tyro
 from pop_fast.cli import EXIT_INCOMPLETE, EXIT_INTERRUPTED, describe, parse
 from pop_fast.cli.options import CaptureArguments, FormatName, LimitOptions, Output, Shown, limited, open_with_bars
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import check_folder, check_place, write_atomically
+from pop_fast.io.atomic import check_folder, check_place, write_file
 from pop_fast.io.heartbeat import Heartbeat
 from pop_fast.io.ply import Frame
 from pop_fast.train.config import TrainConfig
@@ -25,8 +24,7 @@ from pop_fast.train.results import ResultFolder
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from pop_fast.data import Capture
-
+    from pop_fast.data import Capture, View
 
 HTML: Final = "html"
 _EXAMPLES: Final = """
@@ -78,12 +76,7 @@ def run(argv: Sequence[str]) -> int:
         photographed=opened.capture if opened.known else None,
         checkpoint=splat.path,
     )
-    left = limited(shown, args, output)
-    for line in left.said:
-        print(line)
-    data = output.write(left.params, left.level)
-    write_atomically(out, lambda file: file.write(data))
-    say_written(out, len(left.params["means"]), len(data))
+    limited(shown, args, output).write(out, output)
     return 0
 
 
@@ -152,10 +145,6 @@ def file_format(out: Path, to: str | None) -> str:
     return HTML if is_page else named_format(out, to)
 
 
-def say_written(out: Path, count: int, size: int) -> None:
-    print(f"{count:,} Gaussians, {size / 1e6:.2f} MB -> {out}")
-
-
 def note_lost_frame(out: Path, name: str, frame: Frame | None) -> None:
     """Say on stderr that a file does not say its world, where what is taken for it is another one."""
     from pop_fast.io.formats import loses_frame
@@ -178,14 +167,19 @@ def check_file(out: Path, source: Path, overwrite: bool) -> None:
 
 def _output(args: Args, out: Path, name: str, splat: Splat, opened: _Opened) -> Output:
     if name == HTML:
-        from pop_fast.view.html import cameras_of, page_of
-
-        cameras = cameras_of(opened.capture()[0].train_views(opened.config.test_every)) if opened.known else []
-        rest = (cameras, opened.config, splat.sh_degree, args.splat.resolve().name)
-        return Output(HTML, splat.config.antialiased, page=lambda params, level: page_of(params, *rest, level))
+        views = opened.capture()[0].train_views(opened.config.test_every) if opened.known else ()
+        return page_output(views, opened.config, splat.sh_degree, args.splat)
     transform, frame = _output_frame(splat, args)
     note_lost_frame(out, name, frame)
     return Output(name, splat.config.antialiased, frame, transform)
+
+
+def page_output(views: Sequence[View], config: TrainConfig, sh_degree: int, source: Path) -> Output:
+    """Return the page of a splat, which starts at cameras of these views, or where there are none sees most of it."""
+    from pop_fast.view.html import cameras_of, page_of
+
+    rest = (cameras_of(views), config, sh_degree, source.resolve().name)
+    return Output(HTML, config.antialiased, page=lambda params, level: page_of(params, *rest, level))
 
 
 def _output_frame(splat: Splat, args: Args) -> tuple[np.ndarray | None, Frame | None]:
@@ -284,12 +278,7 @@ def after_results(write: Callable[[], object], doing: str, failed: str, left: st
 
 
 def _finish(folder: Path, capture: Capture, options: FinishOptions) -> None:
-    from pop_fast.view.html import cameras_of, page_of
-
     splat = load_splat(folder)
-    title = folder.resolve().name
-
-    rest = (cameras_of(capture.train_views(splat.config.test_every)), splat.config, splat.sh_degree, title)
     shown = Shown(
         params=splat.params,
         sh_degree=splat.sh_degree,
@@ -298,25 +287,17 @@ def _finish(folder: Path, capture: Capture, options: FinishOptions) -> None:
         photographed=lambda: (capture, splat.config),
         checkpoint=splat.path,
     )
-    page = Output(HTML, splat.config.antialiased, page=lambda params, level: page_of(params, *rest, level))
+    page = page_output(capture.train_views(splat.config.test_every), splat.config, splat.sh_degree, folder)
     # what the page and the table of sizes show, and every file whose size is not limited
-    kept = limited(shown, dataclasses.replace(options, target_mb=None), page)
+    kept = limited(shown, replace(options, target_mb=None), page)
     names = options.export or (("ply",) if options.any else ())
-    for line in kept.said if names and options.target_mb is None else ():
-        print(line)
-    frame = Frame("capture", tuple(map(tuple, capture.world_transform.tolist())))
+    frame = Frame("capture", _rows(capture.world_transform))
     for name in names:
         output, left = page if name == HTML else Output(name, page.antialiased, frame, capture.world_transform), kept
         if options.target_mb is not None:
             left = limited(shown, options, output)
-            for line in left.said:
-                print(line)
-        path = folder / EXPORTS / file_name(title, name)
-        data = output.write(left.params, left.level)
-        write_atomically(path, lambda file, data=data: file.write(data))
-        say_written(path, len(left.params["means"]), len(data))
-    shown_page = page.write(kept.params)
-    write_atomically(folder / VIEWER, lambda file: file.write(shown_page))
+        left.write(folder / EXPORTS / file_name(folder.resolve().name, name), output)
+    write_file(folder / VIEWER, page.write(kept.params))
     if not options.skip_sizes:
         _sizes(folder, splat, capture, kept.params)
     if not options.skip_checks:
@@ -349,9 +330,8 @@ def _sizes(folder: Path, splat: Splat, capture: Capture, params: dict[str, Tenso
     backend, _ = renderer(config.backend)
     with reproducible(config.threads):
         found = measure_encodings(backend, params, views, config, splat.sh_degree, capture.world_transform)
-        entries = [encoding.entry() for encoding in found]
-    for line in table_lines(encoding_table(entries)):
-        print(line)
+        entries = list(found)
+    print("\n".join(table_lines(encoding_table(entries))))
     results = ResultFolder(folder)
     before = results.read_stats("val", splat.step) if splat.step is not None else None
     if before is not None and splat.step is not None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 import tyro
 
 from pop_fast.errors import PopError
+from pop_fast.io.atomic import write_file
 from pop_fast.io.formats import format_names
 from pop_fast.io.heartbeat import bars, duration
 from pop_fast.io.ply import Frame
@@ -166,6 +167,15 @@ class Limited:
         if after == 0 and before > 0:
             raise PopError(f"{what} leaves no Gaussian of {before:,}; ask for less")
         self.params = {name: value[kept] for name, value in self.params.items()}
+
+    def write(self, out: Path, output: Output) -> None:
+        """Print what was said, write the file, and say how much is in it."""
+        for line in self.said:
+            print(line)
+        self.said.clear()
+        data = output.write(self.params, self.level)
+        write_file(out, data)
+        print(f"{len(self.params['means']):,} Gaussians, {len(data) / 1e6:.2f} MB -> {out}")
 
 
 def limited(shown: Shown, limits: LimitOptions, output: Output) -> Limited:

@@ -17,7 +17,7 @@ import tyro
 from pop_fast.cli import parse
 from pop_fast.cli.options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import check_file, check_folder, folder_atomically, write_atomically
+from pop_fast.io.atomic import check_file, check_folder, folder_atomically, write_json
 from pop_fast.train.load_result import load_splat, paths_read
 
 if TYPE_CHECKING:
@@ -84,8 +84,7 @@ def _render(args: Args, video: VideoFile | None) -> int:
             written = write_video(write_pictures(frames, files, folder), video)
             listing = [{"view": view.name, "file": file.as_posix()} for view, file in zip(views, files, strict=True)]
             index = {"splat": str(splat.path), "capture": capture.name, "path": args.path, "renders": listing}
-            text = json.dumps(index, indent=2) + "\n"
-            write_atomically(folder / _INDEX, lambda file: file.write(text.encode()))
+            write_json(folder / _INDEX, index)
     targets = " and ".join(str(target) for target in (args.out, args.video) if target is not None)
     print(f"{written} views of {capture.name} -> {targets}")
     return 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -48,17 +48,8 @@ def run(argv: Sequence[str]) -> int:
     from pop_fast.io.images import unreadable_photographs
 
     with bars() as progress:
-        found = run_sfm(
-            args.photos,
-            args.out,
-            progress,
-            max_size=args.max_size,
-            camera_model=args.camera_model,
-            single_camera=args.single_camera,
-            matcher=args.matcher,
-            seed=args.seed,
-            overwrite=args.overwrite,
-        )
+        options = {field.name: getattr(args, field.name) for field in fields(SfmOptions)}
+        found = run_sfm(args.photos, args.out, progress, overwrite=args.overwrite, **options)
     left = unreadable_photographs(photo_folder(args.photos))
     if left:
         print(f"note: {left}")

@@ -13,7 +13,7 @@ from pop_fast.cli import EXIT_INTERRUPTED, printable
 from pop_fast.cli.export import FinishOptions, table_lines
 from pop_fast.cli.train_options import BlocksOptions
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import FolderLock, write_atomically
+from pop_fast.io.atomic import FolderLock, write_file
 from pop_fast.io.heartbeat import bars
 from pop_fast.train.config import TrainConfig, first_difference
 from pop_fast.train.load_result import RECORD, CaptureRecord, record_text
@@ -188,7 +188,7 @@ def _extend(folder: Path, before: Job, job: Job) -> None:
     if job.rounds > before.rounds:
         marker_of(folder, None, None).unlink(missing_ok=True)
         more = replace(before, rounds=job.rounds, round_steps=job.round_steps)
-        write_atomically(folder / JOB, lambda file: file.write(job_text(more).encode()))
+        write_file(folder / JOB, job_text(more))
 
 
 def _take_threads(folder: Path, config: TrainConfig) -> None:

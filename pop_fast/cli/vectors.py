@@ -84,9 +84,6 @@ def _check(args: Check) -> int:
         if names:
             more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
             print(f"{title}, not judged: {', '.join(names[:_NAMED])}{more}")
-    print(
-        f"{len(found.failed)} of {len(found.verdicts)} arrays fail"
-        if found.failed
-        else "all arrays that are there pass"
-    )
+    failing = f"{len(found.failed)} of {len(found.verdicts)} arrays fail"
+    print(failing if found.failed else "all arrays that are there pass")
     return 1 if found.failed else 0

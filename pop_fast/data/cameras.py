@@ -24,6 +24,13 @@ _TOLERANCE = 1e-3
 _SHORTEST = 1e-6
 
 
+def affine(linear: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Return the matrix of x -> linear x + shift. float64 [4, 4]"""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = linear, shift
+    return matrix
+
+
 def nearest_rigid(matrix: np.ndarray) -> np.ndarray:
     """Return the rigid matrix nearest to `matrix` [4, 4], R = U V^T of its singular value decomposition. float64 [4, 4]
 
@@ -47,10 +54,7 @@ def nearest_rigid(matrix: np.ndarray) -> np.ndarray:
         )
     if np.linalg.det(linear) < 0.0:
         raise ValueError("is not rigid: it mirrors (determinant -1); its 3x3 part must be a rotation")
-    rigid = np.eye(4)
-    rigid[:3, :3] = U @ Vt
-    rigid[:3, 3] = matrix[:3, 3]
-    return rigid
+    return affine(U @ Vt, matrix[:3, 3])
 
 
 def rigid_from_quat(quat: np.ndarray, translation: np.ndarray) -> np.ndarray:
@@ -68,10 +72,7 @@ def rigid_from_quat(quat: np.ndarray, translation: np.ndarray) -> np.ndarray:
     # divided by its largest entry first, so that no square overflows
     unit = quat / np.abs(quat).max()
     unit = unit / np.linalg.norm(unit)
-    rigid = np.eye(4)
-    rigid[:3, :3] = _rotation(*unit.tolist())
-    rigid[:3, 3] = translation
-    return rigid
+    return affine(np.array(_rotation(*unit.tolist())), translation)
 
 
 def _rotation(w: float, x: float, y: float, z: float) -> list[list[float]]:
@@ -145,10 +146,7 @@ def viewmat_from_pose(where: str, pose: np.ndarray, opengl: bool) -> np.ndarray:
     except ValueError as error:
         raise CaptureError(f"{where} {error}") from error
     rotation = pose[:3, :3] * (_OPENGL if opengl else 1.0)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = rotation.T
-    viewmat[:3, 3] = -rotation.T @ pose[:3, 3]
-    return viewmat
+    return affine(rotation.T, -rotation.T @ pose[:3, 3])
 
 
 def brown_lens(

@@ -24,6 +24,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
+from pop_fast.data.cameras import affine
 from pop_fast.errors import CaptureError
 
 Split = Literal["train", "val", "test"]
@@ -145,7 +146,7 @@ class Capture:
 
     def train_views(self, test_every: int = 8) -> tuple[View, ...]:
         """Select the views to train on: all that `test_views` leaves, validation views apart."""
-        if self._has_split:
+        if any(view.split is not None for view in self.views):
             return tuple(view for view in self.views if view.split == "train")
         return tuple(view for i, view in enumerate(self.views) if test_every <= 0 or i % test_every != 0)
 
@@ -160,10 +161,6 @@ class Capture:
         """
         chosen = held_out([view.split for view in self.views], test_every)
         return tuple(view for view, out in zip(self.views, chosen, strict=True) if out)
-
-    @property
-    def _has_split(self) -> bool:
-        return any(view.split is not None for view in self.views)
 
 
 def held_out(splits: Sequence[Split | None], test_every: int) -> list[bool]:
@@ -346,10 +343,7 @@ def _from_cameras(viewmats: np.ndarray) -> np.ndarray:
     spread = float(np.ptp(centers, axis=0).max())
     if spread <= 1e-9 * max(1.0, float(np.abs(centers).max())) or distance == 0.0:
         raise CaptureError("all cameras are at one place; a scene needs photographs from different places")
-    transform = np.eye(4)
-    transform[:3, :3] = turn / distance
-    transform[:3, 3] = -origin / distance
-    return transform
+    return affine(turn / distance, -origin / distance)
 
 
 def _rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -377,10 +371,7 @@ def _principal_axes(points: np.ndarray) -> np.ndarray:
         if row[np.argmax(np.abs(row))] < 0.0:
             row *= -1.0
     rotation[2] = np.cross(rotation[0], rotation[1])
-    transform = np.eye(4)
-    transform[:3, :3] = rotation
-    transform[:3, 3] = -rotation @ middle
-    return transform
+    return affine(rotation, -rotation @ middle)
 
 
 MATCHERS: Final = ("auto", "exhaustive", "sequential")

@@ -211,9 +211,7 @@ def about_masks(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding]
         return
     mean = float(np.mean(kept))
     text = f"{len(kept)} masks keep {100 * mean:.0f} % of the pixels (white = keep)"
-    yield CaptureFinding(
-        "warn" if mean < 0.35 else "ok", "masks", text + ("; are they inverted?" if mean < 0.35 else "")
-    )
+    yield warn("masks", f"{text}; are they inverted?") if mean < 0.35 else ok("masks", text)
     if lone:
         yield warn("masks", f"{len(lone)} photographs have none, first {lone[0]}: all of their pixels count")
 

@@ -31,13 +31,21 @@ import math
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Literal, cast
 
 import numpy as np
 
-from pop_fast.data.cameras import WIDEST, Numbers, brown_lens, check_size, make_camera, shortened, viewmat_from_pose
+from pop_fast.data.cameras import (
+    WIDEST,
+    Numbers,
+    affine,
+    brown_lens,
+    check_size,
+    make_camera,
+    shortened,
+    viewmat_from_pose,
+)
 from pop_fast.data.capture import Listing, PosedImage, SparsePoints, Split
 from pop_fast.errors import CaptureError
 from pop_fast.io.image_header import read_size
@@ -114,22 +122,6 @@ _EXPORT_XML = "export the cameras again (Agisoft XML)"
 _RADIAL = ("k1", "k2", "k3", "k4")
 
 
-@dataclass(frozen=True)
-class _Similarity:
-    """x -> scale R x + t, from a chunk's frame to the world."""
-
-    rotation: np.ndarray
-    translation: np.ndarray
-    scale: float
-
-    def pose(self, pose: np.ndarray) -> np.ndarray:
-        moved = np.eye(4)
-        # rows that are not rigid stay so, for the check of the pose to find
-        moved[:3, :3] = self.rotation @ pose[:3, :3]
-        moved[:3, 3] = self.scale * (self.rotation @ pose[:3, 3]) + self.translation
-        return moved
-
-
 def find_metashape(root: Path) -> Path | None:
     """Find a file of exported cameras, the first by name; None where there is none."""
     return _first(root, "*.xml", lambda file: b"<document" in (head := file.read(_HEAD)) and b"<chunk" in head)
@@ -202,10 +194,11 @@ def _numbers(where: str, element: ET.Element | None, count: int) -> np.ndarray:
     return values
 
 
-def _similarity(where: str, frame: ET.Element) -> _Similarity:
+def _similarity(where: str, frame: ET.Element) -> tuple[np.ndarray, np.ndarray, float]:
+    """Read R, t and s of x -> s R x + t, from a chunk's frame to the world."""
     found = frame.find("transform")
     if found is None:
-        return _Similarity(np.eye(3), np.zeros(3), 1.0)
+        return np.eye(3), np.zeros(3), 1.0
     where = f"{where}: {frame.tag} {frame.get('id')}: transform"
     rotation, translation, scale = (found.find(name) for name in ("rotation", "translation", "scale"))
     R = np.eye(3) if rotation is None else _numbers(f"{where}/rotation", rotation, 9).reshape(3, 3)
@@ -213,14 +206,17 @@ def _similarity(where: str, frame: ET.Element) -> _Similarity:
     s = 1.0 if scale is None else float(_numbers(f"{where}/scale", scale, 1)[0])
     if s <= 0.0:
         raise CaptureError(f"{where}/scale is {s}; it must be > 0")
-    return _Similarity(R, t, s)
+    return R, t, s
 
 
-def _viewmat(where: str, camera: ET.Element, frame: _Similarity) -> np.ndarray:
+def _viewmat(where: str, camera: ET.Element, frame: tuple[np.ndarray, np.ndarray, float]) -> np.ndarray:
+    R, t, s = frame
     pose = _numbers(f"{where}: transform", camera.find("transform"), 16).reshape(4, 4)
     if np.abs(pose[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
         raise CaptureError(f"{where}: transform has the last row {pose[3].tolist()}; it must be 0 0 0 1")
-    return viewmat_from_pose(f"{where}: transform", frame.pose(pose), opengl=False)
+    # rows that are not rigid stay so, for the check of the pose to find
+    moved = affine(R @ pose[:3, :3], s * (R @ pose[:3, 3]) + t)
+    return viewmat_from_pose(f"{where}: transform", moved, opengl=False)
 
 
 def _metashape_camera(path: Path, label: str, sensor: ET.Element | None, number: int) -> Any:

@@ -13,7 +13,6 @@ the block alone.
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -44,7 +43,7 @@ from pop_fast.data.exports import EXPORTS, find_transforms, read_export, read_tr
 from pop_fast.data.read_images import PhotoOptions, read_views
 from pop_fast.data.sfm import photo_folder, photographs, read_upright, run_sfm
 from pop_fast.errors import CaptureError, PopError
-from pop_fast.io.atomic import write_atomically
+from pop_fast.io.atomic import write_atomically, write_json
 from pop_fast.io.image_header import read_size
 from pop_fast.io.images import VIDEO_SUFFIXES, find_image, unreadable_photographs
 from pop_fast.io.read_back import read_arrays, read_json
@@ -406,8 +405,7 @@ def write_block(folder: Path, listing: Listing) -> None:
     }
     write_atomically(folder / _POINTS, lambda file: np.savez(file, xyz=cloud.xyz, rgb=cloud.rgb))
     # the list comes last: a folder that has it is whole
-    text = json.dumps(content, indent=1) + "\n"
-    write_atomically(folder / _BLOCK_LIST, lambda file: file.write(text.encode()))
+    write_json(folder / _BLOCK_LIST, content, indent=1)
 
 
 def read_block(folder: Path) -> Listing:
@@ -453,12 +451,8 @@ def _entry(shot: PosedImage) -> dict[str, Any]:
     lens = None
     if camera is not None:
         size = {"width": int(camera.width), "height": int(camera.height)}
-        lens = {
-            "id": int(camera.camera_id),
-            "model": camera.model_name,
-            **size,
-            "params": list(map(float, camera.params)),
-        }
+        params = list(map(float, camera.params))
+        lens = {"id": int(camera.camera_id), "model": camera.model_name, **size, "params": params}
     return {
         "name": shot.name,
         "folder": shot.folder,

@@ -171,10 +171,8 @@ def _about_camera(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     without = [one.name for one in shown if not one.exif.focal]
     if without:
         fix = "where photographs were edited, use the originals: cameras are found more reliably with a known lens"
-        yield warn(
-            "EXIF",
-            f"{len(without)} {number(len(without), 'has', 'have')} no focal length, {some(without)}; {fix}",
-        )
+        what = f"{len(without)} {number(len(without), 'has', 'have')} no focal length"
+        yield warn("EXIF", f"{what}, {some(without)}; {fix}")
     if len(kinds) > 1 or len(lenses) > 1:
         yield warn("EXIF", f"{text}: several lenses or zooms; one fixed lens is placed more reliably")
     else:
@@ -197,12 +195,10 @@ def _about_blur(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
 def _about_exposure(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     dark = [one.name for one in shown if one.dark > _CLIPPED]
     bright = [one.name for one in shown if one.bright > _CLIPPED]
-    for names, what in ((dark, "black"), (bright, "white")):
+    for names, color in ((dark, "black"), (bright, "white")):
         if names:
-            yield warn(
-                "exposure",
-                f"{len(names)} {number(len(names), 'is', 'are')} over a quarter pure {what}, {some(names)}",
-            )
+            what = f"{len(names)} {number(len(names), 'is', 'are')} over a quarter pure {color}"
+            yield warn("exposure", f"{what}, {some(names)}")
     stops = exposure_stops([one.exif for one in shown])
     fix = "lock the exposure, or train with --exposure: without it training assumes one brightness for all"
     if stops is not None and stops > DRIFT_STOPS:
@@ -231,11 +227,8 @@ def _about_copies(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
         others = [shown[i + 1 + int(j)] for j in np.flatnonzero(near)]
         alike += [f"{shown[i].name} and {other.name}" for other in others if other.digest != shown[i].digest]
     if alike:
-        fix = "they add nothing, from the same place"
-        yield warn(
-            "duplicates",
-            f"{len(alike)} {number(len(alike), 'pair looks', 'pairs look')} the same, {some(alike)}; {fix}",
-        )
+        what = f"{len(alike)} {number(len(alike), 'pair looks', 'pairs look')} the same"
+        yield warn("duplicates", f"{what}, {some(alike)}; they add nothing, from the same place")
     if not copies and not alike:
         yield ok("duplicates", "none")
 

@@ -195,26 +195,18 @@ def make_scene(seed: int) -> DemoScene:
     cone = at(-0.72, -1.12)
     tilt = turn()
     poles = [at(-1.42, -0.28), at(0.18, -1.45), at(1.5, 0.12)]
+    white_die, stripes = partial(_die, "f4f1ea", "1c1c22", 0.26), partial(_bands, "f06a1d", "f7f3ec", 0.2)
     things = [
         Frustum((0.0, 0.0, 0.0), partial(_marble, clouds), bottom=0.36, top=0.33, height=0.72, specular=0.15),
         Frustum((0.0, 0.0, 0.72), partial(_plain, "e9e2d2"), bottom=0.44, top=0.47, height=0.09),
         Ball((0.0, 0.0, 1.19), partial(_planet, clouds), turn(), 0.5, 60.0, 0.06, radius=0.38),
         Ball(at(1.12, -0.62, 0.36), _beach_ball, turn(), 0.35, 40.0, 0.03, radius=0.36),
         Box(crate, partial(_crate, clouds, 0.62), tilt, size=(0.62, 0.62, 0.62)),
-        Box(
-            (crate[0], crate[1], 0.62),
-            partial(_die, "f4f1ea", "1c1c22", 0.26),
-            turn(),
-            0.3,
-            50.0,
-            size=(0.26, 0.26, 0.26),
-        ),
+        Box((crate[0], crate[1], 0.62), white_die, turn(), 0.3, 50.0, size=(0.26, 0.26, 0.26)),
         Box(at(-0.32, -0.72), partial(_die, "b8232b", "f6f2e8", 0.3), turn(), 0.3, 50.0, size=(0.3, 0.3, 0.3)),
         Torus(at(0.15, 1.22, 0.15), partial(_donut, spots), turn(), 0.25, 30.0, ring=0.33, tube=0.15),
         Box(cone, partial(_plain, "2c2b2b"), turn(), size=(0.46, 0.46, 0.05)),
-        Frustum(
-            (cone[0], cone[1], 0.05), partial(_bands, "f06a1d", "f7f3ec", 0.2), bottom=0.18, top=0.035, height=0.58
-        ),
+        Frustum((cone[0], cone[1], 0.05), stripes, bottom=0.18, top=0.035, height=0.58),
         Frustum(drum, partial(_checkers, "1f2f5c", "f0c644"), turn(), bottom=0.25, top=0.25, height=0.5),
         Ball((drum[0], drum[1], 0.69), partial(_plain, "a3122a"), 0.0, 0.9, 120.0, 0.08, radius=0.19),
         Ball(at(-1.28, 1.25, 0.24), partial(_plain, "8d979f"), 0.0, 0.6, 80.0, 0.35, radius=0.24),

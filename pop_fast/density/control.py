@@ -327,19 +327,13 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         from pop_fast.density import rows
 
         n_clones, n_splits = int(clones.sum()), int(splits.sum())
+        edited = (context.params, context.optimizers, context.state)
         if n_clones:
-            rows.clone(context.params, context.optimizers, context.state, clones)
+            rows.clone(*edited, clones)
         if n_splits:
             # a clone of this densification step is never split in it
             padded = torch.cat([splits, splits.new_zeros(n_clones)])
-            rows.split(
-                context.params,
-                context.optimizers,
-                context.state,
-                padded,
-                context.draws.normals(n_splits),
-                self.revised_opacity,
-            )
+            rows.split(*edited, padded, context.draws.normals(n_splits), self.revised_opacity)
         done = DensificationStep(n_clones, n_splits, rows.prune_marked(context, prunes()))
         rows.clear(context.state)
         if self.verbose:

@@ -154,11 +154,8 @@ class MiniSplattingStrategy(InriaStrategy):
 
         from pop_fast.data.gaussians import SH_C0
 
-        points, colors = [], []
-        for index in range(context.views.n_views):
-            found, color = self._points_of_view(context, index)
-            points.append(found)
-            colors.append(color)
+        found = [self._points_of_view(context, index) for index in range(context.views.n_views)]
+        points, colors = zip(*found, strict=True)
         sh0 = ((torch.cat(colors) - 0.5) / SH_C0)[:, None]
         return self._begin_anew(context, torch.cat(points), sh0)
 

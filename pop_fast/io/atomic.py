@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
+import json
 import os
 import shutil
 import sys
@@ -18,7 +19,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from pop_fast.errors import PopError
 
@@ -90,6 +91,17 @@ def write_atomically(path: str | os.PathLike[str], writer: Callable[[BinaryIO], 
             file.flush()
             os.fsync(file.fileno())
         os.replace(partial, path)
+
+
+def write_file(path: str | os.PathLike[str], content: str | bytes) -> None:
+    """Write one file whole or not at all, text as UTF-8; see `write_atomically`."""
+    data = content.encode() if isinstance(content, str) else content
+    write_atomically(path, lambda file: file.write(data))
+
+
+def write_json(path: str | os.PathLike[str], content: Any, indent: int | None = 2) -> None:
+    """Write one file of JSON whole or not at all; see `write_atomically`."""
+    write_file(path, json.dumps(content, indent=indent) + "\n")
 
 
 @contextmanager

@@ -30,7 +30,7 @@ import numpy as np
 
 from pop_fast.children import module_command
 from pop_fast.errors import CaptureError, PopError
-from pop_fast.io.atomic import write_atomically
+from pop_fast.io.atomic import write_file
 from pop_fast.io.image_header import (
     HEIF_SUFFIXES,
     INSTALL,
@@ -61,17 +61,17 @@ def readable_suffixes() -> tuple[str, ...]:
 
 def list_images(folder: Path) -> list[Path]:
     """List the photographs of a folder and its subfolders, sorted by relative name; hidden files are left out."""
-    suffixes = readable_suffixes()
-    return sorted(
-        (
-            path
-            for path in folder.rglob("*")
-            if path.suffix.lower() in suffixes
-            and path.is_file()
-            and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-        ),
-        key=lambda path: path.relative_to(folder).as_posix(),
-    )
+    found = _files_ending(readable_suffixes(), _visible(folder))
+    return sorted(found, key=lambda path: path.relative_to(folder).as_posix())
+
+
+def _visible(folder: Path) -> list[Path]:
+    """List what is in a folder and its subfolders, without what is hidden."""
+    return [file for file in folder.rglob("*") if not any(p.startswith(".") for p in file.relative_to(folder).parts)]
+
+
+def _files_ending(suffixes: Sequence[str], paths: Sequence[Path]) -> list[Path]:
+    return [path for path in paths if path.suffix.lower() in suffixes and path.is_file()]
 
 
 def unreadable_photographs(folder: Path) -> str | None:
@@ -79,12 +79,10 @@ def unreadable_photographs(folder: Path) -> str | None:
 
     Hidden files are left out, as `list_images` does.
     """
-    files = [
-        path for path in folder.rglob("*") if not any(part.startswith(".") for part in path.relative_to(folder).parts)
-    ]
+    found = _visible(folder)
     unreadable = _UNREADABLE if can_read_heif() else (*_UNREADABLE, *HEIF_SUFFIXES)
-    still = [path.suffix for path in files if path.suffix.lower() in unreadable and path.is_file()]
-    moving = [path for path in files if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()]
+    still = [path.suffix for path in _files_ending(unreadable, found)]
+    moving = _files_ending(VIDEO_SUFFIXES, found)
     changes: list[str] = []
     if still:
         kind = max(set(still), key=still.count)
@@ -182,7 +180,7 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> None:
     """Write uint8 [H, W, 3] or [H, W] as PNG, atomically."""
     stored = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
     _, data = cv2.imencode(".png", stored)
-    write_atomically(path, lambda file: file.write(data.tobytes()))
+    write_file(path, data.tobytes())
 
 
 def inline_png(image: np.ndarray, longest: int) -> str:

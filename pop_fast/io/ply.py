@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import write_atomically
+from pop_fast.io.atomic import write_file
 
 if TYPE_CHECKING:
     import torch
@@ -70,7 +70,7 @@ def save_ply(
     if drop_transparent:
         visible = arrays["opacities"] >= _VISIBLE_LOGIT
         arrays = {name: array[visible] for name, array in arrays.items()}
-    write_atomically(path, lambda file: file.write(_file(arrays, antialiased, frame)))
+    write_file(path, _file(arrays, antialiased, frame))
     return before, len(arrays["means"])
 
 

@@ -19,6 +19,8 @@ import numpy as np
 from pop_fast.errors import PopError
 from pop_fast.machine import free_bytes
 
+# what helps where the file of a splat is damaged
+WRITE_AGAIN: Final = "copy or write the file again"
 _TEXTS: Final = frozenset({"method", "capture", "machine", "backend", "lpips_net", "lpips_reason", "view"})
 _NUMBERS: Final = frozenset(
     {

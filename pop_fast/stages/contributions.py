@@ -52,7 +52,7 @@ def _contribution_sums(
     walk = PairWalk(splats, lists, *size, profile)
     rows = EntryRows(walk, 4)
     values = walk.tiles_of(splats.means2d.new_zeros((*size[::-1], 1)) if pixel_map is None else pixel_map[..., None])
-    for pairs in walk.front_to_back():
+    for pairs in walk.steps():
         dx, dy = walk.offsets(pairs)
         weight = pairs.weight.sum(2)
         blended = torch.gt(pairs.alpha, 0.0, out=pairs.scratch)
@@ -280,13 +280,14 @@ class PairWalk:
         self.groups = tile_groups(self.entries.lists)
         self._inside = self.tiles_of(colors.new_ones((*self.size, 1)))[:, 0]
 
-    def front_to_back(self) -> Iterator[Pairs]:
-        """Yield the steps such that, in every tile, nearer entries come first."""
-        return self._walk(backwards=False)
-
-    def back_to_front(self) -> Iterator[Pairs]:
-        """Yield the steps such that, in every tile, farther entries come first; within a step the nearer do."""
-        return self._walk(backwards=True)
+    def steps(self, backwards: bool = False) -> Iterator[Pairs]:
+        """Yield the steps: in every tile nearer entries come first, or farther ones, but the nearer within a step."""
+        for group in self.groups:
+            blend = self.blender.blend(group)
+            with acquired_buffers(3, group.slab, self.blender.table.dtype) as scratch:
+                for step in reversed(blend.steps) if backwards else blend.steps:
+                    yield self._pairs(group, step.rows, step.blocks, self.blender.again(group, step, scratch))
+                    release_buffer(step.transmittance)
 
     def color_dot_grads(self, background: Tensor) -> Iterator[tuple[Pairs, Tensor]]:
         """Yield the steps back to front, with how far every splat's colour exceeds the light from behind it.
@@ -302,7 +303,7 @@ class PairWalk:
         """
         n_tiles, n_pixels = self._inside.shape
         behind = background.to(self._inside.dtype)[:, None, None].expand(-1, n_tiles, n_pixels).clone()
-        for pairs in self.back_to_front():
+        for pairs in self.steps(backwards=True):
             passing = behind.index_select(1, pairs.tiles)
             colors = pairs.colors.permute(2, 1, 0)[..., None]
             color_dot_grad = behind.new_empty((len(behind), *pairs.alpha.shape))
@@ -312,24 +313,14 @@ class PairWalk:
             behind.index_copy_(1, pairs.tiles, passing)
             yield pairs, color_dot_grad
 
-    def _walk(self, backwards: bool) -> Iterator[Pairs]:
-        for group in self.groups:
-            blend = self.blender.blend(group)
-            with acquired_buffers(3, group.slab, self.blender.table.dtype) as scratch:
-                for step in reversed(blend.steps) if backwards else blend.steps:
-                    yield self._pairs(group, step.rows, step.blocks, self.blender.again(group, step, scratch))
-                    release_buffer(step.transmittance)
-
     def _pairs(self, group: TileGroup, chosen: Tensor | None, blocks: Tensor, made: list[Tensor]) -> Pairs:
         entries, alpha, weight, scratch = made
         tiles = (group.tiles if chosen is None else group.tiles[chosen])[: len(blocks)]
         inside = self._inside.index_select(0, tiles)[:, None]
         rows = (BLOCK * blocks[:, :, None] + torch.arange(BLOCK)).view(len(blocks), -1)
         coefficients = entries.view(-1, entries.shape[2])[:, :6]
-        ids = self.entries.lists.ids[rows]
-        return Pairs(
-            tiles, rows, ids, coefficients, entries[:, :, 6:-1], alpha.mul_(inside), weight.mul_(inside), scratch
-        )
+        ids, colors = self.entries.lists.ids[rows], entries[:, :, 6:-1]
+        return Pairs(tiles, rows, ids, coefficients, colors, alpha.mul_(inside), weight.mul_(inside), scratch)
 
     def offsets(self, pairs: Pairs) -> tuple[Tensor, Tensor]:
         """Return how far every splat's centre is from every pixel's, along x and y, px. [n, K, P] each"""
@@ -423,7 +414,7 @@ def _dominant_ids(
     directions = walk.tiles_of(ray_directions(camera, profile).to(facing.dtype))
     best, T = directions.new_zeros(len(directions), directions.shape[2]), directions.new_ones(directions[:, 0].shape)
     ids = torch.full(best.shape, -1)
-    for pairs in walk.front_to_back():
+    for pairs in walk.steps():
         torch.bmm(facing[pairs.ids], directions.index_select(0, pairs.tiles), out=pairs.scratch)
         competing = pairs.scratch.le_(0.0).mul_(pairs.weight)
         largest, place = competing.max(1)

@@ -410,12 +410,11 @@ def _value_and_gradient(
     if terms.pixel_weight is not None:
         n = image.numel() if mask is None else max(int(mask.sum()), 1) * image.shape[2]
         total = torch.sum(difference.abs() if terms.pixel == "l1" else difference * difference)
-        value = value + (terms.pixel_weight / n) * total
+        per_value = terms.pixel_weight / n
+        value = value + per_value * total
         if want_grad:
             slope = difference.sign_() if terms.pixel == "l1" else difference.mul_(2.0)
-            grad = (
-                slope.mul_(terms.pixel_weight / n) if grad is None else grad.add_(slope, alpha=terms.pixel_weight / n)
-            )
+            grad = slope.mul_(per_value) if grad is None else grad.add_(slope, alpha=per_value)
     if grad is not None and mask is not None:
         grad.masked_fill_(~mask[:, :, None], 0.0)
     return value, grad

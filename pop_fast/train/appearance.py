@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from pop_fast.stages.appearance import background_at, centred_exposures, expose, refined_viewmat, without_common_motion
+from pop_fast.train.checkpoint import pack_optimizers
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.model import make_optimizers
 from pop_fast.train.views import ViewTensors
@@ -91,11 +92,8 @@ class Appearance:
 
     def state_dict(self) -> dict[str, dict[str, Tensor]]:
         """Return everything that a resumed run needs: by name, the numbers and their moments."""
-        packed: dict[str, dict[str, Tensor]] = {}
-        for name, param in self.params.items():
-            moments = self._optimizers[name].state[param]
-            packed[name] = {"value": param.detach(), **{key: value.detach() for key, value in moments.items()}}
-        return packed
+        moments = pack_optimizers(self._optimizers)
+        return {name: {"value": param.detach(), **moments[name]} for name, param in self.params.items()}
 
     def load_state_dict(self, packed: Mapping[str, Mapping[str, Tensor]]) -> None:
         """Put back what `state_dict` returned."""

@@ -153,10 +153,8 @@ class Tuner:
                 self._taken += run.step - before
                 if before > 0:
                     # a first step also loads what all of them need
-                    self._timed, self._seconds = (
-                        self._timed + run.step - before,
-                        self._seconds + time.perf_counter() - began,
-                    )
+                    self._timed += run.step - before
+                    self._seconds += time.perf_counter() - began
                 known = self._seconds / self._timed * self._planned if self._seconds > _SURE_AFTER else None
                 self._report(self._taken, self._planned, known)
         return {name: value.detach().cpu().clone() for name, value in run.params.items()}
@@ -197,12 +195,11 @@ class Tuner:
             return whole
         weights, eyes = self._weights
         sh, means = torch.cat((whole["sh0"], whole["shN"]), 1).double(), whole["means"].double()
-        fitted = torch.cat(
-            [
-                lower_degree(sh[rows], means[rows] - eyes[:, None], weights[:, rows].double(), degree)
-                for rows in torch.arange(len(sh)).split(_ROWS)
-            ]
-        ).to(whole["sh0"])
+        parts = [
+            lower_degree(sh[rows], means[rows] - eyes[:, None], weights[:, rows].double(), degree)
+            for rows in torch.arange(len(sh)).split(_ROWS)
+        ]
+        fitted = torch.cat(parts).to(whole["sh0"])
         return {**whole, "sh0": fitted[:, :1].contiguous(), "shN": fitted[:, 1:].contiguous()}
 
     @cached_property
@@ -227,10 +224,8 @@ def with_pictures(capture: Capture, params: Params, config: TrainConfig, sh_degr
     backend, _ = renderer(config.backend)
 
     def picture(view: View) -> View:
-        image = render_view(backend, params, ViewTensors.of(view), config, sh_degree).image
-        return replace(
-            view, image=(255.0 * image.clamp(0.0, 1.0)).round().to(torch.uint8).numpy(), mask=None, alpha=None
-        )
+        image = 255.0 * render_view(backend, params, ViewTensors.of(view), config, sh_degree).image.clamp(0.0, 1.0)
+        return replace(view, image=image.round().to(torch.uint8).numpy(), mask=None, alpha=None)
 
     with torch.no_grad():
         drawn = replace(capture, views=[picture(view) for view in capture.views])

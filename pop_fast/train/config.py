@@ -12,7 +12,7 @@ import json
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final, Literal, Self
 
 from pop_fast.api.backend import BACKENDS
@@ -227,9 +227,8 @@ class TrainConfig:
             return replace(self, **overrides)
         again = Given.of(overrides, method=self.given.method)
         given = replace(self.given, settings={**self.given.settings, **again.settings})
-        free = {
-            f.name: getattr(self, f.name) for f in fields(self) if f.name not in (*defaults(given), *overrides, "given")
-        }
+        bound = (*defaults(given), *overrides)
+        free = {name: value for name, value in _as_dict(self).items() if name not in bound}
         return replace(self._promised(given), **free, given=given)
 
     @classmethod
@@ -239,8 +238,7 @@ class TrainConfig:
         return cls._from_values(laid_over(plain, given), given.method)
 
     def _departs_from(self, promised: TrainConfig, given: Given) -> str | None:
-        differing = (name for name in defaults(given) if getattr(self, name) != getattr(promised, name))
-        return next(differing, None)
+        return next((name for name in defaults(given) if getattr(self, name) != getattr(promised, name)), None)
 
     @classmethod
     def _from_values(cls, values: dict[str, Any], method: str) -> Self:
@@ -414,13 +412,13 @@ _SHARES_OF_STRATEGY: Final = (
 _BETWEEN_OF_STRATEGY: Final = ("reinit_opacity",)
 
 
-def check_values(config: Any) -> None:
+def check_values(config: TrainConfig) -> None:
     """Check every setting of a run.
 
     Raises:
         PopError: a setting is out of range or, being a number, not finite.
     """
-    values, method = dict(_flat(config)), config.method
+    values, method = config.flat(), config.method
     _check_names(values)
     own = {name: value for name, value in values.items() if name.startswith(f"{method}.")}
     shares = ("lambda_ssim", *(name for name in own if name.removeprefix(f"{method}.") in _SHARES_OF_STRATEGY))
@@ -437,14 +435,14 @@ def check_values(config: Any) -> None:
         if name in values and not 0.0 < values[name] < 1.0:
             raise PopError(f"{name} is {values[name]}; it must lie between 0 and 1")
     stops = values["coarse_stop_iters"]
-    if any(stop < 0 for stop in stops) or list(stops) != sorted(stops) or len(stops) > _MOST_COARSE_STOPS:
+    if any(stop < 0 for stop in stops) or stops != sorted(stops) or len(stops) > _MOST_COARSE_STOPS:
         raise PopError(
-            f"coarse_stop_iters is {list(stops)}; it must be at most {_MOST_COARSE_STOPS} step numbers that ascend"
+            f"coarse_stop_iters is {stops}; it must be at most {_MOST_COARSE_STOPS} step numbers that ascend"
         )
     if any(not 0.0 <= value <= 1.0 for value in values["background"]):
-        raise PopError(f"background is {list(values['background'])}; every channel must lie in [0, 1]")
+        raise PopError(f"background is {values['background']}; every channel must lie in [0, 1]")
     for name in (*_OVER_ZERO, *shares, *(name for name, value in values.items() if isinstance(value, float))):
-        for value in values[name] if isinstance(values[name], tuple) else (values[name],):
+        for value in values[name] if isinstance(values[name], list) else (values[name],):
             _check_number(name, value, name in shares)
 
 
@@ -468,14 +466,3 @@ def _check_number(name: str, value: float, is_share: bool) -> None:
         right, meaning = 0.0 <= value < math.inf, "be >= 0 and finite"
     if not right:
         raise PopError(f"{name} is {value}; it must {meaning}")
-
-
-def _flat(config: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for each in fields(config):
-        value = getattr(config, each.name)
-        if each.name == "given":
-            continue
-        if is_dataclass(value):
-            yield from _flat(value, f"{config.method if each.name == 'strategy' else each.name}.")
-        else:
-            yield f"{prefix}{each.name}", value

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -192,21 +192,6 @@ def _keep_pictures(
 _MOST_VIEWS: Final = 4
 
 
-@dataclass(frozen=True)
-class Encoding:
-    """A splat in a format."""
-
-    format: str  # its name
-    bytes: int  # of the file
-    num_gaussians: int  # in it
-    psnr: float | None  # mean over some held-out views after a round trip, dB; None where there is none
-    views: int  # how many these are
-
-    def entry(self) -> dict[str, Any]:
-        """Return what the statistics hold of it."""
-        return asdict(self)
-
-
 def measure_encodings(
     backend: Any,
     params: Mapping[str, Tensor],
@@ -214,7 +199,7 @@ def measure_encodings(
     config: TrainConfig,
     sh_degree: int,
     world_transform: np.ndarray,
-) -> Iterator[Encoding]:
+) -> Iterator[dict[str, Any]]:
     """Write a splat in every format, in the capture's own frame, read it back and measure it in the training frame.
 
     A format that cannot hold the splat is left out.
@@ -224,7 +209,8 @@ def measure_encodings(
         world_transform: the training frame from the capture's. [4, 4]
 
     Yields:
-        One format after the other, as soon as it is measured.
+        What the statistics hold of a format, as soon as it is measured: its name, bytes, Gaussians, mean PSNR over some
+            held-out views after the round trip (dB; None where there is none), and how many these are.
     """
     some = evenly(views, _MOST_VIEWS)
     plain = {name: value.detach().cpu() for name, value in params.items()}
@@ -236,4 +222,5 @@ def measure_encodings(
             continue
         back = apply_similarity(decoded(name, data)[0], world_transform)
         psnr = evaluate(backend, back, some, config, sh_degree)["psnr"] if some else None
-        yield Encoding(name, len(data), len(own["means"]), psnr, len(some))
+        entry = {"format": name, "bytes": len(data), "num_gaussians": len(own["means"])}
+        yield {**entry, "psnr": psnr, "views": len(some)}

@@ -37,7 +37,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import shlex
 import shutil
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -50,7 +49,7 @@ import numpy as np
 
 from pop_fast.density.protocol import DensificationStep
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import FolderLock, check_place, is_left_behind, write_atomically
+from pop_fast.io.atomic import FolderLock, check_place, is_left_behind, write_atomically, write_file, write_json
 from pop_fast.io.read_back import parse_json, read_json
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.steps import Phase, StepStats
@@ -160,7 +159,7 @@ class ResultFolder:
     def write_settings(self, config: TrainConfig, beside: Mapping[str, str]) -> None:
         """Write cfg.json, then other texts by file name."""
         for name, text in {"cfg.json": config.to_json(), **beside}.items():
-            write_atomically(self.path / name, lambda file, text=text: file.write(text.encode()))
+            write_file(self.path / name, text)
 
     def _is_used(self) -> bool:
         return self.path.is_dir() and not all(is_left_behind(found) for found in self.path.iterdir())
@@ -230,8 +229,7 @@ class ResultFolder:
 
     def write_stats(self, kind: str, step: int, stats: dict[str, Any]) -> None:
         """Write stats/{kind}_step{step}.json."""
-        text = json.dumps(_finite(stats), indent=2) + "\n"
-        write_atomically(self.stats_path(kind, step), lambda file: file.write(text.encode()))
+        write_json(self.stats_path(kind, step), _finite(stats))
 
     def read_stats(self, kind: str, step: int) -> dict[str, Any] | None:
         """Read what `write_stats` wrote, or None."""
@@ -339,17 +337,6 @@ def record_of(
     }
 
 
-class Stopwatch:
-    """Measures a piece of work from when it is made."""
-
-    def __init__(self) -> None:
-        self._clock, self._cpu = time.perf_counter(), time.process_time()
-
-    def read(self) -> tuple[float, float]:
-        """Give the seconds since: by the clock, and of the processor over all threads of this process."""
-        return time.perf_counter() - self._clock, time.process_time() - self._cpu
-
-
 @dataclass
 class Times:
     """The times of a run, s."""
@@ -424,8 +411,3 @@ def _is_command(entry: Any) -> bool:
         return False
     words = entry.get("words")
     return isinstance(words, list) and all(isinstance(word, str) for word in words)
-
-
-def shell_line(words: Sequence[str]) -> str:
-    """Write a command as a shell reads it."""
-    return shlex.join(words)

@@ -135,7 +135,8 @@ class TorchStepper:
             try:
                 found.append(self._take(step, phase))
             except Abandoned:
-                self._forget_gradients()
+                for param in (*self._params.values(), *self._task.appearance.params.values()):
+                    param.grad = None
                 break
         return found
 
@@ -145,17 +146,13 @@ class TorchStepper:
     def _take(self, step: int, phase: Phase) -> StepStats:
         with self._task.stop.abandoning(self._task.may_abandon):
             look = self._look(self._task.order[step], step, phase)
-            self._require_finite(look.loss, look.index, step)
+            self._require_finite(look.loss.item(), look.index, step)
             stats = self._measured(look, step, phase)
         adam_step(self._params, self._optimizers, self._task.updates, step, self._state)
         self._task.appearance.update(step)
         self._task.strategy.collect(self._params, self._state, step, look.rendered.info)
         self.step = step + 1
         return stats
-
-    def _forget_gradients(self) -> None:
-        for param in (*self._params.values(), *self._task.appearance.params.values()):
-            param.grad = None
 
     def _look(self, index: int, step: int, phase: Phase) -> ViewGradient:
         """Render a view, compare it with its photograph and go back to the gradients of the parameters."""
@@ -202,19 +199,18 @@ class TorchStepper:
             depth=config.depth_lambda != 0.0 and self._task.views[index].points is not None,
         )
 
-    def _require_finite(self, loss: Tensor, index: int, step: int) -> None:
-        if not math.isfinite(loss.item()):
-            raise ValueError(f"the loss of view {self._task.views[index].name} is {loss.item()} at step {step}")
+    def _require_finite(self, loss: float, index: int, step: int) -> None:
+        if not math.isfinite(loss):
+            raise ValueError(f"the loss of view {self._task.views[index].name} is {loss} at step {step}")
 
     def _measured(self, look: ViewGradient, step: int, phase: Phase) -> StepStats:
         """Return the loss's parts, and where a record is due everything else too."""
         photometric, pop = look.objective.item(), 0.0 if look.term is None else look.term.item()
         if step % self._task.config.log_every != 0 and not self._task.strategy.changes_after(step):
             return StepStats(math.nan, math.nan, photometric, math.nan, pop)
-        rendered = look.rendered
-        image = rendered.image.detach()
+        image = look.rendered.image.detach()
         pixelwise, structural, square = self._photo_loss.measure(image, look.index, phase.objective, look.behind)
-        return StepStats(pixelwise, structural, photometric, square, pop, *gaussians_per_pixel(rendered.info))
+        return StepStats(pixelwise, structural, photometric, square, pop, *gaussians_per_pixel(look.rendered.info))
 
 
 class BatchStepper(TorchStepper):
@@ -235,7 +231,8 @@ class BatchStepper(TorchStepper):
             for place in ranks.positions(size):
                 look = self._look(indices[place], step, phase)
                 looks.append(self._seen(look, step))
-                numbers.append(_numbers(self._measured(look, step, phase), look.loss))
+                measured = (*self._measured(look, step, phase), look.loss.item())
+                numbers.append(torch.tensor(measured, dtype=torch.float64))
                 keys[:] = [key for key, param in self._params.items() if param.grad is not None]
                 yield self._flat_gradients(keys)
 
@@ -297,13 +294,8 @@ class BatchStepper(TorchStepper):
         """Return the views' mean measurements; ValueError in every process where a loss is not finite."""
         rows = [row.tolist() for row in numbers]
         for index, row in zip(indices, rows, strict=True):
-            if not math.isfinite(row[-1]):
-                raise ValueError(f"the loss of view {self._task.views[index].name} is {row[-1]} at step {step}")
+            self._require_finite(row[-1], index, step)
         return StepStats(*(sum(column) / len(rows) for column in list(zip(*rows, strict=True))[:-1]))
-
-
-def _numbers(stats: StepStats, loss: Tensor) -> Tensor:
-    return torch.tensor([*stats, loss.item()], dtype=torch.float64)
 
 
 def check_batch(config: TrainConfig, own_strategy: bool, ranks: Ranks) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import sys
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cached_property
@@ -41,7 +42,7 @@ from pop_fast.train.lpips import load_nets
 from pop_fast.train.model import KEYS, make_optimizers, require_usable
 from pop_fast.train.preflight import check_start, check_views, facts, find_warnings
 from pop_fast.train.ranks import ALONE, Ranks
-from pop_fast.train.results import ResultFolder, Segment, Stopwatch, Times, record_of
+from pop_fast.train.results import ResultFolder, Segment, Times, record_of
 from pop_fast.train.schedule import ViewOrder, active_sh_degree, phase_at, reads_rows, segment_end, updates_of_strategy
 from pop_fast.train.signals import Abandoned, StopRequest, stop_requests
 from pop_fast.train.stepper import Engine, Stepper, Task
@@ -237,7 +238,8 @@ class TrainingRun:
         Raises:
             PopError: a number is no longer finite; names it.
         """
-        took, first, before = Stopwatch(), self.step, len(self.params["means"])
+        began, began_cpu = time.perf_counter(), time.process_time()
+        first, before = self.step, len(self.params["means"])
         phase, stepper = phase_at(self.config, self.strategy, first), self.stepper
         size = self.config.batch_size
         with translate_oom():
@@ -245,7 +247,8 @@ class TrainingRun:
             densification = self._change(self.step - 1) if stats else None
         views = [", ".join(self._train[self._order.next()].name for _ in range(size)) for _ in stats]
         after = len(self.params["means"])
-        return Segment(first, phase, views, stats, densification, before, after, *took.read())
+        seconds, seconds_cpu = time.perf_counter() - began, time.process_time() - began_cpu
+        return Segment(first, phase, views, stats, densification, before, after, seconds, seconds_cpu)
 
     def _measured(self, stepper: Stepper, first: int, last: int, phase: Phase) -> list[StepStats]:
         try:

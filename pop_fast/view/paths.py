@@ -15,8 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
-from types import TracebackType
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -215,14 +214,10 @@ class VideoFile:
         self._writer.write(np.ascontiguousarray(frame[: size[1], : size[0], ::-1]))
         self._count += 1
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> bool | None:
-        return self._steps.__exit__(kind, error, trace)
+    def __exit__(self, *error: Any) -> bool | None:
+        return self._steps.__exit__(*error)
 
-    def _finish(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def _finish(self, kind: type[BaseException] | None, *_: object) -> None:
         if self._writer is not None:
             self._writer.release()
         if kind is not None:

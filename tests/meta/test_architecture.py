@@ -408,7 +408,7 @@ def test_what_the_program_prints_is_in_megabytes() -> None:
     found = [f"{_name(p)}: {text}" for p in printing for text in _printed(p) if re.search(r"\b[KMG]iB\b", text)]
     assert found == []
     # the search sees what it is about
-    assert any("MB" in text for text in _printed(ROOT / "pop_fast" / "cli" / "export.py"))
+    assert any("MB" in text for text in _printed(ROOT / "pop_fast" / "cli" / "options.py"))
 
 
 # What words in backticks name is there: modules, what lies in them, and files of source.

@@ -17,6 +17,7 @@ import numpy as np
 from pop_fast.errors import PopError
 from pop_fast.io.formats.cloud import SH_C0, Cloud, drop_largest, logits_of_bytes, restore_largest, to_bytes
 from pop_fast.io.ply import MODE, Frame, asks_for_antialiasing, header_of, read_header
+from pop_fast.io.read_back import WRITE_AGAIN
 
 _CHUNK: Final = 256
 _RANGES: Final = tuple(
@@ -32,7 +33,6 @@ _VECTOR_BITS: Final = (11, 10, 11)
 _SCALE_LIMIT: Final = 20.0
 # coefficients are bytes over [-4, 4]
 _SH_STEPS: Final = 32.0
-_WRITE_AGAIN: Final = "copy or write the file again"
 
 
 def is_compressed(path: Path) -> bool:
@@ -66,19 +66,12 @@ def encode(cloud: Cloud) -> bytes:
     ranges, shares = zip(*(_in_chunks(values) for values in (cloud.means, scales, colors)), strict=True)
     chunks = np.concatenate(ranges, axis=1).astype("<f4")
     rgba = to_bytes(255.0 * np.concatenate([shares[2], cloud.opacities[:, None]], axis=1)).astype(np.uint32)
-    words = np.stack(
-        [
-            _packed_vector(shares[0]),
-            _packed_rotation(cloud.quats),
-            _packed_vector(shares[1]),
-            rgba[:, 0] << 24 | rgba[:, 1] << 16 | rgba[:, 2] << 8 | rgba[:, 3],
-        ],
-        axis=1,
-    ).astype("<u4")
+    color = rgba[:, 0] << 24 | rgba[:, 1] << 16 | rgba[:, 2] << 8 | rgba[:, 3]
+    words = [_packed_vector(shares[0]), _packed_rotation(cloud.quats), _packed_vector(shares[1]), color]
     flat = cloud.rest.transpose(0, 2, 1).reshape(n, 3 * cloud.rest.shape[1]).astype(np.float64)
     rest = np.clip(np.floor(_SH_STEPS * flat + 128.0), 0, 255).astype(np.uint8)
     header = _header(cloud, len(chunks), flat.shape[1])
-    return header + chunks.tobytes() + words.tobytes() + rest.tobytes()
+    return header + chunks.tobytes() + np.stack(words, axis=1).astype("<u4").tobytes() + rest.tobytes()
 
 
 def _header(cloud: Cloud, chunks: int, coefficients: int) -> bytes:
@@ -126,13 +119,13 @@ def decode(data: bytes, path: Path) -> Cloud:
     n = len(words)
     if len(chunks) * _CHUNK < n:
         raise PopError(
-            f"{path}: has {len(chunks)} chunks for {n} vertices; {-(-n // _CHUNK)} are needed: {_WRITE_AGAIN}"
+            f"{path}: has {len(chunks)} chunks for {n} vertices; {-(-n // _CHUNK)} are needed: {WRITE_AGAIN}"
         )
     header = header_of(data, path)
     which = np.arange(n) // _CHUNK
     colors = _COLOR_RANGES if set(_COLOR_RANGES) & set(chunks.dtype.names or ()) else ()
     if not {*_RANGES, *colors} <= set(chunks.dtype.names or ()) or not set(_WORDS) <= set(words.dtype.names or ()):
-        raise PopError(f"{path}: element 'chunk' or 'vertex' lacks a property of compressed PLY; {_WRITE_AGAIN}")
+        raise PopError(f"{path}: element 'chunk' or 'vertex' lacks a property of compressed PLY; {WRITE_AGAIN}")
 
     def spread(names: tuple[str, ...], shares: np.ndarray) -> np.ndarray:
         low, high = (np.stack([chunks[name] for name in part], axis=1)[which] for part in (names[:3], names[3:]))
@@ -172,7 +165,7 @@ def _rest(rows: np.ndarray | None, n: int, path: Path) -> np.ndarray:
     if count not in (9, 24, 45) or set(rows.dtype.names or ()) != {f"f_rest_{i}" for i in range(count)}:
         raise PopError(f"{path}: element 'sh' has {count} properties; there must be f_rest_0 to 8, 23 or 44")
     if len(rows) != n:
-        raise PopError(f"{path}: has {len(rows)} rows of 'sh' for {n} of 'vertex'; {_WRITE_AGAIN}")
+        raise PopError(f"{path}: has {len(rows)} rows of 'sh' for {n} of 'vertex'; {WRITE_AGAIN}")
     stored = np.stack([rows[f"f_rest_{i}"] for i in range(count)], axis=1)
     values = (stored.astype(np.float64) - 127.5) / _SH_STEPS
     return values.reshape(n, 3, count // 3).transpose(0, 2, 1).astype(np.float32)
@@ -182,14 +175,14 @@ def _elements(data: bytes, path: Path) -> dict[str, np.ndarray]:
     """Return the rows of every element."""
     header = header_of(data, path)
     if not header.order or any(element.lists for element in header.elements):
-        raise PopError(f"{path}: is a text file or has lists; compressed PLY is binary and has none: {_WRITE_AGAIN}")
+        raise PopError(f"{path}: is a text file or has lists; compressed PLY is binary and has none: {WRITE_AGAIN}")
     found: dict[str, np.ndarray] = {}
     at = header.length
     for element in header.elements:
         kind = np.dtype([(name, header.order + column) for name, column in element.columns])
         if at + kind.itemsize * element.count > len(data):
             raise PopError(
-                f"{path}: is cut off in element {element.name!r}, which has {element.count} rows; {_WRITE_AGAIN}"
+                f"{path}: is cut off in element {element.name!r}, which has {element.count} rows; {WRITE_AGAIN}"
             )
         found[element.name] = np.frombuffer(data, kind, element.count, at)
         at += kind.itemsize * element.count

@@ -26,7 +26,7 @@ import numpy as np
 
 from pop_fast.errors import PopError
 from pop_fast.io.formats.cloud import COEFFICIENTS, SH_C0, Cloud, logits_of_bytes, to_bytes
-from pop_fast.io.read_back import check_memory
+from pop_fast.io.read_back import WRITE_AGAIN, check_memory
 
 _SPLAT_ROW: Final = np.dtype([("xyz", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rot", "u1", 4)])
 
@@ -50,9 +50,7 @@ def encode_splat(cloud: Cloud) -> bytes:
 def decode_splat(data: bytes, path: Path) -> Cloud:
     """Read `.splat`."""
     if len(data) % _SPLAT_ROW.itemsize:
-        raise PopError(
-            f"{path}: has {len(data)} bytes, no multiple of {_SPLAT_ROW.itemsize}; copy or write the file again"
-        )
+        raise PopError(f"{path}: has {len(data)} bytes, no multiple of {_SPLAT_ROW.itemsize}; {WRITE_AGAIN}")
     rows = np.frombuffer(data, _SPLAT_ROW)
     bad = np.flatnonzero(~(rows["scale"] > 0.0).all(axis=1))
     if len(bad):
@@ -81,7 +79,6 @@ _COEFFICIENT_RANGE: Final = (-1.5, 1.5)
 _SMALLEST_SCALE: Final = 2.0**-25
 # bytes of a Gaussian while it is decoded, at most
 _IN_MEMORY: Final = 1500
-_WRITE_AGAIN: Final = "copy or write the file again"
 
 
 @dataclass(frozen=True)
@@ -119,21 +116,21 @@ class _Section:
 def decode_ksplat(data: bytes, path: Path) -> Cloud:
     """Read KSPLAT."""
     if len(data) < _HEADER_SIZE:
-        raise PopError(f"{path}: is cut off in its header; {_WRITE_AGAIN}")
+        raise PopError(f"{path}: is cut off in its header; {WRITE_AGAIN}")
     major, minor, count, n, level, low, high = _HEADER.unpack_from(data)
     if major != 0 or minor < 1:
         raise PopError(f"{path}: version is {major}.{minor}; write it as version 0.1, which this program reads")
     if level >= len(_LEVELS):
-        raise PopError(f"{path}: compressionLevel is {level}; it must be 0, 1 or 2: {_WRITE_AGAIN}")
+        raise PopError(f"{path}: compressionLevel is {level}; it must be 0, 1 or 2: {WRITE_AGAIN}")
     sections = _sections(data, count, level, path)
     if sum(section.used for section in sections) != n:
-        raise PopError(f"{path}: splatCount is {n}, and its sections hold other than that; {_WRITE_AGAIN}")
-    check_memory(path, n * _IN_MEMORY, len(data), f"its splatCount of {n}", _WRITE_AGAIN)
+        raise PopError(f"{path}: splatCount is {n}, and its sections hold other than that; {WRITE_AGAIN}")
+    check_memory(path, n * _IN_MEMORY, len(data), f"its splatCount of {n}", WRITE_AGAIN)
     ends = (low or _COEFFICIENT_RANGE[0], high or _COEFFICIENT_RANGE[1])
     bands = COEFFICIENTS[max((section.degree for section in sections), default=0)]
     parts = [_rows(data, section, ends, bands, path) for section in sections]
     if not parts:
-        raise PopError(f"{path}: has no section; {_WRITE_AGAIN}")
+        raise PopError(f"{path}: has no section; {WRITE_AGAIN}")
     means, log_scales, quats, logits, sh0, rest = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     return Cloud(means, log_scales, quats, logits, sh0, rest).checked(path)
 
@@ -142,18 +139,18 @@ def _sections(data: bytes, count: int, level: int, path: Path) -> list[_Section]
     """Return the headers of all sections, each of which the file has room for."""
     at, found = _HEADER_SIZE + count * _SECTION_SIZE, list[_Section]()
     if at > len(data):
-        raise PopError(f"{path}: maxSectionCount is {count}, more than {len(data)} bytes can hold; {_WRITE_AGAIN}")
+        raise PopError(f"{path}: maxSectionCount is {count}, more than {len(data)} bytes can hold; {WRITE_AGAIN}")
     for number in range(count):
         fields = _SECTION.unpack_from(data, _HEADER_SIZE + number * _SECTION_SIZE)
         section, where = _Section(*fields, at=at, level=level), f"{path}: section {number}"
         if section.degree >= len(COEFFICIENTS):
-            raise PopError(f"{where}: sphericalHarmonicsDegree is {section.degree}; it must be 0 to 3: {_WRITE_AGAIN}")
+            raise PopError(f"{where}: sphericalHarmonicsDegree is {section.degree}; it must be 0 to 3: {WRITE_AGAIN}")
         if section.used > section.rows:
-            raise PopError(f"{where}: splatCount is {section.used}, over maxSplatCount {section.rows}; {_WRITE_AGAIN}")
+            raise PopError(f"{where}: splatCount is {section.used}, over maxSplatCount {section.rows}; {WRITE_AGAIN}")
         if level and section.used and section.bucket_bytes != _BUCKET_SIZE:
             raise PopError(f"{where}: bucketStorageSizeBytes is {section.bucket_bytes}, not {_BUCKET_SIZE}")
         if section.end > len(data):
-            raise PopError(f"{where}: its rows end at byte {section.end} of {len(data)}; {_WRITE_AGAIN}")
+            raise PopError(f"{where}: its rows end at byte {section.end} of {len(data)}; {WRITE_AGAIN}")
         at = section.end
         found.append(section)
     return found
@@ -196,6 +193,6 @@ def _bucket_centres(data: bytes, section: _Section, path: Path) -> np.ndarray:
     lengths = np.concatenate([np.full(section.full, section.capacity, np.int64), lengths])
     which = np.searchsorted(np.cumsum(lengths), np.arange(section.used), side="right")
     if len(which) and which[-1] >= len(lengths):
-        raise PopError(f"{path}: its buckets hold {lengths.sum()} of {section.used} Gaussians; {_WRITE_AGAIN}")
+        raise PopError(f"{path}: its buckets hold {lengths.sum()} of {section.used} Gaussians; {WRITE_AGAIN}")
     centres = np.frombuffer(data, "<f4", 3 * section.buckets, section.at + 4 * section.partial)
     return centres.reshape(-1, 3)[which].astype(np.float64)

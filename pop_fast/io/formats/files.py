@@ -10,7 +10,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import write_atomically
+from pop_fast.io.atomic import write_file
 from pop_fast.io.formats import FORMATS, PLY, format_names, sog
 from pop_fast.io.formats.cloud import Cloud
 from pop_fast.io.formats.compressed_ply import is_compressed
@@ -126,7 +126,7 @@ def save_as(
 ) -> int:
     """Write a splat in a format, atomically; returns the number of bytes."""
     data = encoded(name, params, antialiased, frame)
-    write_atomically(path, lambda file: file.write(data))
+    write_file(path, data)
     return len(data)
 
 

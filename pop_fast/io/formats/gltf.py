@@ -23,6 +23,7 @@ from pop_fast.errors import PopError
 from pop_fast.io.formats import spz
 from pop_fast.io.formats.cloud import COEFFICIENTS, SH_C0, Cloud, to_bytes
 from pop_fast.io.ply import KEY, Frame
+from pop_fast.io.read_back import WRITE_AGAIN
 
 NAME: Final = "KHR_gaussian_splatting"
 SPZ_NAME: Final = "KHR_gaussian_splatting_compression_spz_2"
@@ -32,7 +33,6 @@ _FLOAT, _BYTE = 5126, 5121
 _TYPES: Final = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 # an opacity of 1 has no finite logit; the largest float32 under it has
 _OPAQUE: Final = 1.0 - 2.0**-24
-_WRITE_AGAIN: Final = "copy or write the file again"
 
 
 def encode(cloud: Cloud) -> bytes:
@@ -127,7 +127,7 @@ def decode(data: bytes, path: Path) -> Cloud:
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         if isinstance(error, PopError):
             raise
-        raise PopError(f"{path}: its JSON does not follow glTF 2.0 ({error!r}); {_WRITE_AGAIN}") from error
+        raise PopError(f"{path}: its JSON does not follow glTF 2.0 ({error!r}); {WRITE_AGAIN}") from error
 
 
 def _chunks(data: bytes, path: Path) -> tuple[dict[str, Any], bytes]:
@@ -136,17 +136,17 @@ def _chunks(data: bytes, path: Path) -> tuple[dict[str, Any], bytes]:
         raise PopError(f"{path}: does not begin as a .glb file; where it is .gltf, pack it into .glb")
     version, total, length, kind = struct.unpack("<IIII", data[4:20])
     if version != 2 or kind != _JSON or total > len(data) or 20 + length > total:
-        raise PopError(f"{path}: its chunks do not fit into {len(data)} bytes; {_WRITE_AGAIN}")
+        raise PopError(f"{path}: its chunks do not fit into {len(data)} bytes; {WRITE_AGAIN}")
     try:
         content = json.loads(data[20 : 20 + length])
     except (ValueError, RecursionError) as error:
-        raise PopError(f"{path}: its JSON is damaged ({error}); {_WRITE_AGAIN}") from error
+        raise PopError(f"{path}: its JSON is damaged ({error}); {WRITE_AGAIN}") from error
     at = 20 + length
     if at + 8 > total:
         return content, b""
     length, kind = struct.unpack("<II", data[at : at + 8])
     if kind != _BIN or at + 8 + length > total:
-        raise PopError(f"{path}: its binary chunk of {length} bytes does not fit; {_WRITE_AGAIN}")
+        raise PopError(f"{path}: its binary chunk of {length} bytes does not fit; {WRITE_AGAIN}")
     return content, data[at + 8 : at + 8 + length]
 
 
@@ -168,7 +168,7 @@ def _splat(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
 def _from_attributes(content: Mapping[str, Any], body: bytes, attributes: Mapping[str, int], path: Path) -> Cloud:
     def attribute(name: str, width: int) -> np.ndarray:
         if name not in attributes:
-            raise PopError(f"{path}: its splat has no attribute {name}; {_WRITE_AGAIN}")
+            raise PopError(f"{path}: its splat has no attribute {name}; {WRITE_AGAIN}")
         accessor = content["accessors"][attributes[name]]
         n = accessor["count"]
         if accessor["componentType"] != _FLOAT or accessor["type"] != _TYPES[width] or "sparse" in accessor:
@@ -180,7 +180,7 @@ def _from_attributes(content: Mapping[str, Any], body: bytes, attributes: Mappin
             raise PopError(f"{path}: attribute {name} is interleaved with others; write it in a buffer view of its own")
         part = _part(content, body, accessor["bufferView"], path)[accessor.get("byteOffset", 0) :]
         if len(part) < 4 * width * n:
-            raise PopError(f"{path}: attribute {name} is cut off: {len(part)} bytes for {n} values; {_WRITE_AGAIN}")
+            raise PopError(f"{path}: attribute {name} is cut off: {len(part)} bytes for {n} values; {WRITE_AGAIN}")
         return np.frombuffer(part, "<f4", n * width).reshape(n, width)
 
     degree = next((d for d in (3, 2, 1) if f"{NAME}:SH_DEGREE_{d}_COEF_0" in attributes), 0)
@@ -188,7 +188,7 @@ def _from_attributes(content: Mapping[str, Any], body: bytes, attributes: Mappin
     bands = [attribute(f"{NAME}:SH_DEGREE_{d}_COEF_{i}", 3) for d in range(1, degree + 1) for i in range(2 * d + 1)]
     opacities = attribute(f"{NAME}:OPACITY", 1)[:, 0].astype(np.float64)
     if len(opacities) and not (opacities.min() >= 0.0 and opacities.max() <= 1.0):
-        raise PopError(f"{path}: {NAME}:OPACITY leaves [0, 1]; {_WRITE_AGAIN}")
+        raise PopError(f"{path}: {NAME}:OPACITY leaves [0, 1]; {WRITE_AGAIN}")
     opacities = np.clip(opacities, np.finfo(np.float32).tiny, _OPAQUE)
     scales = attribute(f"{NAME}:SCALE", 3).astype(np.float64)
     columns = {
@@ -201,7 +201,7 @@ def _from_attributes(content: Mapping[str, Any], body: bytes, attributes: Mappin
     }
     lengths = {name: len(column) for name, column in columns.items()}
     if len(set(lengths.values())) > 1:
-        raise PopError(f"{path}: its attributes have different counts ({lengths}); {_WRITE_AGAIN}")
+        raise PopError(f"{path}: its attributes have different counts ({lengths}); {WRITE_AGAIN}")
     antialiased = bool(content.get("asset", {}).get("extras", {}).get("antialiased", False))
     assert columns["rest"].shape[1] in COEFFICIENTS
     return Cloud(**columns, antialiased=antialiased).turned("z").checked(path)
@@ -213,5 +213,5 @@ def _part(content: Mapping[str, Any], body: bytes, index: int, path: Path) -> by
         raise PopError(f"{path}: bufferViews[{index}] lies outside of the file; pack it into one .glb")
     start, length = entry.get("byteOffset", 0), entry["byteLength"]
     if start < 0 or length < 0 or start + length > len(body):
-        raise PopError(f"{path}: bufferViews[{index}] reaches beyond the binary chunk; {_WRITE_AGAIN}")
+        raise PopError(f"{path}: bufferViews[{index}] reaches beyond the binary chunk; {WRITE_AGAIN}")
     return body[start : start + length]

@@ -26,7 +26,7 @@ from pop_fast.errors import PopError
 from pop_fast.io.formats.cloud import COEFFICIENTS, Cloud, drop_largest, logits_of_bytes, restore_largest, to_bytes
 from pop_fast.io.image_header import size_of
 from pop_fast.io.ply import KEY, Frame
-from pop_fast.io.read_back import check_members, check_memory
+from pop_fast.io.read_back import WRITE_AGAIN, check_members, check_memory
 
 _CODES: Final = 256
 _ROUNDS: Final = 8
@@ -137,7 +137,6 @@ _LOSSLESS: Final = (cv2.IMWRITE_WEBP_QUALITY, 101)
 _LARGEST_META: Final = 2**20
 # bytes of a Gaussian while it is decoded, at most
 _IN_MEMORY: Final = 700
-_WRITE_AGAIN: Final = "copy or write the file again"
 
 
 def encode(cloud: Cloud, shared_by: int = _SHARED_BY) -> bytes:
@@ -224,10 +223,10 @@ def decode(data: bytes, path: Path) -> Cloud:
     """Read SOG, as one file."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            check_members(path, archive, len(data), _WRITE_AGAIN)
+            check_members(path, archive, len(data), WRITE_AGAIN)
             return _read(lambda name: _unzipped(archive, name, path), len(data), path)
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError) as error:
-        raise PopError(f"{path}: is not a readable ZIP file ({error}); {_WRITE_AGAIN}") from error
+        raise PopError(f"{path}: is not a readable ZIP file ({error}); {WRITE_AGAIN}") from error
 
 
 def decode_folder(path: Path) -> Cloud:
@@ -242,7 +241,7 @@ def decode_folder(path: Path) -> Cloud:
 def _unzipped(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
     size = archive.getinfo(name).file_size
     if name == META and size > _LARGEST_META:
-        raise PopError(f"{path}: {META} has {size} bytes; {_WRITE_AGAIN}")
+        raise PopError(f"{path}: {META} has {size} bytes; {WRITE_AGAIN}")
     return archive.read(name)
 
 
@@ -252,7 +251,7 @@ def _file(folder: Path, name: str, path: Path) -> bytes:
     try:
         size = (folder / name).stat().st_size
         if name == META and size > _LARGEST_META:
-            raise PopError(f"{path}: has {size} bytes; {_WRITE_AGAIN}")
+            raise PopError(f"{path}: has {size} bytes; {WRITE_AGAIN}")
         return (folder / name).read_bytes()
     except FileNotFoundError:
         raise PopError(f"{folder / name}: is absent, and {path.name} names it; copy it beside {path.name}") from None
@@ -267,7 +266,7 @@ def _read(read: Callable[[str], bytes], held: int, path: Path) -> Cloud:
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError, RecursionError) as error:
         if isinstance(error, PopError):
             raise
-        raise PopError(f"{path}: {META} is not that of SOG version 2 ({error!r}); {_WRITE_AGAIN}") from error
+        raise PopError(f"{path}: {META} is not that of SOG version 2 ({error!r}); {WRITE_AGAIN}") from error
 
 
 def _decoded(read: Callable[[str], bytes], held: int, path: Path) -> Cloud:
@@ -278,8 +277,8 @@ def _decoded(read: Callable[[str], bytes], held: int, path: Path) -> Cloud:
         )
     n = meta["count"]
     if not isinstance(n, int) or n < 0:
-        raise PopError(f"{path}: {META}.count is {n}; it must be a number of Gaussians: {_WRITE_AGAIN}")
-    check_memory(path, n * _IN_MEMORY, held, f"{META}.count of {n}", _WRITE_AGAIN)
+        raise PopError(f"{path}: {META}.count is {n}; it must be a number of Gaussians: {WRITE_AGAIN}")
+    check_memory(path, n * _IN_MEMORY, held, f"{META}.count of {n}", WRITE_AGAIN)
 
     def pixels(entry: str, index: int, least: int = n) -> np.ndarray:
         name = str(meta[entry]["files"][index])
@@ -319,7 +318,7 @@ def _rest(meta: Mapping[str, Any], pixels: Any, path: Path) -> np.ndarray:
     palette = _codes(meta, "shN")[pixels("shN", 0, count * each)[:, :3]].reshape(count, each, 3)
     labels = pixels("shN", 1)[:, :2].astype(np.int64) @ np.array([1, 256])
     if len(labels) and labels.max() >= count:
-        raise PopError(f"{path}: shN_labels names row {labels.max()} of a palette of {count}; {_WRITE_AGAIN}")
+        raise PopError(f"{path}: shN_labels names row {labels.max()} of a palette of {count}; {WRITE_AGAIN}")
     return palette[labels]
 
 
@@ -328,12 +327,12 @@ def _pixels(data: bytes, name: str, least: int, path: Path) -> np.ndarray:
     sound = len(data) >= 32 and data[:4] == b"RIFF" and (data[12:16] != b"VP8L" or data[20] == 0x2F)
     width, height = (size_of(data) if sound else None) or (0, 0)
     if width * height < least:
-        raise PopError(f"{path}: {name} is {width}x{height} pixels; {least} are needed: {_WRITE_AGAIN}")
+        raise PopError(f"{path}: {name} is {width}x{height} pixels; {least} are needed: {WRITE_AGAIN}")
     if width * height > 4 * least + 2**16:
-        raise PopError(f"{path}: {name} is {width}x{height} pixels for {least} values; {_WRITE_AGAIN}")
+        raise PopError(f"{path}: {name} is {width}x{height} pixels for {least} values; {WRITE_AGAIN}")
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 3 or image.dtype != np.uint8 or image.shape[0] * image.shape[1] < least:
-        raise PopError(f"{path}: {name} cannot be decoded as an image of colours; {_WRITE_AGAIN}")
+        raise PopError(f"{path}: {name} cannot be decoded as an image of colours; {WRITE_AGAIN}")
     flat = image[..., [2, 1, 0]].reshape(-1, 3)
     # where all are opaque, there may be no fourth channel
     fourth = image[..., 3].reshape(-1, 1) if image.shape[2] == 4 else np.full((len(flat), 1), 255, np.uint8)

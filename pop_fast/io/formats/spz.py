@@ -27,7 +27,7 @@ import numpy as np
 from pop_fast.errors import PopError
 from pop_fast.io.formats.cloud import COEFFICIENTS, Cloud, drop_largest, logits_of_bytes, restore_largest, to_bytes
 from pop_fast.io.ply import KEY, Frame
-from pop_fast.io.read_back import check_memory
+from pop_fast.io.read_back import WRITE_AGAIN, check_memory
 
 MAGIC: Final = 0x5053474E
 # magic, version, count, degree, fractional bits, flags, and a zero byte or the number of streams
@@ -63,7 +63,6 @@ _WIDEST_STEP: Final = 64
 _EXPANSION: Final = 1032
 # bytes of a Gaussian while it is decoded, at most
 _IN_MEMORY: Final = 700
-_WRITE_AGAIN: Final = "copy or write the file again"
 
 
 def encode(cloud: Cloud, version: int = 3, sh_step: float = SH_STEP) -> bytes:
@@ -211,14 +210,14 @@ def _of_gzip(data: bytes, path: Path) -> tuple[_Head, list[bytes], bytes]:
     try:
         first = stream.decompress(data, _HEADER.size)
         if len(first) < _HEADER.size:
-            raise PopError(f"{path}: is cut off in its header; {_WRITE_AGAIN}")
+            raise PopError(f"{path}: is cut off in its header; {WRITE_AGAIN}")
         head = _checked_head(first, (2, 3), len(data), path)
         size = head.n * sum(head.widths)
         body = stream.decompress(stream.unconsumed_tail, size + _LONGEST)
     except zlib.error as error:
-        raise PopError(f"{path}: its gzip stream is damaged ({error}); {_WRITE_AGAIN}") from error
+        raise PopError(f"{path}: its gzip stream is damaged ({error}); {WRITE_AGAIN}") from error
     if len(body) < size:
-        raise PopError(f"{path}: ends after {len(body)} of {size} bytes of its columns; {_WRITE_AGAIN}")
+        raise PopError(f"{path}: ends after {len(body)} of {size} bytes of its columns; {WRITE_AGAIN}")
     columns, at = list[bytes](), 0
     for width in head.widths:
         columns.append(body[at : at + head.n * width])
@@ -230,7 +229,7 @@ def _of_streams(data: bytes, path: Path) -> tuple[_Head, list[bytes], bytes]:
     """Return the header of version 4, whose promises hold, the columns and the extensions."""
     begin = _HEADER.size + _TABLE_AT.size
     if len(data) < begin:
-        raise PopError(f"{path}: is cut off in its header; {_WRITE_AGAIN}")
+        raise PopError(f"{path}: is cut off in its header; {WRITE_AGAIN}")
     head = _checked_head(data[: _HEADER.size], (4,), len(data), path)
     (table,) = _TABLE_AT.unpack_from(data, _HEADER.size)
     plain = [head.n * width for width in head.widths]
@@ -238,15 +237,15 @@ def _of_streams(data: bytes, path: Path) -> tuple[_Head, list[bytes], bytes]:
         raise PopError(f"{path}: numStreams is {head.streams}; its degree and count make {sum(s > 0 for s in plain)}")
     at = table + _SIZES.size * head.streams
     if table < begin or at > len(data):
-        raise PopError(f"{path}: tocByteOffset is {table}, which leaves no room for the table; {_WRITE_AGAIN}")
+        raise PopError(f"{path}: tocByteOffset is {table}, which leaves no room for the table; {WRITE_AGAIN}")
     sizes = iter(_SIZES.iter_unpack(data[table:at]))
     columns: list[bytes] = []
     for number, size in enumerate(plain):
         packed, stated = next(sizes) if size else (0, 0)
         if stated != size:
-            raise PopError(f"{path}: stream {number} is to hold {stated} bytes, not {size}; {_WRITE_AGAIN}")
+            raise PopError(f"{path}: stream {number} is to hold {stated} bytes, not {size}; {WRITE_AGAIN}")
         if at + packed > len(data):
-            raise PopError(f"{path}: is cut off in stream {number}; {_WRITE_AGAIN}")
+            raise PopError(f"{path}: is cut off in stream {number}; {WRITE_AGAIN}")
         columns.append(_inflated(data[at : at + packed], size, number, path) if size else b"")
         at += packed
     extensions = data[begin:table] if head.flags & _EXTENDED else b""
@@ -264,12 +263,12 @@ def _checked_head(first: bytes, versions: Sequence[int], length: int, path: Path
     if head.degree > 3:
         raise PopError(f"{path}: shDegree is {head.degree}; it must be 0 to 3: write it with fewer degrees")
     if head.bits > 24:
-        raise PopError(f"{path}: fractionalBits is {head.bits}; it must be 0 to 24: {_WRITE_AGAIN}")
+        raise PopError(f"{path}: fractionalBits is {head.bits}; it must be 0 to 24: {WRITE_AGAIN}")
     if head.flags & _LEVELS_OF_DETAIL:
         raise PopError(f"{path}: holds levels of detail (flag 0x80), not one splat; write it without them")
     if head.n * sum(head.widths) > _EXPANSION * length:
-        raise PopError(f"{path}: numPoints is {head.n}, more than {length} bytes can hold; {_WRITE_AGAIN}")
-    check_memory(path, head.n * _IN_MEMORY, length, f"its numPoints of {head.n}", _WRITE_AGAIN)
+        raise PopError(f"{path}: numPoints is {head.n}, more than {length} bytes can hold; {WRITE_AGAIN}")
+    check_memory(path, head.n * _IN_MEMORY, length, f"its numPoints of {head.n}", WRITE_AGAIN)
     return head
 
 
@@ -280,9 +279,9 @@ def _inflated(stream: bytes, size: int, number: int, path: Path) -> bytes:
         with zstandard.ZstdDecompressor(max_window_size=_WIDEST_WINDOW).stream_reader(stream) as reader:
             column = reader.read(size + 1)
     except zstandard.ZstdError as error:
-        raise PopError(f"{path}: stream {number} is damaged ({error}); {_WRITE_AGAIN}") from error
+        raise PopError(f"{path}: stream {number} is damaged ({error}); {WRITE_AGAIN}") from error
     if len(column) != size:
-        raise PopError(f"{path}: stream {number} holds other than its {size} bytes; {_WRITE_AGAIN}")
+        raise PopError(f"{path}: stream {number} holds other than its {size} bytes; {WRITE_AGAIN}")
     return column
 
 
@@ -297,7 +296,7 @@ def _said(extensions: bytes, path: Path) -> tuple[str, Frame | None]:
         at += _EXTENSION.size
         payload = extensions[at : at + length]
         if len(payload) < length:
-            raise PopError(f"{path}: extension {kind:#x} of {length} bytes is cut off; {_WRITE_AGAIN}")
+            raise PopError(f"{path}: extension {kind:#x} of {length} bytes is cut off; {WRITE_AGAIN}")
         at += length
         if kind == _COORDINATES:
             number = int.from_bytes(payload[:4], "little")

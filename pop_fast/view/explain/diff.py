@@ -226,14 +226,8 @@ def _side(scene: ExplainedView, name: str, region: tuple[int, int, int, int]) ->
             f"diff names {name!r}, which is neither a profile ({', '.join(PROFILES)}) nor a backend "
             f"({', '.join(backend_names())})"
         )
-    return Side(
-        name,
-        profile,
-        info,
-        image.double().numpy()[part],
-        info["dominant_ids"][0].numpy()[part],
-        info["n_contrib"][0].numpy()[part],
-    )
+    dominant, blended = (info[key][0].numpy()[part] for key in ("dominant_ids", "n_contrib"))
+    return Side(name, profile, info, image.double().numpy()[part], dominant, blended)
 
 
 def _oracle_side(scene: ExplainedView, region: tuple[int, int, int, int]) -> Side:

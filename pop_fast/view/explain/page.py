@@ -159,14 +159,11 @@ def _stages(e: PixelExplanation, drawn: Sequence[Row], pictures: dict[str, np.nd
     near, left, top = crop(pictures["render"], e.x, e.y, side)
     box = (left, top, near.shape[1], near.shape[0])
     kind = "tall" if e.height > e.width else "wide"
+    names = {"photo": "photograph", "dominant_ids": "dominant Gaussian", "pop_pull": "where POP pulls"}
     small = "".join(
         f'<figure><img alt="{name}" src="{data_uri(crop(pictures[key], e.x, e.y, side)[0], lossless=True)}">'
         f'<div class="caption">{name}</div></figure>'
-        for key, name in (
-            ("photo", "photograph"),
-            ("dominant_ids", "dominant Gaussian"),
-            ("pop_pull", "where POP pulls"),
-        )
+        for key, name in names.items()
         if key in pictures
     )
     return (

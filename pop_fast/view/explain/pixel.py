@@ -373,7 +373,6 @@ class PixelExplanation:
         return next((row for row in self.rows if row.status == "stopped"), None)
 
     def __str__(self) -> str:
-
         return table(self)
 
     def to_json(self) -> str:

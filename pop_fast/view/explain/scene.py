@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +14,7 @@ from torch import Tensor
 from pop_fast.api.rasterize import rasterization
 from pop_fast.data.capture import View
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import write_atomically
+from pop_fast.io.atomic import write_json
 from pop_fast.io.images import colormap_table, error_magnitude, error_scale, id_colors, to_uint8, write_png
 from pop_fast.stages.covariance import opacities_from_logits, scales_from_log_scales
 from pop_fast.stages.losses import photometric
@@ -66,9 +65,8 @@ class ExplainedView:
             settings["sh_degree"] = self.sh_degree
             settings["backgrounds"] = self.background.to(dtype)[None]
         own = given.pop("sh")
-        drawn = own if colors is None else colors
         with torch.no_grad():
-            images, _, info = draw(**given, colors=drawn, **settings)
+            images, _, info = draw(**given, colors=own if colors is None else colors, **settings)
         return images[0], info
 
 
@@ -191,42 +189,23 @@ def view_maps(scene: ExplainedView) -> list[Map]:
     info = scene.info
     render, photo = to_uint8(scene.image.numpy()), scene.view.image
     error = error_magnitude(render, photo)
-    shares = _shares(scene)
-    pulls = scaled(
-        "pop_pull",
-        "Where POP pulls",
-        "weight of Gaussians that POP pulls up, less weight of those it pushes down",
-        shares[1],
-        "coolwarm",
-        1.0,
-        -1.0,
-    )
+    light, pull = _shares(scene)
+    about_error = "mean over the channels of |render - photograph|"
+    about_ids = "every pixel in the colour of the Gaussian with the largest weight (D8); black: none"
+    about_light = "share of the pixel's weight from Gaussians that dominate some pixel of the view"
+    about_pull = "weight of Gaussians that POP pulls up, less weight of those it pushes down"
+    visited = info["n_traversed"][0].numpy()
+    pulls = scaled("pop_pull", "Where POP pulls", about_pull, pull, "coolwarm", 1.0, -1.0)
     return [
         Map("render", "Render", "what the splat shows, clamped to [0, 1]", render),
         Map("photo", "Photograph", "what it should show", photo),
-        scaled(
-            "error", "Error", "mean over the channels of |render - photograph|", error, "magma", error_scale([error])
-        ),
-        Map(
-            "dominant_ids",
-            "Dominant Gaussian",
-            "every pixel in the colour of the Gaussian with the largest weight (D8); black: none",
-            id_colors(info["dominant_ids"][0].numpy()),
-        ),
+        scaled("error", "Error", about_error, error, "magma", error_scale([error])),
+        Map("dominant_ids", "Dominant Gaussian", about_ids, id_colors(info["dominant_ids"][0].numpy())),
         _count("n_blended", "Blended", "Gaussians blended into the pixel", info["n_contrib"][0].numpy()),
-        _count(
-            "n_traversed", "Traversed", "list entries visited until the pixel ended", info["n_traversed"][0].numpy()
-        ),
+        _count("n_traversed", "Traversed", "list entries visited until the pixel ended", visited),
         _termination(scene),
         _light_left(info["final_T"][0].numpy()),
-        scaled(
-            "importance",
-            "Important light",
-            "share of the pixel's weight from Gaussians that dominate some pixel of the view",
-            shares[0],
-            "viridis",
-            1.0,
-        ),
+        scaled("importance", "Important light", about_light, light, "viridis", 1.0),
         _dots(scene, render),
         *([pulls] if scene.lambda_pop > 0.0 else []),
     ]
@@ -239,8 +218,7 @@ def write_maps(maps: list[Map], folder: Path) -> None:
         write_png(folder / f"{entry.name}.png", entry.picture)
         scale = None if entry.scale is None else dict(zip(("colors", "low", "top"), entry.scale, strict=True))
         legend[f"{entry.name}.png"] = {"title": entry.title, "about": entry.about, "scale": scale}
-    text = json.dumps(legend, indent=2) + "\n"
-    write_atomically(folder / "maps.json", lambda file: file.write(text.encode()))
+    write_json(folder / "maps.json", legend)
 
 
 def scaled(name: str, title: str, about: str, values: np.ndarray, colors: str, top: float, low: float = 0.0) -> Map:

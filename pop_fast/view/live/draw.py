@@ -7,33 +7,31 @@ The splat is at rest, or of a training between its steps. A recorded path of cam
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
+from pop_fast.data.cameras import affine
 from pop_fast.density.shrink import inside, opaque_enough
 from pop_fast.errors import PopError
 from pop_fast.io.images import colormap_table, depth_picture, depth_range, id_colors, to_uint8
 from pop_fast.io.read_back import read_json
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.views import Layers, ViewTensors, render_layers
+from pop_fast.view.live.guard import Rule, flag, interval, number, one_of
 from pop_fast.view.paths import interpolate
 
 if TYPE_CHECKING:
     from pop_fast.train.training_run import TrainingRun
     from pop_fast.view.live.server import LiveViewer
-import time
-from collections import deque
-from collections.abc import Callable, MutableMapping
-
-import cv2
-
-from pop_fast.view.live.guard import Rule, flag, interval, number, one_of
 
 # what covers a pixel by less has no depth
 _SEEN = 0.1
@@ -96,9 +94,8 @@ class SplatScene:
             whole = found if rows is None else np.append(rows.cpu().numpy(), -1)[found]
             return id_colors(whole), f"; {len(np.unique(whole[whole >= 0])):,} own a pixel, one colour each"
         if state.mode == "opacity":
-            return colormap_table("viridis")[
-                to_uint8(layers.alpha)
-            ], f"; {layers.alpha.mean():.1%} opaque on average, yellow is all"
+            image = colormap_table("viridis")[to_uint8(layers.alpha)]
+            return image, f"; {layers.alpha.mean():.1%} opaque on average, yellow is all"
         if state.mode == "depth":
             depth = np.where(layers.alpha >= _SEEN, layers.depth / self._unit, np.nan)
             near, far = depth_range([depth])
@@ -190,10 +187,7 @@ def viewmat_of_pose(wxyz: np.ndarray, position: np.ndarray) -> np.ndarray:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = rotation.T
-    viewmat[:3, 3] = -rotation.T @ np.asarray(position, np.float64)
-    return viewmat
+    return affine(rotation.T, -rotation.T @ np.asarray(position, np.float64))
 
 
 def pose_of_viewmat(viewmat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -268,9 +262,8 @@ def _camera(entry: Any, where: str) -> KeyCamera:
         viewmat, degrees = np.array(entry["viewmat"], np.float64), float(entry["fov_y_degrees"])
     except (TypeError, KeyError, ValueError, OverflowError) as error:
         raise PopError(f"{where}: needs viewmat and fov_y_degrees ({error}); {_FIX}") from error
-    if viewmat.shape != (4, 4) or not np.allclose(viewmat[:3, :3] @ viewmat[:3, :3].T, np.eye(3), atol=1e-4):
-        raise PopError(f"{where}: viewmat is not a rigid 4 x 4 matrix; {_FIX}")
-    if not np.isfinite(viewmat).all() or not np.array_equal(viewmat[3], [0.0, 0.0, 0.0, 1.0]):
+    whole = viewmat.shape == (4, 4) and np.isfinite(viewmat).all() and np.array_equal(viewmat[3], [0.0, 0.0, 0.0, 1.0])
+    if not whole or not np.allclose(viewmat[:3, :3] @ viewmat[:3, :3].T, np.eye(3), atol=1e-4):
         raise PopError(f"{where}: viewmat is not a rigid 4 x 4 matrix; {_FIX}")
     if np.linalg.det(viewmat[:3, :3]) < 0.0:
         raise PopError(f"{where}: viewmat is mirrored, which no camera is; {_FIX}")

@@ -21,6 +21,7 @@ from contextlib import contextmanager
 from http import HTTPStatus
 from typing import Any, Final
 
+from pop_fast.data.cameras import shortened
 from pop_fast.errors import PopError
 
 # raises PopError of a value that a control cannot have
@@ -51,7 +52,7 @@ def passed_on(data: Any, rules: Mapping[str, Rule]) -> bool:
     elif kind in known:
         known[kind](message)
     else:
-        raise PopError(f"a browser asked for {_short(kind)}, which the viewer does not do")
+        raise PopError(f"a browser asked for {shortened(kind)}, which the viewer does not do")
     return True
 
 
@@ -60,7 +61,7 @@ def one_of(options: Sequence[str]) -> Rule:
 
     def check(value: Any) -> None:
         if not isinstance(value, str) or value not in options:
-            raise PopError(f"a browser chose {_short(value)}, which was not offered")
+            raise PopError(f"a browser chose {shortened(value)}, which was not offered")
 
     return check
 
@@ -70,7 +71,7 @@ def number(low: float, high: float) -> Rule:
 
     def check(value: Any) -> None:
         if not _is_number(value) or not low - _SLACK <= value <= high + _SLACK:
-            raise PopError(f"a browser set a slider to {_short(value)}; it goes from {low:g} to {high:g}")
+            raise PopError(f"a browser set a slider to {shortened(value)}; it goes from {low:g} to {high:g}")
 
     return check
 
@@ -81,7 +82,7 @@ def interval(low: float, high: float) -> Rule:
     def check(value: Any) -> None:
         whole = isinstance(value, list) and len(value) == 2 and all(map(_is_number, value))
         if not whole or not low - _SLACK <= value[0] <= value[1] <= high + _SLACK:
-            raise PopError(f"a browser set a slider to {_short(value)}; its two ends lie from {low:g} to {high:g}")
+            raise PopError(f"a browser set a slider to {shortened(value)}; its two ends lie from {low:g} to {high:g}")
 
     return check
 
@@ -89,7 +90,7 @@ def interval(low: float, high: float) -> Rule:
 def flag(value: Any) -> None:
     """Check what a box or a button is set to: the rule of both."""
     if not isinstance(value, bool):
-        raise PopError(f"a browser set a box to {_short(value)}")
+        raise PopError(f"a browser set a box to {shortened(value)}")
 
 
 def _decoded(data: Any) -> dict[str, Any]:
@@ -113,13 +114,13 @@ def _check_camera(message: dict[str, Any]) -> None:
         raise PopError(f"a browser sent a camera whose quaternion wxyz has length {norm:g}; it must be 1")
     for name in ("near", "far"):
         if not _is_number(message[name]) or message[name] <= 0.0:
-            raise PopError(f"a browser sent a camera with {name} {_short(message[name])}; it must be positive")
+            raise PopError(f"a browser sent a camera with {name} {shortened(message[name])}; it must be positive")
     if not _is_number(message["fov"]) or not 0.005 < message["fov"] < 3.1:
-        raise PopError(f"a browser sent a camera with fov {_short(message['fov'])}; it must be in (0.005, 3.1)")
+        raise PopError(f"a browser sent a camera with fov {shortened(message['fov'])}; it must be in (0.005, 3.1)")
     for name in ("image_height", "image_width"):
         value = message[name]
         if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= _LONGEST_SIDE:
-            raise PopError(f"a browser sent a camera with {name} {_short(value)}; it must be 0 to {_LONGEST_SIDE}")
+            raise PopError(f"a browser sent a camera with {name} {shortened(value)}; it must be 0 to {_LONGEST_SIDE}")
 
 
 def _check_click(message: dict[str, Any]) -> None:
@@ -134,14 +135,14 @@ def _check_click(message: dict[str, Any]) -> None:
         value = message.get(name)
         whole = isinstance(value, int) if name == "instance_index" else isinstance(value, str) and len(value) < 256
         if not whole and (value is not None or name == "name"):
-            raise PopError(f"a browser sent a click with {name} {_short(value)}")
+            raise PopError(f"a browser sent a click with {name} {shortened(value)}")
 
 
 def _check_update(message: dict[str, Any], rules: Mapping[str, Rule]) -> None:
     """Check a value that a control was set to."""
     control, updates = message.get("uuid"), message.get("updates")
     if message.keys() != {"uuid", "updates"} or not isinstance(control, str) or control not in rules:
-        raise PopError(f"a browser set {_short(control)}, which is not a control of the viewer")
+        raise PopError(f"a browser set {shortened(control)}, which is not a control of the viewer")
     # viser would set any field of the control that is named here
     if not isinstance(updates, dict) or updates.keys() != {"value"}:
         raise PopError("a browser set more of a control than its value")
@@ -150,17 +151,12 @@ def _check_update(message: dict[str, Any], rules: Mapping[str, Rule]) -> None:
 
 def _check_vector(value: Any, length: int, what: str) -> None:
     if not isinstance(value, list) or len(value) != length or not all(map(_is_number, value)):
-        raise PopError(f"a browser sent {what} {_short(value)}; it must be {length} finite numbers")
+        raise PopError(f"a browser sent {what} {shortened(value)}; it must be {length} finite numbers")
 
 
 def _is_number(value: Any) -> bool:
     """Tell whether it is a number that single precision holds, squared too."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _LARGEST
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 # of one server

@@ -6,7 +6,6 @@ the held-out views' pictures, the orbit to videos/orbit_step{step}.webm: a repor
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from pop_fast.data.capture import Capture, View, neighbour_degrees
 from pop_fast.data.photo_quality import GAMMA
 from pop_fast.density.passes import Passes
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import write_atomically
+from pop_fast.io.atomic import write_json
 from pop_fast.io.images import fit, to_uint8
 from pop_fast.io.read_back import read_json
 from pop_fast.stages.appearance import expose
@@ -167,9 +166,7 @@ def write_checks(
         given=len(capture.views) + capture.unplaced,
         placed=len(capture.views),
     )
-    text = json.dumps(asdict(checks), indent=2) + "\n"
-    target = folder / "report_data" / f"checks_step{step}.json"
-    write_atomically(target, lambda file: file.write(text.encode()))
+    write_json(folder / "report_data" / f"checks_step{step}.json", asdict(checks))
     with VideoFile(folder / "videos" / f"orbit_step{step}.webm", _ORBIT_FPS) as video:
         for view in turn:
             video.add(to_uint8(looked(view).image))

@@ -88,13 +88,8 @@ def verdict(
     sharper = more if checks is None or checks.train_psnr < _FITS else _more_steps(stats, checks, _EPOCHS_FOR_DETAIL)
     found = [*_quality(psnr, checks, () if fewer is not None else sharper), *_course(course, fewer)]
     if checks is not None:
-        found += [
-            *_unfitting(checks, more),
-            *_overfitting(checks, fewer, more),
-            *_photographs(checks),
-            *_exposure(checks, more),
-            *_floating(checks),
-        ]
+        found += [*_unfitting(checks, more), *_overfitting(checks, fewer, more), *_photographs(checks)]
+        found += [*_exposure(checks, more), *_floating(checks)]
     return found
 
 

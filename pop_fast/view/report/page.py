@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import shlex
 from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any, Final
@@ -11,34 +12,20 @@ from urllib.parse import quote
 import numpy as np
 
 from pop_fast.io import images
-from pop_fast.train.results import shell_line
 from pop_fast.view.document import Chart, Series, asset, document, draw, draw_histogram
 from pop_fast.view.report.model import Finding, Histogram, ReportData, ReportView, Tile
 
-# (title, ((curve, legend, colour, dots), ...), log axis, axis from zero, unit)
+# (curve, legend, colour, dots)
+_OF_TRAINING: Final = ("psnr_train", "training view, running mean", "var(--c1)", False)
+_OF_HELD_OUT: Final = ("psnr_val", "held-out views", "var(--c2)", True)
+_TRAVERSED: Final = ("n_traversed", "traversed", "var(--c2)", False)
+_BLENDED: Final = ("n_blended", "blended", "var(--c1)", False)
+# (title, curves, log axis, axis from zero, unit)
 _CHARTS: Final = (
     ("Gaussians", (("num_gaussians", "N", "var(--c1)", False),), False, True, ""),
-    (
-        "PSNR, dB",
-        (
-            ("psnr_train", "training view, running mean", "var(--c1)", False),
-            ("psnr_val", "held-out views", "var(--c2)", True),
-        ),
-        False,
-        False,
-        " dB",
-    ),
+    ("PSNR, dB", (_OF_TRAINING, _OF_HELD_OUT), False, False, " dB"),
     ("Loss", (("loss", "running mean", "var(--c1)", False),), True, False, ""),
-    (
-        "Gaussians per pixel",
-        (
-            ("n_traversed", "traversed", "var(--c2)", False),
-            ("n_blended", "blended", "var(--c1)", False),
-        ),
-        False,
-        True,
-        "",
-    ),
+    ("Gaussians per pixel", (_TRAVERSED, _BLENDED), False, True, ""),
 )
 
 
@@ -105,16 +92,11 @@ def _opacities(histograms: Sequence[Histogram]) -> str:
     # all Gaussians start at one opacity: that single bar would flatten the other charts, so it may leave the axis
     tallest = [float(h.shares.max(initial=0.0)) for h in histograms]
     top = max(tallest[1:] or tallest) * 1.12
-    drawn = [
-        draw_histogram(
-            h.title,
-            h.shares.tolist(),
-            top,
-            "var(--c1)",
-            (f"{100 * h.share_between(0, 0.1):.1f} % under 0.1", f"{100 * h.share_between(0.9, 1.0):.1f} % over 0.9"),
-        )
-        for h in histograms
-    ]
+    drawn = []
+    for h in histograms:
+        low, high = (100.0 * h.share_between(*span) for span in ((0, 0.1), (0.9, 1.0)))
+        notes = (f"{low:.1f} % under 0.1", f"{high:.1f} % over 0.9")
+        drawn.append(draw_histogram(h.title, h.shares.tolist(), top, "var(--c1)", notes))
     return (
         "<h2>Opacity</h2>"
         "<p>Share of the Gaussians by opacity. Polarised means: near 1, or near 0, where <code>pop export "
@@ -201,7 +183,7 @@ def verdict_section(findings: Sequence[Finding], checked: bool) -> str:
 
 
 def _to_type(finding: Finding) -> str:
-    return f" <code>{escape(shell_line(['pop', *finding.next]))}</code>" if finding.next else ""
+    return f" <code>{escape(shlex.join(['pop', *finding.next]))}</code>" if finding.next else ""
 
 
 def orbit_section(orbit: tuple[str, bytes] | None) -> str:
@@ -310,12 +292,8 @@ def views_section(views: Sequence[ReportView], n_held_out: int | None) -> str:
     some = f" Pictures of {len(views)} of {n_held_out}." if n_held_out is not None and n_held_out > len(views) else ""
     legend = _bar("error", images.colorbar_css(), "0", f"{255 * top:.0f} of 255 and more")
     if any(view.depth is not None for view in views):
-        legend += _bar(
-            "depth",
-            images.colorbar_css(images.DEPTH_COLORS),
-            f"{near:.3g}",
-            f"{far:.3g} units of the capture, logarithmic",
-        )
+        most = f"{far:.3g} units of the capture, logarithmic"
+        legend += _bar("depth", images.colorbar_css(images.DEPTH_COLORS), f"{near:.3g}", most)
     return (
         "<h2>Held-out views, the worst first</h2><p>Photographs that training never saw: drag the line between "
         "photograph and render. Error is the mean over the channels of |render − photo|; depth is the mean of what a "

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,12 +16,12 @@ from typing import Any, Final
 import numpy as np
 
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import write_atomically
+from pop_fast.io.atomic import write_file
 from pop_fast.io.read_back import check_record, parse_json, read_arrays, read_json
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import CaptureRecord, read_record
 from pop_fast.train.presets import ALIASES, METHODS, Given, words_of
-from pop_fast.train.results import read_commands, read_config, shell_line
+from pop_fast.train.results import read_commands, read_config
 from pop_fast.view.document import Window
 from pop_fast.view.report.checks import read_checks
 from pop_fast.view.report.model import Finding, Histogram, ReportData, ReportView, Tile, verdict
@@ -79,7 +80,7 @@ def read_result(folder: Path) -> ReportData:
         verdict=[typed(found, config, folder) for found in verdict(stats, checks, curves.get("psnr_val"))],
         checked=checks is not None,
         orbit=_orbit(folder),
-        commands=[(shell_line(entry["words"]), entry["folder"]) for entry in read_commands(folder)],
+        commands=[(shlex.join(entry["words"]), entry["folder"]) for entry in read_commands(folder)],
         links=list(_links(folder)),
     )
 
@@ -251,20 +252,14 @@ def _schedule_note(config: TrainConfig) -> str:
 def _curves(records: Sequence[Mapping[str, Any]], folder: Path) -> dict[str, tuple[list[float], list[float]]]:
     curves: dict[str, tuple[list[float], list[float]]] = {}
     window = max(1, round(len(records) * _SMOOTH))
-    for name, key, smooth in (
-        ("num_gaussians", "num_gaussians", False),
-        ("psnr_train", "psnr", True),
-        ("loss", "loss", True),
-        ("n_blended", "n_blended", True),
-        ("n_traversed", "n_traversed", True),
-    ):
+    for key in ("num_gaussians", "psnr", "loss", "n_blended", "n_traversed"):
         points = [(float(r["step"]), float(r[key])) for r in records if r.get(key) is not None]
         if points:
             steps, values = (list(column) for column in zip(*points, strict=True))
-            curves[name] = steps, running_mean(values, window) if smooth else values
-    measured = [
-        (step, read_stats(path).get("psnr")) for step, path in _numbered(folder / "stats", r"val_step(\d+)\.json")
-    ]
+            name = "psnr_train" if key == "psnr" else key
+            curves[name] = steps, values if key == "num_gaussians" else running_mean(values, window)
+    files = _numbered(folder / "stats", r"val_step(\d+)\.json")
+    measured = [(step, read_stats(path).get("psnr")) for step, path in files]
     held_out = [(float(step + 1), float(psnr)) for step, psnr in measured if psnr is not None]
     if held_out:
         curves["psnr_val"] = [step for step, _ in held_out], [psnr for _, psnr in held_out]
@@ -295,9 +290,8 @@ def _windows(config: TrainConfig) -> list[Window]:
         windows.append(Window("blur densification", plan.blur_start_iter, plan.blur_stop_iter, "var(--blur)"))
     if plan.lambda_pop > 0.0:
         windows.append(Window("POP loss", plan.pop_start_iter, plan.pop_stop_iter, "var(--pop)"))
-    return [
-        Window(w.name, w.start, min(w.stop, config.max_steps), w.color) for w in windows if w.start < config.max_steps
-    ]
+    last = config.max_steps
+    return [replace(window, stop=min(window.stop, last)) for window in windows if window.start < last]
 
 
 def _histograms(folder: Path, max_steps: int) -> Iterator[Histogram]:
@@ -360,18 +354,8 @@ def _settings(config: TrainConfig, folder: Path) -> dict[str, Any]:
 
 
 COLUMNS: Final = (
-    "capture",
-    "method",
-    "λ",
-    "steps",
-    "PSNR",
-    "SSIM",
-    "Gaussians",
-    "with opacity ≥ 1/255",
-    "per pixel: blended / traversed",
-    "opacity > 0.9 / < 0.1",
-    "seconds",
-    "machine",
+    *("capture", "method", "λ", "steps", "PSNR", "SSIM", "Gaussians", "with opacity ≥ 1/255"),
+    *("per pixel: blended / traversed", "opacity > 0.9 / < 0.1", "seconds", "machine"),
 )
 _TEXT: Final = frozenset({"capture", "method", "machine"})
 
@@ -419,14 +403,9 @@ def plain(rows: Sequence[Sequence[str]]) -> str:
     """Lay rows out in columns for a terminal."""
     table = [COLUMNS, *rows]
     widths = [max(len(cells[i]) for cells in table) for i in range(len(COLUMNS))]
-    lines: list[str] = []
-    for cells in table:
-        padded = (
-            cell.ljust(width) if name in _TEXT else cell.rjust(width)
-            for name, cell, width in zip(COLUMNS, cells, widths, strict=True)
-        )
-        lines.append("  ".join(padded).rstrip())
-    return "\n".join(lines)
+    pads = [str.ljust if name in _TEXT else str.rjust for name in COLUMNS]
+    padded = ((pad(cell, w) for pad, cell, w in zip(pads, cells, widths, strict=True)) for cells in table)
+    return "\n".join("  ".join(cells).rstrip() for cells in padded)
 
 
 _KINDS: Final[Mapping[str, tuple[type, ...]]] = {
@@ -481,7 +460,6 @@ def write_report(result_dir: str | Path) -> Path:
     """Write report.html into a result folder, from the files in it alone, and return its path."""
     folder = Path(result_dir)
     # a name that is no text is shown with escapes
-    html = page(read_result(folder)).encode("utf-8", "backslashreplace")
     target = folder / "report.html"
-    write_atomically(target, lambda file: file.write(html))
+    write_file(target, page(read_result(folder)).encode("utf-8", "backslashreplace"))
     return target
