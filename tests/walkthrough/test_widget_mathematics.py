@@ -433,12 +433,7 @@ def _orbit_truth(distance: float, sideways: float) -> tuple[np.ndarray, np.ndarr
     """Project the widget's Gaussian and very many of its points; return the ellipse's half-axes, the points' sides."""
     (ca, sa), (ce, se) = ((np.cos(a), np.sin(a)) for a in (0.6, 0.35))
     viewmat = np.array(
-        [
-            [ca, 0, -sa, sideways * distance],
-            [-sa * se, ce, -ca * se, 0],
-            [sa * ce, se, ca * ce, distance],
-            [0, 0, 0, 1],
-        ]
+        [[ca, 0, -sa, sideways * distance], [-sa * se, ce, -ca * se, 0], [sa * ce, se, ca * ce, distance], [0, 0, 0, 1]]
     )
     K = np.array([[270.0, 0, 160], [0, 270, 120], [0, 0, 1]])
     covars = covariance.covars_from_quats_scales(np.array([[0.85, 0.3, 0.1, 0.45]]), np.array([[0.9, 0.35, 0.2]]))
