@@ -17,7 +17,7 @@ from pop_ref import density, fisher, losses, mini_splatting, optimizer, polariza
 from pop_ref.density import Rows, zero_statistics
 from pop_ref.recipes import BASELINES, RECIPES
 from pop_ref.scripted import Script, ScriptedView
-from pop_ref.settings import DensityConfig, PopTerm, Recipe, ScreenSizeRules, UpdateRules
+from pop_ref.settings import PopTerm, Recipe, ScreenSizeRules
 
 KEYS: Final = ("means", "scales", "quats", "opacities", "sh0", "shN")
 # of Adam, before the first step of a script: whoever counts from there, or begins anew, shows it
@@ -80,15 +80,14 @@ _EXTRAS_OF: Final = {
 }
 
 
-def _taken(kind: Any, start: Any, settings: Any) -> Any:
-    names = {f.name for f in fields(kind)}
-    return kind(**{name: settings[name] if name in settings else getattr(start, name, None) for name in names})
+def _taken(start: Any, settings: Mapping[str, Any]) -> Any:
+    return replace(start, **{f.name: settings[f.name] for f in fields(start) if f.name in settings})
 
 
 def _recipe_of(script: Script, extras: Extras) -> Recipe:
     """Return the script's method under its settings."""
     base, settings = RECIPE_OF[script.method], script.settings
-    updates = _taken(UpdateRules, base.updates, settings)
+    updates = _taken(base.updates, settings)
     restarts = base.adam_restarts
     if script.method == "pup":
         restarts = tuple(updates.rounds_start_iter + k * updates.round_steps for k in range(len(extras.prune_shares)))
@@ -97,7 +96,7 @@ def _recipe_of(script: Script, extras: Extras) -> Recipe:
     return replace(
         base,
         **{f.name: settings.get(f.name, getattr(base, f.name)) for f in fields(PopTerm)},
-        density=_taken(DensityConfig, base.density, settings),
+        density=_taken(base.density, settings),
         updates=updates,
         lr=script.lr,
         max_steps=script.max_steps,
@@ -144,13 +143,18 @@ def method_settings(method: str) -> dict[str, Any]:
         >>> method_settings("pop")["lambda_pop"], method_settings("pup")["prune_shares"]
         (0.001, (0.8, 0.5))
     """
-    recipe, found = RECIPE_OF[method], {f.name: getattr(Extras(), f.name) for f in fields(Extras)}
+    recipe = RECIPE_OF[method]
     # only what the method does itself is a setting of its strategy
-    kept = {name: value for name, value in found.items() if name in _EXTRAS_OF.get(method, ())}
-    for group in (recipe.density, recipe.updates):
-        kept |= {f.name: getattr(group, f.name) for f in fields(group)}
-    screen = {f.name: getattr(ScreenSizeRules(), f.name) for f in fields(ScreenSizeRules)}
-    return {**kept, **{f.name: getattr(recipe, f.name) for f in fields(PopTerm)}, **screen, "absgrad": False}
+    kept = {name: value for name, value in vars(Extras()).items() if name in _EXTRAS_OF.get(method, ())}
+    prior = {f.name: getattr(recipe, f.name) for f in fields(PopTerm)}
+    return {
+        **kept,
+        **vars(recipe.density),
+        **vars(recipe.updates),
+        **prior,
+        **vars(ScreenSizeRules()),
+        "absgrad": False,
+    }
 
 
 class Driven:
@@ -164,12 +168,9 @@ class Driven:
 
     def __init__(self, script: Script, rows: Rows) -> None:
         self.script, self.rows = script, rows
-        given = {name: value for name, value in script.settings.items() if name in {f.name for f in fields(Extras)}}
-        self.extras = Extras(**given)
+        self.extras = _taken(Extras(), script.settings)
         self.recipe = _recipe_of(script, self.extras)
-        self.screen = ScreenSizeRules(
-            **{f.name: script.settings[f.name] for f in fields(ScreenSizeRules) if f.name in script.settings}
-        )
+        self.screen = _taken(ScreenSizeRules(), script.settings)
         self.window, self.extents = zero_statistics(len(rows)), np.zeros(len(rows))
         self.first_count = len(rows)
         self.waiting: dict[str, np.ndarray] = {}

@@ -162,18 +162,7 @@ def render_vjp(
         antialiased=antialiased,
         colors=colors,
     )
-    return RenderGradients(
-        means=of.means,
-        quats=of.quats,
-        scales=of.scales,
-        opacities=of.opacities,
-        sh=of.sh,
-        viewmat=of.viewmat,
-        background=v_background,
-        means2d=v.v_means2d,
-        means2d_abs=v.v_means2d_abs,
-        colors=of.colors,
-    )
+    return RenderGradients(**of._asdict(), background=v_background, means2d=v.v_means2d, means2d_abs=v.v_means2d_abs)
 
 
 def _behind(

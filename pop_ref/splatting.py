@@ -239,13 +239,7 @@ def project_vjp(
 
 
 def _take(gaussians: Gaussians, rows: Int64[np.ndarray, " M"]) -> Gaussians:
-    return Gaussians(
-        means=gaussians.means[rows],
-        quats=gaussians.quats[rows],
-        scales=gaussians.scales[rows],
-        opacities=gaussians.opacities[rows],
-        sh=gaussians.sh[rows],
-    )
+    return Gaussians(**{name: values[rows] for name, values in vars(gaussians).items()})
 
 
 def _scatter(n: int, rows: Int64[np.ndarray, " M"], values: np.ndarray) -> np.ndarray:

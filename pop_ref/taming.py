@@ -237,13 +237,7 @@ def taming_scores(
         )
         photometric = photometric_3dgs(drawn.image, photo / 255.0, padding="same")
         scores = scores + view_score(
-            photometric,
-            grads,
-            gaussians.opacities,
-            gaussians.scales,
-            drawn.splats.depths,
-            drawn.splats.radii,
-            found,
+            photometric, grads, gaussians.opacities, gaussians.scales, drawn.splats.depths, drawn.splats.radii, found
         )
     return scores
 

@@ -13,11 +13,12 @@ class Stage:
     Attributes:
         name: of the stage and its file.
         does: what it does, in a few words.
-        chapter: the walk-through's chapter that explains it, unless `elsewhere` names another for a function.
+        chapter: the walk-through's chapter that explains it, unless what follows names another.
         functions: the oracle's functions, by the oracle's module that has them.
         laws: the kit's stages whose laws judge it.
         more_laws: names of single laws of other stages.
-        elsewhere: the chapters of functions that another one explains, by function.
+        transposes: the chapter that explains its functions' transposes, where that is another one.
+        elsewhere: the chapters of functions that yet another one explains, by function.
     """
 
     name: str
@@ -26,6 +27,7 @@ class Stage:
     functions: dict[str, tuple[str, ...]]
     laws: tuple[str, ...] = ()
     more_laws: tuple[str, ...] = ()
+    transposes: str = ""
     elsewhere: dict[str, str] = field(default_factory=dict[str, str])
 
     def chapter_of(self, name: str) -> str:
@@ -35,7 +37,8 @@ class Stage:
             >>> stage_named("compositing").chapter_of("composite_pixel_vjp")
             '5'
         """
-        return self.elsewhere.get(name, self.chapter)
+        usual = self.transposes if self.transposes and name.endswith("_vjp") else self.chapter
+        return self.elsewhere.get(name, usual)
 
     def home_of(self, name: str) -> str:
         """Return the oracle's module that has a function."""
@@ -52,14 +55,11 @@ class Stage:
         return f"{self.name}.py"
 
 
-def _transposes_in(chapter: str, *names: str) -> dict[str, str]:
-    return {f"{name}_vjp": chapter for name in names}
-
-
 def _with_transposes(*names: str) -> tuple[str, ...]:
     return tuple(each for name in names for each in (name, f"{name}_vjp"))
 
 
+_CAMERA: Final = ("camera_center", "view_dirs", "means_cam_from_means", "covars_cam_from_covars")
 COURSE: Final = (
     Stage(
         "activations",
@@ -74,7 +74,7 @@ COURSE: Final = (
         "2",
         {"covariance": _with_transposes("rotmats_from_quats", "covars_from_quats_scales")},
         ("covariance",),
-        elsewhere=_transposes_in("5b", "rotmats_from_quats", "covars_from_quats_scales"),
+        transposes="5b",
     ),
     Stage(
         "harmonics",
@@ -82,24 +82,16 @@ COURSE: Final = (
         "3",
         {"harmonics": _with_transposes("sh_basis", "colors_from_sh")},
         ("harmonics",),
-        elsewhere=_transposes_in("5b", "sh_basis", "colors_from_sh"),
+        transposes="5b",
     ),
     Stage(
         "camera",
         "from the world into the camera's frame",
         "2",
-        {
-            "camera": (
-                *_with_transposes("camera_center", "view_dirs", "means_cam_from_means", "covars_cam_from_covars"),
-                "in_front",
-            )
-        },
+        {"camera": (*_with_transposes(*_CAMERA), "in_front")},
         ("camera",),
-        elsewhere={
-            "camera_center": "9b",
-            "view_dirs": "3",
-            **_transposes_in("5b", "camera_center", "view_dirs", "means_cam_from_means", "covars_cam_from_covars"),
-        },
+        transposes="5b",
+        elsewhere={"camera_center": "9b", "view_dirs": "3"},
     ),
     Stage(
         "projection",
@@ -107,7 +99,7 @@ COURSE: Final = (
         "2",
         {"projection": _with_transposes("project_means", "projection_jacobians", "project_covars")},
         ("projection",),
-        elsewhere=_transposes_in("5b", "project_means", "projection_jacobians", "project_covars"),
+        transposes="5b",
     ),
     Stage(
         "footprint",
@@ -115,11 +107,8 @@ COURSE: Final = (
         "2",
         {"footprint": (*_with_transposes("low_pass", "conics_from_covars2d"), "radii_from_covars2d", "on_screen")},
         ("footprint",),
-        elsewhere={
-            "radii_from_covars2d": "1",
-            "conics_from_covars2d": "1",
-            **_transposes_in("5b", "low_pass", "conics_from_covars2d"),
-        },
+        transposes="5b",
+        elsewhere={"radii_from_covars2d": "1", "conics_from_covars2d": "1"},
     ),
     Stage(
         "tiles",
@@ -134,23 +123,21 @@ COURSE: Final = (
         "1",
         {"alpha": _with_transposes("sigma_at_pixel", "falloff", "alpha_from_sigma")},
         ("alpha",),
-        elsewhere=_transposes_in("5", "sigma_at_pixel", "falloff", "alpha_from_sigma"),
+        transposes="5",
     ),
     Stage(
         "compositing",
         "one pixel from front to back, its gradient from back to front, and what dominates it",
         "4",
-        {
-            "pixel": ("stops", *_with_transposes("composite_pixel")),
-            "dominance": ("dominant_id", "dominant_counts"),
-        },
+        {"pixel": ("stops", *_with_transposes("composite_pixel")), "dominance": ("dominant_id", "dominant_counts")},
         ("compositing", "dominance"),
         (
             "zero_cotangents_give_exact_zeros",
             "gradients_are_the_oracles",
             "a_step_along_any_direction_changes_the_image_as_the_gradient_says",
         ),
-        elsewhere={"composite_pixel_vjp": "5", "dominant_id": "7", "dominant_counts": "7"},
+        transposes="5",
+        elsewhere={"dominant_id": "7", "dominant_counts": "7"},
     ),
     Stage(
         "losses",
@@ -160,13 +147,7 @@ COURSE: Final = (
         ("losses", "polarization"),
         elsewhere=dict.fromkeys(("importance_mask", "pop_loss", "pop_loss_vjp"), "8"),
     ),
-    Stage(
-        "optimizer",
-        "Adam, which moves every parameter",
-        "1b",
-        {"optimizer": ("adam_step",)},
-        ("optimizer",),
-    ),
+    Stage("optimizer", "Adam, which moves every parameter", "1b", {"optimizer": ("adam_step",)}, ("optimizer",)),
     Stage(
         "density",
         "clone, split and prune: more Gaussians where they are needed, fewer where not",

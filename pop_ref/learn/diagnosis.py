@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from pop_ref.learn.mistakes import explained_by
+from pop_ref.learn.mistakes_geometry import with_turned_rotation
 from pop_ref.learn.probes import oracle
 from pop_ref.learn.student import Call, numbers, said, same, where
 
@@ -266,7 +267,7 @@ def _as_a_whole(
     if all(b.ndim >= 2 and b.shape[-1] == b.shape[-2] for _, b in pairs):
         if always(lambda b: np.swapaxes(b, -1, -2)):
             return "is transposed: rows stand for columns"
-        if all(b.shape == (4, 4) for _, b in pairs) and always(_with_turned_rotation):
+        if all(b.shape == (4, 4) for _, b in pairs) and always(with_turned_rotation):
             return "has its rotation, the first three rows and columns, transposed"
     if all(b.ndim >= 1 and b.shape[-1] > 1 for _, b in pairs):
         if always(lambda b: b[..., ::-1]):
@@ -284,12 +285,6 @@ def _as_a_whole(
         if always(made):
             return what
     return _of_rounding(found, expected) or per_input(pairs, sizes)
-
-
-def _with_turned_rotation(viewmat: np.ndarray) -> np.ndarray:
-    turned = viewmat.copy()
-    turned[:3, :3] = viewmat[:3, :3].T
-    return turned
 
 
 def _of_a_mask(found: np.ndarray, expected: np.ndarray, some_right: bool) -> str:

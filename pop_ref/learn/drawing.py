@@ -49,7 +49,8 @@ def drawn_counterexample(verdict: Verdict) -> np.ndarray | None:
         nothing to draw.
     """
     scenes = [value for value in (verdict.drawn or {}).values() if isinstance(value, Scene)][:1]
-    panels = [_titled(_scene(value), ("the scene", _INK)) for value in scenes]
+    images = [render(scene.gaussians, scene.camera, scene.background).image for scene in scenes]
+    panels = [_titled(_enlarged(image), ("the scene", _INK)) for image in images]
     if verdict.call is not None:
         panels += _results(verdict.call)
     if not panels:
@@ -171,20 +172,14 @@ def _bars(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
 def _image(value: Any) -> np.ndarray | None:
     if not isinstance(value, np.ndarray) or value.ndim != 3 or min(value.shape[:2]) < 5:
         return None
-    return _enlarged(np.broadcast_to(value[..., :3], (*value.shape[:2], 3)))
-
-
-def _scene(scene: Scene) -> np.ndarray:
-    background = scene.background
-    view = render(scene.gaussians, scene.camera, background)
-    return _enlarged(np.broadcast_to(view.image[..., :3], (*view.image.shape[:2], 3)))
+    return _enlarged(value)
 
 
 def _enlarged(image: np.ndarray) -> np.ndarray:
     """Fit a picture into a square panel, pixels as squares."""
-    height, width = image.shape[:2]
-    times = max(1, SIDE // max(height, width))
-    large = np.clip(np.nan_to_num(image), 0.0, 1.0).repeat(times, axis=0).repeat(times, axis=1)[:SIDE, :SIDE]
+    times = max(1, SIDE // max(image.shape[:2]))
+    shown = np.clip(np.nan_to_num(np.broadcast_to(image[..., :3], (*image.shape[:2], 3))), 0.0, 1.0)
+    large = shown.repeat(times, axis=0).repeat(times, axis=1)[:SIDE, :SIDE]
     panel = np.tile(_PAPER, (SIDE, SIDE, 1))
     panel[: large.shape[0], : large.shape[1]] = large
     return panel
@@ -199,22 +194,16 @@ def write_film(path: Path, frames: Sequence[np.ndarray], seconds: float = 0.4) -
         seconds: how long each is seen.
     """
     height, width = frames[0].shape[:2]
-    bodies = []
-    for frame in frames:
-        rows = (np.clip(np.nan_to_num(frame), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
-        bodies.append(zlib.compress(b"".join(b"\0" + row.tobytes() for row in rows)))
     parts = [(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))]
     parts.append((b"acTL", struct.pack(">II", len(frames), 1)))
-    number = 0
-    for k, body in enumerate(bodies):
-        shown = round(1000.0 * seconds * (5 if k + 1 == len(bodies) else 1))
+    for k, frame in enumerate(frames):
+        rows = (np.clip(np.nan_to_num(frame), 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+        body = zlib.compress(b"".join(b"\0" + row.tobytes() for row in rows))
+        shown = round(1000.0 * seconds * (5 if k + 1 == len(frames) else 1))
+        # both kinds of chunks are numbered together; the first frame's pixels have no number
+        number = max(2 * k - 1, 0)
         parts.append((b"fcTL", struct.pack(">IIIIIHHBB", number, width, height, 0, 0, shown, 1000, 0, 0)))
-        number += 1
-        if k:
-            parts.append((b"fdAT", struct.pack(">I", number) + body))
-            number += 1
-        else:
-            parts.append((b"IDAT", body))
+        parts.append((b"fdAT", struct.pack(">I", number + 1) + body) if k else (b"IDAT", body))
     beside = path.with_name(f".{path.name}.part")
     with beside.open("wb") as file:
         file.write(b"\x89PNG\r\n\x1a\n")

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from pop_ref.learn.course import COURSE, Stage
-from pop_ref.learn.judge import judge
+from pop_ref.learn.course import BY_NAME, COURSE, Stage
+from pop_ref.learn.judge import Verdict, judge
 from pop_ref.learn.student import Work, read_work
 
 N_FUNCTIONS: Final = sum(len(stage.names) for stage in COURSE)
@@ -31,10 +31,8 @@ def graded(work: Work) -> dict[str, Any]:
         "score", the functions that are right, "of" so many; "passed", the stages that have; and "stages", a list of
         name, passed, right, unwritten, laws (that hold), broken and sentence.
     """
-    stages = []
     with contextlib.redirect_stdout(io.StringIO()):
-        for stage in COURSE:
-            stages.append(_stage_graded(work, stage))
+        stages = [_stage_graded(work, stage) for stage in COURSE]
     return {
         "score": sum(len(each["right"]) for each in stages),
         "of": N_FUNCTIONS,
@@ -44,14 +42,12 @@ def graded(work: Work) -> dict[str, Any]:
 
 
 def _stage_graded(work: Work, stage: Stage) -> dict[str, Any]:
-    if not work.written[stage.name]:
-        told = {"passed": False, "right": [], "unwritten": list(stage.names), "laws": 0, "broken": "", "sentence": ""}
-        return {"name": stage.name, **told}
-    try:
-        verdict = judge(work, stage)
-    except ValueError as error:
-        told = {"passed": False, "right": [], "unwritten": [], "laws": 0, "broken": "the file runs"}
-        return {"name": stage.name, **told, "sentence": str(error)}
+    verdict = Verdict(unwritten=stage.names)
+    if work.written[stage.name]:
+        try:
+            verdict = judge(work, stage)
+        except ValueError as error:
+            verdict = Verdict(broken="the file runs", sentence=str(error))
     return {
         "name": stage.name,
         "passed": verdict.passed,
@@ -67,13 +63,11 @@ def told_in_lines(grade: dict[str, Any]) -> str:
     """Write a grade for its student."""
     lines = []
     for stage in grade["stages"]:
-        n = len(next(each for each in COURSE if each.name == stage["name"]).names)
+        n = len(BY_NAME[stage["name"]].names)
         how = "passed" if stage["passed"] else "not yet"
         lines.append(f"{stage['name']:<12} {how:<8} {len(stage['right'])}/{n}  {stage['sentence']}".rstrip())
-    total = (
-        f"{grade['score']} of {grade['of']} functions are right; {len(grade['passed'])} of {len(COURSE)} stages have"
-    )
-    return "\n".join([*lines, f"{total} passed"])
+    passed = f"{len(grade['passed'])} of {len(COURSE)} stages have passed"
+    return "\n".join([*lines, f"{grade['score']} of {grade['of']} functions are right; {passed}"])
 
 
 def handed_over(grade: dict[str, Any]) -> str:
@@ -145,11 +139,8 @@ def stopped(why: str) -> dict[str, Any]:
 
 def class_report(grades: Sequence[tuple[str, dict[str, Any]]]) -> str:
     """Write a class as markdown: a line a student, a column a stage, and what is wrong most often."""
-    names = [stage.name for stage in COURSE]
-    lines = [
-        f"| student | score of {N_FUNCTIONS} | {' | '.join(names)} |",
-        "|" + "---|" * (len(names) + 2),
-    ]
+    head = f"| student | score of {N_FUNCTIONS} | {' | '.join(BY_NAME)} |"
+    lines = [head, "|" + "---|" * (len(COURSE) + 2)]
     for student, grade in grades:
         by_name = {stage["name"]: stage for stage in grade["stages"]}
         cells = []

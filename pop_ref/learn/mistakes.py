@@ -99,10 +99,6 @@ def _conics(by: Callable[..., Any], sign: float = -1.0) -> Callable[..., Any]:
     return made
 
 
-def _exchanged_sides(o: Oracle, means2d: Any, radii: Any, width: int, height: int, *profile: Any) -> Any:
-    return o["on_screen"](means2d, radii, height, width, *profile)
-
-
 def _sigma(squares: float = 0.5, cross: float = 1.0, right: float = 0.0, down: float = 0.0) -> Callable[..., Any]:
     """Make `sigma_at_pixel` with other factors, or with the pixel's centre elsewhere."""
 
@@ -111,14 +107,6 @@ def _sigma(squares: float = 0.5, cross: float = 1.0, right: float = 0.0, down: f
         return squares * (A * dx * dx + C * dy * dy) + cross * B * dx * dy
 
     return made
-
-
-def _shifted(right: float, down: float) -> Known:
-    return (
-        _sigma(right=right, down=down),
-        "Your pixel is half a pixel off: px and py are the pixel's centre already, its index + 0.5.",
-        "Use d = mean2d - (px, py) as they are given; add or take away no half.",
-    )
 
 
 def _pixel_vjp(
@@ -198,10 +186,6 @@ def _pixel_forward(dims: str = "1 - alpha", last: bool = False, after: bool = Fa
     return made
 
 
-def _pixel(o: Oracle, ids: Any, rows: Any, px: float, py: float, background: Any, *profile: Any) -> Any:
-    return o["composite_pixel"](ids, rows, px, py, [0.0] * len(background), *profile)
-
-
 _HALF: Final = "The exponent of a Gaussian is half of d^T Q d: exp(-x^2 / 2) has a 2 under its square."
 
 
@@ -218,328 +202,275 @@ def _dominant(better: Callable[[float, float], bool], by_place: bool = False) ->
     return made
 
 
-_PIXELS: Final[dict[str, tuple[Known, ...]]] = {
-    "low_pass": (
-        (
-            lambda o, covars2d, eps2d: covars2d + eps2d,
-            "The blur is added to all four entries; a round blur has no entries off the diagonal.",
+_PIXELS: Final[dict[str, Known]] = {
+    "low_pass": {
+        "The blur is added to all four entries; a round blur has no entries off the diagonal.": (
             "covars2d + eps2d * np.eye(2).",
+            lambda o, covars2d, eps2d: covars2d + eps2d,
         ),
-        (
-            lambda o, covars2d, eps2d, *given: covars2d - eps2d * np.eye(2),
-            "eps2d is taken away from the diagonal; it is added, as blur makes a splat wider.",
+        "eps2d is taken away from the diagonal; it is added, as blur makes a splat wider.": (
             "covars2d + eps2d times the unit matrix.",
+            lambda o, covars2d, eps2d, *given: covars2d - eps2d * np.eye(2),
         ),
-    ),
-    "conics_from_covars2d": (
-        (
+    },
+    "conics_from_covars2d": {
+        "You return the covariance; a conic is its inverse.": (
+            "[[a, b], [b, c]] has the inverse [[c, -b], [-b, a]] / (a c - b b).",
             lambda o, covars2d: np.where(
                 np.linalg.det(covars2d)[:, None] > 0.0, covars2d.reshape(-1, 4)[:, [0, 1, 3]], 0.0
             ),
-            "You return the covariance; a conic is its inverse.",
-            "[[a, b], [b, c]] has the inverse [[c, -b], [-b, a]] / (a c - b b).",
         ),
-        (
+        "The off-diagonal of the inverse has the wrong sign.": (
+            "[[a, b], [b, c]] has the inverse [[c, -b], [-b, a]] / (a c - b b).",
             lambda o, covars2d: o["conics_from_covars2d"](covars2d) * np.array([1.0, -1.0, 1.0]),
-            "The off-diagonal of the inverse has the wrong sign.",
-            "[[a, b], [b, c]] has the inverse [[c, -b], [-b, a]] / (a c - b b).",
         ),
-        (
+        "The determinant has the wrong sign in it: it is a c - b b.": (
+            "[[a, b], [b, c]] has the inverse [[c, -b], [-b, a]] / (a c - b b).",
             _conics(lambda det: 1.0 / det, sign=1.0),
-            "The determinant has the wrong sign in it: it is a c - b b.",
+        ),
+        "You do not divide by the determinant, as an inverse does.": (
             "[[a, b], [b, c]] has the inverse [[c, -b], [-b, a]] / (a c - b b).",
+            *(_conics(by) for by in (lambda det: det, lambda det: 1.0)),
         ),
-        *(
-            (
-                _conics(by),
-                "You do not divide by the determinant, as an inverse does.",
-                "[[a, b], [b, c]] has the inverse [[c, -b], [-b, a]] / (a c - b b).",
-            )
-            for by in (lambda det: det, lambda det: 1.0)
-        ),
-    ),
-    "conics_from_covars2d_vjp": (
-        (
-            lambda o, covars2d, v: o["conics_from_covars2d_vjp"](covars2d, v * np.array([1.0, 2.0, 1.0])),
-            "The off-diagonal counts twice: it stands once in the conic and twice in the matrix.",
+    },
+    "conics_from_covars2d_vjp": {
+        "The off-diagonal counts twice: it stands once in the conic and twice in the matrix.": (
             "Give each of the matrix's two entries half of v_xy.",
+            lambda o, covars2d, v: o["conics_from_covars2d_vjp"](covars2d, v * np.array([1.0, 2.0, 1.0])),
         ),
-        (
-            _on_one_side,
-            "The products stand in another order: Q stands on either side of V.",
+        "The products stand in another order: Q stands on either side of V.": (
             "The inverse's small change is -Q dX Q, so the cotangent is -Q V Q.",
+            _on_one_side,
         ),
-    ),
-    "radii_from_covars2d": (
-        (
-            _reach(squared=False),
-            "A 2 is missing under the root: alpha is o exp(-d^2 / 2), so that it falls to 1/255 at d^2 = 2 ln(255 o).",
+    },
+    "radii_from_covars2d": {
+        "A 2 is missing under the root: alpha is o exp(-d^2 / 2), so that it falls to 1/255 at d^2 = 2 ln(255 o).": (
             "The reach is min(3.33, sqrt(2 ln(255 o))) standard deviations.",
+            _reach(squared=False),
         ),
-        (
+        "Your reach is three standard deviations whatever the opacity; it ends where alpha falls to 1/255.": (
+            "The reach is min(3.33, sqrt(2 ln(255 o))) standard deviations: a faint splat ends sooner.",
             _reach(squared=True, k=3.0),
-            "Your reach is three standard deviations whatever the opacity; it ends where alpha falls to 1/255.",
-            "The reach is min(3.33, sqrt(2 ln(255 o))) standard deviations: a faint splat ends sooner.",
         ),
-        (
+        "Your reach is 3.33 standard deviations whatever the opacity; that is its upper bound only.": (
+            "The reach is min(3.33, sqrt(2 ln(255 o))) standard deviations: a faint splat ends sooner.",
             _reach(squared=True, k=3.33),
-            "Your reach is 3.33 standard deviations whatever the opacity; that is its upper bound only.",
-            "The reach is min(3.33, sqrt(2 ln(255 o))) standard deviations: a faint splat ends sooner.",
         ),
-        (
+        "You take variances for standard deviations: the covariance's diagonal holds squares.": (
+            "The reach is k times the root of the diagonal's entry.",
             lambda o, covars2d, *given: (
                 o["radii_from_covars2d"](covars2d * covars2d * np.eye(2), *given)
                 * (o["radii_from_covars2d"](covars2d, *given) > 0)
             ),
-            "You take variances for standard deviations: the covariance's diagonal holds squares.",
-            "The reach is k times the root of the diagonal's entry.",
         ),
-        (
+        "Your reach is that of opacity 1 for every splat; a faint one ends sooner.": (
+            "The reach is min(3.33, sqrt(2 ln(255 o))) standard deviations, with o the splat's own.",
             lambda o, covars2d, opacities, *given: (
                 o["radii_from_covars2d"](covars2d, np.ones_like(opacities), *given)
                 * (o["radii_from_covars2d"](covars2d, opacities, *given) > 0)
             ),
-            "Your reach is that of opacity 1 for every splat; a faint one ends sooner.",
-            "The reach is min(3.33, sqrt(2 ln(255 o))) standard deviations, with o the splat's own.",
         ),
-    ),
-    "on_screen": (
-        (
-            _exchanged_sides,
-            "Width and height are exchanged: x is compared with the width, y with the height.",
+    },
+    "on_screen": {
+        "Width and height are exchanged: x is compared with the width, y with the height.": (
             "The columns of means2d are x and y.",
+            lambda o, means2d, radii, width, height, *profile: o["on_screen"](means2d, radii, height, width, *profile),
         ),
-    ),
-    "tile_rects": (
-        (
-            lambda o, *given: o["tile_rects"](*given)[:, [1, 0, 3, 2]],
-            "x and y are exchanged: columns stand for rows. A rectangle is (x0, y0, x1, y1).",
+    },
+    "tile_rects": {
+        "x and y are exchanged: columns stand for rows. A rectangle is (x0, y0, x1, y1).": (
             "tiles_x, tiles_y = grid_size(width, height, tile_size), x first.",
+            lambda o, *given: o["tile_rects"](*given)[:, [1, 0, 3, 2]],
         ),
-        (
-            lambda o, *given: o["tile_rects"](*given)[:, [0, 2, 1, 3]],
-            "Your rectangle has one axis after the other, (x0, x1, y0, y1); it is (x0, y0, x1, y1).",
+        "Your rectangle has one axis after the other, (x0, x1, y0, y1); it is (x0, y0, x1, y1).": (
             "First the corner with the smaller numbers, then the other.",
+            lambda o, *given: o["tile_rects"](*given)[:, [0, 2, 1, 3]],
         ),
-        (
-            lambda o, *given: o["tile_rects"](*given) - np.pad(o["tile_rects"](*given)[:, :2], ((0, 0), (2, 0))),
-            "Your last two numbers are the number of tiles; what is asked for is one past the last tile.",
+        "Your last two numbers are the number of tiles; what is asked for is one past the last tile.": (
             "(x0, y0, x1, y1), half open: x1 - x0 tiles lie between.",
+            lambda o, *given: o["tile_rects"](*given) - np.pad(o["tile_rects"](*given)[:, :2], ((0, 0), (2, 0))),
         ),
-    ),
-    "tile_lists": (
-        (
-            _lists(lambda depth, i: (depth, i), by_column=True),
-            "Your tiles are numbered down the columns: columns stand for rows. Tile (x, y) is number y * tiles_x + x.",
+    },
+    "tile_lists": {
+        "Your tiles are numbered down the columns: columns stand for rows. Tile (x, y) is number y * tiles_x + x.": (
             "Row-major order: all tiles of the first row, then the second.",
+            _lists(lambda depth, i: (depth, i), by_column=True),
         ),
-        (
+        "Your lists run from back to front; the nearest splat comes first.": (
+            "Sort by (depth, index), the smaller depth first.",
             _lists(lambda depth, i: (-depth, i)),
-            "Your lists run from back to front; the nearest splat comes first.",
-            "Sort by (depth, index), the smaller depth first.",
-        ),
-        (
-            _lists(lambda depth, i: i),
-            "Your lists are not sorted by depth.",
-            "Go through the splats in the order of (depth, index).",
-        ),
-        (
             _lists(lambda depth, i: (-depth, -i)),
-            "Your lists run from back to front; the nearest splat comes first.",
-            "Sort by (depth, index), the smaller depth first.",
         ),
-    ),
-    "sigma_at_pixel": (
-        (
-            _sigma(1.0, 1.0),
-            f"A half is missing before the two squares. {_HALF}",
+        "Your lists are not sorted by depth.": (
+            "Go through the splats in the order of (depth, index).",
+            _lists(lambda depth, i: i),
+        ),
+    },
+    "sigma_at_pixel": {
+        f"A half is missing before the two squares. {_HALF}": (
             "The cross term has no half, because B stands twice in the symmetric matrix Q and once in the conic.",
+            _sigma(1.0, 1.0),
         ),
-        (
-            _sigma(1.0, 2.0),
-            f"A half is missing: your exponent is twice what it should be. {_HALF}",
+        f"A half is missing: your exponent is twice what it should be. {_HALF}": (
             "Halve the whole of A dx dx + 2 B dx dy + C dy dy.",
+            _sigma(1.0, 2.0),
         ),
-        (
-            _sigma(0.5, 0.5),
-            "The cross term is halved once too often: B stands twice in the symmetric matrix Q, once in the conic.",
+        "The cross term is halved once too often: B stands twice in the symmetric matrix Q, once in the conic.": (
             "Write Q = [[A, B], [B, C]] and multiply d^T Q d out before you halve it.",
+            _sigma(0.5, 0.5),
         ),
-        _shifted(0.5, 0.5),
-        _shifted(-0.5, -0.5),
-        _shifted(0.5, 0.0),
-        _shifted(0.0, 0.5),
-        _shifted(-0.5, 0.0),
-        _shifted(0.0, -0.5),
-        (
-            _sigma(0.5, 0.0),
-            "The cross term is missing: a splat that is turned has B, too.",
+        "Your pixel is half a pixel off: px and py are the pixel's centre already, its index + 0.5.": (
+            "Use d = mean2d - (px, py) as they are given; add or take away no half.",
+            *(
+                _sigma(right=right, down=down)
+                for right, down in ((0.5, 0.5), (-0.5, -0.5), (0.5, 0.0), (0.0, 0.5), (-0.5, 0.0), (0.0, -0.5))
+            ),
+        ),
+        "The cross term is missing: a splat that is turned has B, too.": (
             "sigma = (A dx dx + C dy dy) / 2 + B dx dy.",
+            _sigma(0.5, 0.0),
         ),
-        (
-            lambda o, mean2d, conic, px, py: o["sigma_at_pixel"](mean2d, conic, py, px),
-            "The pixel's x and y are exchanged: rows stand for columns.",
+        "The pixel's x and y are exchanged: rows stand for columns.": (
             "px runs along the columns of an image, py along its rows: dx = mean2d[0] - px, dy = mean2d[1] - py.",
+            lambda o, mean2d, conic, px, py: o["sigma_at_pixel"](mean2d, conic, py, px),
         ),
-        (
-            lambda o, mean2d, conic, px, py: o["sigma_at_pixel"](mean2d, (conic[0], conic[2], conic[1]), px, py),
-            "The conic is read in another order: it is (A, B, C), the cross term in the middle.",
+        "The conic is read in another order: it is (A, B, C), the cross term in the middle.": (
             "A, B, C = conic; sigma = (A dx dx + C dy dy) / 2 + B dx dy.",
+            lambda o, mean2d, conic, px, py: o["sigma_at_pixel"](mean2d, (conic[0], conic[2], conic[1]), px, py),
         ),
-    ),
-    "falloff": (
-        (
-            lambda o, sigma: float(np.exp(sigma)),
-            "Your falloff grows with the distance: the exponent's sign is missing.",
+    },
+    "falloff": {
+        "Your falloff grows with the distance: the exponent's sign is missing.": (
             "It is 1 at the centre and less everywhere else.",
+            lambda o, sigma: float(np.exp(sigma)),
         ),
-        (
-            lambda o, sigma: 1.0 - sigma,
-            "You take the first two terms of the exponential for the whole of it.",
+        "You take the first two terms of the exponential for the whole of it.": (
             "exp(-sigma), which never falls below 0.",
+            lambda o, sigma: 1.0 - sigma,
         ),
-    ),
-    "alpha_from_sigma": (
-        (
-            lambda o, sigma, opacity, *profile: (opacity * o["falloff"](sigma), False),
-            "Your alpha has neither ceiling nor floor.",
+    },
+    "alpha_from_sigma": {
+        "Your alpha has neither ceiling nor floor.": (
             "Take min(profile.alpha_ceiling, ...), and skip the splat where sigma < 0 or alpha < profile.alpha_floor.",
+            lambda o, sigma, opacity, *profile: (opacity * o["falloff"](sigma), False),
         ),
-        (
-            lambda o, sigma, opacity, *profile: o["alpha_from_sigma"](sigma, 1.0, *profile),
-            "The opacity is missing: alpha is the opacity times the falloff.",
+        "The opacity is missing: alpha is the opacity times the falloff.": (
             "alpha = min(ceiling, opacity * falloff(sigma)).",
+            lambda o, sigma, opacity, *profile: o["alpha_from_sigma"](sigma, 1.0, *profile),
         ),
-    ),
-    "alpha_from_sigma_vjp": (
-        (
-            _opacity_left_in,
-            "The opacity is left in its own derivative: of o exp(-sigma) by o it is exp(-sigma).",
+    },
+    "alpha_from_sigma_vjp": {
+        "The opacity is left in its own derivative: of o exp(-sigma) by o it is exp(-sigma).": (
             "v_o = exp(-sigma) v_alpha; only v_sigma has the opacity in it.",
+            _opacity_left_in,
         ),
-        (
-            _opacity_left_out,
-            "The opacity is missing from the cotangent of sigma.",
+        "The opacity is missing from the cotangent of sigma.": (
             "alpha = o exp(-sigma), so v_sigma = -alpha v_alpha.",
+            _opacity_left_out,
         ),
-    ),
-    "composite_pixel": (
-        (
-            _pixel,
-            "The background is missing: what light is left behind the last splat shows it.",
+    },
+    "composite_pixel": {
+        "The background is missing: what light is left behind the last splat shows it.": (
             "Add T_final times the background to the colour.",
+            lambda o, ids, rows, px, py, background, *profile: o["composite_pixel"](
+                ids, rows, px, py, [0.0] * len(background), *profile
+            ),
         ),
-        (
-            _pixel_by_alpha,
-            "Your weight is alpha alone: a splat gives its colour times alpha, times the light that is left, T.",
+        "Your weight is alpha alone: a splat gives its colour times alpha, times the light that is left, T.": (
             "weight = T * alpha, with T before this splat.",
+            _pixel_by_alpha,
         ),
-        (
-            lambda o, ids, *given: o["composite_pixel"](list(reversed(ids)), *given),
-            "You walk from back to front; the list is in order, front first.",
+        "You walk from back to front; the list is in order, front first.": (
             "Go through ids as they come: T starts at 1 at the eye.",
+            lambda o, ids, *given: o["composite_pixel"](list(reversed(ids)), *given),
         ),
-        (
-            _pixel_forward(dims="alpha"),
-            "You keep the share alpha of the light; a splat takes that share away, and 1 - alpha is left.",
+        "You keep the share alpha of the light; a splat takes that share away, and 1 - alpha is left.": (
             "T starts at 1, and behind a splat it is T (1 - alpha).",
+            _pixel_forward(dims="alpha"),
         ),
-        (
-            _pixel_forward(dims="T - alpha"),
-            "You take alpha from the light that is left; a splat takes the share alpha of what reaches it.",
+        "You take alpha from the light that is left; a splat takes the share alpha of what reaches it.": (
             "Behind a splat T is T (1 - alpha), which is T - T alpha.",
+            _pixel_forward(dims="T - alpha"),
         ),
-        (
-            _pixel_forward(last=True),
-            "You blend the splat at which the pixel stops; the pixel ends before it.",
+        "You blend the splat at which the pixel stops; the pixel ends before it.": (
             "Ask stops(T (1 - alpha)) before the splat's colour is added.",
+            _pixel_forward(last=True),
         ),
-        (
-            _pixel_forward(after=True),
-            "You keep the light that is left behind each splat; the light before it is asked for.",
+        "You keep the light that is left behind each splat; the light before it is asked for.": (
             "Append T to the transmittances before T becomes T (1 - alpha).",
+            _pixel_forward(after=True),
         ),
-        (
-            _pixel_painted,
-            "You paint each splat over those before it, as from back to front; the list is in order, front first.",
+        "You paint each splat over those before it, as from back to front; the list is in order, front first.": (
             "color += T alpha c, with T the light that the splats before it have left.",
+            _pixel_painted,
         ),
-    ),
-    "composite_pixel_vjp": (
-        (
-            _pixel_vjp(tail=False, background_seen=False),
-            "The tail is missing from dC/dalpha: more alpha shows more of a splat's own colour, and hides the colour of"
-            " all that is behind it. Yours has the first part only.",
+    },
+    "composite_pixel_vjp": {
+        "The tail is missing from dC/dalpha: more alpha shows more of a splat's own colour, and hides the colour of"
+        " all that is behind it. Yours has the first part only.": (
             "C = T (alpha c + (1 - alpha) behind), so dC/dalpha = T (c - behind). Walk from the back: start with behind"
             " = background . v_color + v_T_final, and after each splat behind += alpha (color_dot_grad - behind).",
+            _pixel_vjp(tail=False, background_seen=False),
         ),
-        (
-            _pixel_vjp(background_seen=False),
-            "The background is missing from the light behind the last splat.",
+        "The background is missing from the light behind the last splat.": (
             "Before the walk from back to front, behind is background . v_color + v_T_final.",
+            _pixel_vjp(background_seen=False),
         ),
-        (
-            _pixel_vjp(forwards=True),
-            "You walk from front to back; the way back begins with the last splat, since what is behind a splat must be"
-            " known before the splat is reached.",
+        "You walk from front to back; the way back begins with the last splat, since what is behind a splat must be"
+        " known before the splat is reached.": (
             "Go through reversed(pixel.ids), with alphas and transmittances reversed alike.",
+            _pixel_vjp(forwards=True),
         ),
-        (
-            _pixel_vjp(early=True),
-            "You add a splat to what is behind it before its own cotangent is taken.",
+        "You add a splat to what is behind it before its own cotangent is taken.": (
             "First v_alpha = T (color_dot_grad - behind), then behind += alpha (color_dot_grad - behind).",
+            _pixel_vjp(early=True),
         ),
-        (
-            _pixel_vjp(dims=False),
-            "A splat hides what is behind it: the light behind must lose the share alpha before the splat's own is"
-            " added.",
+        "A splat hides what is behind it: the light behind must lose the share alpha before the splat's own is"
+        " added.": (
             "behind += alpha (color_dot_grad - behind), the same as alpha color_dot_grad + (1 - alpha) behind.",
+            _pixel_vjp(dims=False),
         ),
-        (
-            _pixel_vjp(share=False),
-            "A splat counts whole in what is behind the next one; it counts by the share alpha that it covers.",
+        "A splat counts whole in what is behind the next one; it counts by the share alpha that it covers.": (
             "behind = alpha color_dot_grad + (1 - alpha) behind.",
+            _pixel_vjp(share=False),
         ),
-        (
-            _pixel_vjp(color_lit=False),
-            "The light that reaches the splat is missing from the cotangent of its colour.",
+        "The light that reaches the splat is missing from the cotangent of its colour.": (
             "v_colors += T alpha v_color, as C has T alpha c.",
+            _pixel_vjp(color_lit=False),
         ),
-        (
-            _pixel_vjp(absolute=False),
-            "The absolute value is missing in v_means2d_abs: pixels on two sides of a splat cancel.",
+        "The absolute value is missing in v_means2d_abs: pixels on two sides of a splat cancel.": (
             "Add |v_mean2d| of every pixel, entry by entry.",
+            _pixel_vjp(absolute=False),
         ),
-        (
-            _pixel_vjp(lit=False),
-            "The light that reaches the splat is missing from v_alpha: what hardly any light reaches changes the pixel"
-            " hardly.",
+        "The light that reaches the splat is missing from v_alpha: what hardly any light reaches changes the pixel"
+        " hardly.": (
             "v_alpha = T (color_dot_grad - behind), with T of pixel.transmittances.",
+            _pixel_vjp(lit=False),
         ),
-    ),
-    "dominant_id": (
-        (
-            _dominant(lambda weight, best: weight < best),
-            "The comparison is the wrong way round: the largest weight wins.",
+    },
+    "dominant_id": {
+        "The comparison is the wrong way round: the largest weight wins.": (
             "A later splat wins where weight > best_weight.",
+            _dominant(lambda weight, best: weight < best),
         ),
-        (
-            _dominant(lambda weight, best: weight > best, by_place=True),
-            "You return the winner's place in the list; its id is asked for.",
+        "You return the winner's place in the list; its id is asked for.": (
             "ids[place] is the id.",
+            _dominant(lambda weight, best: weight > best, by_place=True),
         ),
-    ),
-    "dominant_counts": (
-        (
-            lambda o, ids, n: np.minimum(o["dominant_counts"](ids, n), 1),
-            "Each Gaussian is counted once, however many pixels it dominates.",
+    },
+    "dominant_counts": {
+        "Each Gaussian is counted once, however many pixels it dominates.": (
             "Add 1 to a Gaussian's count at every pixel that is its own.",
+            lambda o, ids, n: np.minimum(o["dominant_counts"](ids, n), 1),
         ),
-    ),
+    },
 }
 
 MISTAKES: Final = tuple(
-    Mistake(function, *known) for function, all_known in (GEOMETRY | _PIXELS | TRAINING).items() for known in all_known
+    Mistake(function, made, sentence, hint)
+    for function, known in (GEOMETRY | _PIXELS | TRAINING).items()
+    for sentence, (hint, *all_made) in known.items()
+    for made in all_made
 )
 
 

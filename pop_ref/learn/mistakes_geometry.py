@@ -8,43 +8,23 @@ from typing import Any, Final
 import numpy as np
 
 from pop_ref.learn.probes import Oracle
+from pop_ref.learn.splat import rotmats_from_quats
 
-# what a mistake computes, what is wrong, and where to look
-Known = tuple[Callable[..., Any], str, str]
-
-
-def _turned(name: str) -> Callable[..., Any]:
-    return lambda o, *given: np.swapaxes(o[name](*given), 1, 2)
+# of one function, by what is wrong: where to look, and what each such mistake computes
+Known = dict[str, tuple[str, *tuple[Callable[..., Any], ...]]]
 
 
-def _with_transposed_camera(name: str) -> Callable[..., Any]:
-    def made(o: Oracle, values: Any, viewmat: Any) -> Any:
-        back = viewmat.copy()
-        back[:3, :3] = viewmat[:3, :3].T
-        return o[name](values, back)
-
-    return made
-
-
-def _transposed_covars(o: Oracle, quats: Any, scales: Any) -> Any:
-    inverse = quats * np.array([1.0, -1.0, -1.0, -1.0])
-    return o["covars_from_quats_scales"](inverse, scales)
-
-
-def _without_length(o: Oracle, quats: Any) -> Any:
-    w, x, y, z = quats.T
-    rows = [
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), 2, 0)
+def with_turned_rotation(viewmat: np.ndarray) -> np.ndarray:
+    """Transpose a camera's rotation."""
+    turned = viewmat.copy()
+    turned[:3, :3] = viewmat[:3, :3].T
+    return turned
 
 
 def _without_length_back(o: Oracle, quats: Any, v_rotmats: Any) -> Any:
     """Make `rotmats_from_quats_vjp` up to the unit quaternion; R is quadratic, so central differences are exact."""
     units = quats / np.linalg.norm(quats, axis=1, keepdims=True)
-    slopes = [0.5 * (_without_length(o, units + e) - _without_length(o, units - e)) for e in np.eye(4)]
+    slopes = [0.5 * (rotmats_from_quats(units + e) - rotmats_from_quats(units - e)) for e in np.eye(4)]
     return np.stack([np.sum(v_rotmats * slope, axis=(1, 2)) for slope in slopes], axis=1)
 
 
@@ -146,406 +126,328 @@ def _turned_back(name: str) -> Callable[..., Any]:
     """Make a camera's vjp whose first result has R where R^T is asked for, or the reverse."""
 
     def made(o: Oracle, values: Any, viewmat: Any, v: Any) -> Any:
-        turned = viewmat.copy()
-        turned[:3, :3] = viewmat[:3, :3].T
-        right, wrong = (list(o[name](values, each, v)) for each in (viewmat, turned))
-        right[0] = wrong[0]
-        return tuple(right)
+        (wrong, *_), (_, *right) = (o[name](values, each, v) for each in (with_turned_rotation(viewmat), viewmat))
+        return wrong, *right
 
     return made
 
 
 def _two_of_one(o: Oracle, quats: Any, v_rotmats: Any, *, half: int) -> Any:
     """Make `rotmats_from_quats_vjp` with one number of the unit quaternion's cotangent halved."""
-    units = o["unit_quats_from_quats"](quats)
-    w, x, y, z = units.T
-    g = np.moveaxis(v_rotmats, 0, -1)
-    along = [
-        -z * g[0, 1] + y * g[0, 2] + z * g[1, 0] - x * g[1, 2] - y * g[2, 0] + x * g[2, 1],
-        y * (g[0, 1] + g[1, 0]) + z * (g[0, 2] + g[2, 0]) + w * (g[2, 1] - g[1, 2]) - 2 * x * (g[1, 1] + g[2, 2]),
-        x * (g[0, 1] + g[1, 0]) + z * (g[1, 2] + g[2, 1]) + w * (g[0, 2] - g[2, 0]) - 2 * y * (g[0, 0] + g[2, 2]),
-        x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1]) + w * (g[1, 0] - g[0, 1]) - 2 * z * (g[0, 0] + g[1, 1]),
-    ]
-    v_units = 2.0 * np.stack(along, axis=1)
+    v_units = _without_length_back(o, quats, v_rotmats)
     v_units[:, half] *= 0.5
     return o["unit_quats_from_quats_vjp"](quats, v_units)
 
 
-_UNIT_BACK: Final = "unit_quats_from_quats_vjp"
-
-
 def _rotation_left(name: str, formula: str) -> Known:
-    return (
-        _turned_back(f"{name}_vjp"),
-        "R stands where R^T is asked for: what the camera turned is turned back.",
-        f"The way forward turns by R, the way back by its transpose: {formula}.",
-    )
+    return {
+        "R stands where R^T is asked for: what the camera turned is turned back.": (
+            f"The way forward turns by R, the way back by its transpose: {formula}.",
+            _turned_back(f"{name}_vjp"),
+        )
+    }
 
 
-GEOMETRY: Final[dict[str, tuple[Known, ...]]] = {
-    "scales_from_log_scales": (
-        (
-            lambda o, log_scales: log_scales,
-            "The exponential is missing: what is kept is the logarithm of the width.",
+GEOMETRY: Final[dict[str, Known]] = {
+    "scales_from_log_scales": {
+        "The exponential is missing: what is kept is the logarithm of the width.": (
             "exp(log_scales), entry by entry.",
+            lambda o, log_scales: log_scales,
         ),
-    ),
-    "scales_from_log_scales_vjp": (
-        (
+    },
+    "scales_from_log_scales_vjp": {
+        "You multiply by the logarithm; the derivative of exp(x) is exp(x).": (
+            "v_scales times the scales themselves.",
             lambda o, log_scales, v: log_scales * v,
-            "You multiply by the logarithm; the derivative of exp(x) is exp(x).",
-            "v_scales times the scales themselves.",
         ),
-        (
+        "The exponential's slope is missing: the derivative of exp(x) is exp(x).": (
+            "v_scales times the scales themselves.",
             lambda o, log_scales, v: v.copy(),
-            "The exponential's slope is missing: the derivative of exp(x) is exp(x).",
-            "v_scales times the scales themselves.",
         ),
-        (
+        "You divide by the slope; a cotangent is multiplied by it on the way back.": (
+            "v_scales times the scales themselves.",
             lambda o, log_scales, v: v / np.exp(log_scales),
-            "You divide by the slope; a cotangent is multiplied by it on the way back.",
-            "v_scales times the scales themselves.",
         ),
-    ),
-    "opacities_from_logits": (
-        (
-            lambda o, logits: o["opacities_from_logits"](-logits),
-            "The sign of the exponent is wrong: a large logit must give an opacity near 1, and yours goes to 0.",
+    },
+    "opacities_from_logits": {
+        "The sign of the exponent is wrong: a large logit must give an opacity near 1, and yours goes to 0.": (
             "o = 1 / (1 + exp(-x)).",
+            lambda o, logits: o["opacities_from_logits"](-logits),
         ),
-        (
-            lambda o, logits: 1.0 / (1.0 + np.exp(-np.abs(logits))),
-            "The logit's sign is lost: no opacity of yours is below a half.",
+        "The logit's sign is lost: no opacity of yours is below a half.": (
             "Where the logit is negative the opacity is exp(logit) / (1 + exp(logit)).",
+            lambda o, logits: 1.0 / (1.0 + np.exp(-np.abs(logits))),
         ),
-    ),
-    "opacities_from_logits_vjp": (
-        (
-            lambda o, logits, v: v.copy(),
-            "The sigmoid's slope is missing.",
+    },
+    "opacities_from_logits_vjp": {
+        "The sigmoid's slope is missing.": (
             "o = 1 / (1 + exp(-x)) has the derivative o (1 - o).",
+            lambda o, logits, v: v.copy(),
         ),
-        (
-            lambda o, logits, v: o["opacities_from_logits"](logits) * v,
-            "A part of the sigmoid's slope is missing: o (1 - o), and yours is o.",
+        "A part of the sigmoid's slope is missing: o (1 - o), and yours is o.": (
             "Near o = 1 the sigmoid is flat, so that the gradient must vanish there, too.",
+            lambda o, logits, v: o["opacities_from_logits"](logits) * v,
         ),
-        (
-            lambda o, logits, v: o["opacities_from_logits"](logits) ** 2 * v,
-            "You multiply o by itself: the slope of the sigmoid is o (1 - o).",
+        "You multiply o by itself: the slope of the sigmoid is o (1 - o).": (
             "1 - o is the sigmoid of -logit.",
+            lambda o, logits, v: o["opacities_from_logits"](logits) ** 2 * v,
         ),
-    ),
-    "unit_quats_from_quats": (
-        (
-            lambda o, quats: quats / np.linalg.norm(quats),
-            "You divide all rows by one length, that of the whole array; each quaternion has a length of its own.",
+    },
+    "unit_quats_from_quats": {
+        "You divide all rows by one length, that of the whole array; each quaternion has a length of its own.": (
             "np.linalg.norm(quats, axis=1, keepdims=True).",
+            lambda o, quats: quats / np.linalg.norm(quats),
         ),
-        (
+        "You divide by the square of the length: the root is missing.": (
+            "|q| is the root of the sum of the squares.",
             lambda o, quats: quats / np.sum(quats * quats, axis=1, keepdims=True),
-            "You divide by the square of the length: the root is missing.",
-            "|q| is the root of the sum of the squares.",
         ),
-        (
+        "You divide by the largest entry; a unit quaternion has the length 1.": (
+            "|q| is the root of the sum of the squares.",
             lambda o, quats: quats / np.max(np.abs(quats), axis=1, keepdims=True),
-            "You divide by the largest entry; a unit quaternion has the length 1.",
-            "|q| is the root of the sum of the squares.",
         ),
-    ),
-    "unit_quats_from_quats_vjp": (
-        (
-            lambda o, quats, v: v / np.linalg.norm(quats, axis=1, keepdims=True),
-            "The part along q is still in it: a longer q is the same rotation, so the loss does not ask for it.",
+    },
+    "unit_quats_from_quats_vjp": {
+        "The part along q is still in it: a longer q is the same rotation, so the loss does not ask for it.": (
             "Take u (u . v) from v before you divide by the length.",
+            lambda o, quats, v: v / np.linalg.norm(quats, axis=1, keepdims=True),
         ),
-        (
-            lambda o, quats, v: o["unit_quats_from_quats_vjp"](quats, v) * np.linalg.norm(quats, axis=1, keepdims=True),
-            "The division by the length is missing: twice as long a q turns half as fast.",
+        "The division by the length is missing: twice as long a q turns half as fast.": (
             "v_q = (v - u (u . v)) / |q|.",
+            lambda o, quats, v: o["unit_quats_from_quats_vjp"](quats, v) * np.linalg.norm(quats, axis=1, keepdims=True),
         ),
-        (
-            _along_q,
-            "The part along q is taken out with q itself, whose length is not 1; it must be taken out with u = q /"
-            " |q|.",
+        "The part along q is taken out with q itself, whose length is not 1; it must be taken out with u = q / |q|.": (
             "v_q = (v - u (u . v)) / |q|: both u have length 1.",
+            _along_q,
         ),
-        (
-            lambda o, quats, v: 2.0 * v / np.linalg.norm(quats, axis=1, keepdims=True) - o[_UNIT_BACK](quats, v),
-            "The part along q is added where it must be taken away.",
+        "The part along q is added where it must be taken away.": (
             "v_q = (v - u (u . v)) / |q|, with a minus.",
+            lambda o, quats, v: (
+                2.0 * v / np.linalg.norm(quats, axis=1, keepdims=True) - o["unit_quats_from_quats_vjp"](quats, v)
+            ),
         ),
-    ),
-    "rotmats_from_quats": (
-        (
-            _turned("rotmats_from_quats"),
-            f"Your rotation is transposed. {_TRANSPOSED}",
+    },
+    "rotmats_from_quats": {
+        f"Your rotation is transposed. {_TRANSPOSED}": (
             "Turn (1, 0, 0) by a quarter about z, q = (1, 0, 0, 1): it must land on (0, 1, 0), so the first column of R"
             " is (0, 1, 0). Exchange the signs of the terms with w.",
+            lambda o, quats: np.swapaxes(o["rotmats_from_quats"](quats), 1, 2),
         ),
-        (
-            lambda o, quats: o["rotmats_from_quats"](quats[:, [3, 0, 1, 2]]),
-            "Your quaternion is read as (x, y, z, w); here the real part comes first, (w, x, y, z).",
+        "Your quaternion is read as (x, y, z, w); here the real part comes first, (w, x, y, z).": (
             "The identity is (1, 0, 0, 0).",
+            lambda o, quats: o["rotmats_from_quats"](quats[:, [3, 0, 1, 2]]),
         ),
-        (
-            _without_length,
-            "Your quaternion is used as it is given; it must be divided by its length first, since only then is it a"
-            " rotation.",
+        "Your quaternion is used as it is given; it must be divided by its length first, since only then is it a"
+        " rotation.": (
             "Training moves its four numbers freely, so that its length is anything; unit_quats_from_quats divides.",
+            lambda o, quats: rotmats_from_quats(quats),
         ),
-    ),
-    "rotmats_from_quats_vjp": (
-        (
-            _without_length_back,
-            "The division by the length is not walked back: yours is the cotangent of the unit quaternion, not of q.",
+    },
+    "rotmats_from_quats_vjp": {
+        "The division by the length is not walked back: yours is the cotangent of the unit quaternion, not of q.": (
             "End with unit_quats_from_quats_vjp(quats, v_units).",
+            _without_length_back,
         ),
-        *(
-            (
-                lambda o, quats, v, k=k: _two_of_one(o, quats, v, half=k),
-                f"A two is missing from the cotangent of {letter} of the unit quaternion; the other three have it.",
+        **{
+            f"A two is missing from the cotangent of {letter} of the unit quaternion; the other three have it.": (
                 "Every entry of R has a two before its products, as in 2 (x y - w z).",
+                lambda o, quats, v, k=k: _two_of_one(o, quats, v, half=k),
             )
             for k, letter in enumerate("wxyz")
-        ),
-        (
-            lambda o, quats, v_rotmats: o["rotmats_from_quats_vjp"](quats, np.swapaxes(v_rotmats, 1, 2)),
-            "The cotangent is read with its rows and columns exchanged.",
+        },
+        "The cotangent is read with its rows and columns exchanged.": (
             "v_rotmats[i, j, k] belongs to row j and column k of the i-th matrix.",
+            lambda o, quats, v_rotmats: o["rotmats_from_quats_vjp"](quats, np.swapaxes(v_rotmats, 1, 2)),
         ),
-    ),
-    "covars_from_quats_scales": (
-        (
-            _transposed_covars,
-            f"Your rotation is transposed: the covariance is R^T S S R and not R S S R^T. {_TRANSPOSED}",
+    },
+    "covars_from_quats_scales": {
+        f"Your rotation is transposed: the covariance is R^T S S R and not R S S R^T. {_TRANSPOSED}": (
             "With M = R diag(s) the covariance is M M^T. M^T M is another matrix.",
+            lambda o, quats, scales: o["covars_from_quats_scales"](quats * np.array([1.0, -1.0, -1.0, -1.0]), scales),
         ),
-        (
-            lambda o, quats, scales: o["covars_from_quats_scales"](quats, np.sqrt(scales)),
-            "Your scales enter once; a covariance holds squares, because scales are standard deviations.",
+        "Your scales enter once; a covariance holds squares, because scales are standard deviations.": (
             "With M = R diag(s) the covariance is M M^T, in which every scale stands twice.",
+            lambda o, quats, scales: o["covars_from_quats_scales"](quats, np.sqrt(scales)),
         ),
-        (
-            lambda o, quats, scales: np.stack([np.diag(s * s) for s in scales]),
-            "The rotation has gone from your covariance, diag(s)^2 is left: you multiply M^T M where M M^T is asked"
-            " for, or your M scales its rows, diag(s) R.",
+        "The rotation has gone from your covariance, diag(s)^2 is left: you multiply M^T M where M M^T is asked"
+        " for, or your M scales its rows, diag(s) R.": (
             "M = R diag(s) scales columns, R * s in NumPy; a column of R is an axis of the Gaussian. Then M @ M.T.",
+            lambda o, quats, scales: np.stack([np.diag(s * s) for s in scales]),
         ),
-        (
-            lambda o, quats, scales: o["covars_from_quats_scales"](quats, scales**2),
-            "Your scales enter four times; a covariance holds squares of standard deviations, so each enters twice.",
+        "Your scales enter four times; a covariance holds squares of standard deviations, so each enters twice.": (
             "With M = R diag(s), without a square, the covariance is M M^T.",
+            lambda o, quats, scales: o["covars_from_quats_scales"](quats, scales**2),
         ),
-    ),
-    "covars_from_quats_scales_vjp": (
-        (
-            _covars_back(widths=False),
-            "The widths are missing from the cotangent of R: a column of M is a column of R times its width.",
+    },
+    "covars_from_quats_scales_vjp": {
+        "The widths are missing from the cotangent of R: a column of M is a column of R times its width.": (
             "M_ij = R_ij s_j, so v_R_ij = v_M_ij s_j, and then rotmats_from_quats_vjp.",
+            _covars_back(widths=False),
         ),
-        (
-            _covars_back(turned=False),
-            "R is missing from the cotangent of the widths: a width multiplies a column of R.",
+        "R is missing from the cotangent of the widths: a width multiplies a column of R.": (
             "M_ij = R_ij s_j, so v_s_j is the sum over i of R_ij v_M_ij.",
+            _covars_back(turned=False),
         ),
-    ),
-    "sh_basis": (
-        (
-            _positive_first_harmonics,
-            "Two of your harmonics of degree 1 have the wrong sign: they are (-y, z, -x) times a constant.",
+    },
+    "sh_basis": {
+        "Two of your harmonics of degree 1 have the wrong sign: they are (-y, z, -x) times a constant.": (
             "The signs are a convention, and every file of splats follows it.",
+            _positive_first_harmonics,
         ),
-        (
-            lambda o, dirs, degree: o["sh_basis"](-dirs, degree),
-            "Your direction runs from the Gaussian to the camera; it is asked for from the camera to the Gaussian.",
+        "Your direction runs from the Gaussian to the camera; it is asked for from the camera to the Gaussian.": (
             "Use (x, y, z) as they are given: the harmonics of degree 1 are (-y, z, -x) times a constant.",
+            lambda o, dirs, degree: o["sh_basis"](-dirs, degree),
         ),
-        *(
-            (
-                _first_degree(*signs),
-                "Your harmonics of degree 1 stand in the order x, y, z; they are (-y, z, -x) times a constant.",
-                "The order is a convention as well as the signs, and every file of splats follows it.",
-            )
-            for signs in ((1.0, 1.0, 1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, -1.0))
+        "Your harmonics of degree 1 stand in the order x, y, z; they are (-y, z, -x) times a constant.": (
+            "The order is a convention as well as the signs, and every file of splats follows it.",
+            *(_first_degree(*signs) for signs in ((1.0, 1.0, 1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, -1.0))),
         ),
-        (
-            lambda o, dirs, *given: o["sh_basis"](dirs[:, [0, 2, 1]], *given),
-            "y and z are exchanged in the basis.",
+        "y and z are exchanged in the basis.": (
             "The three functions of degree 1 are those of -y, z and -x, in this order.",
+            lambda o, dirs, *given: o["sh_basis"](dirs[:, [0, 2, 1]], *given),
         ),
-    ),
-    "sh_basis_vjp": (
-        (
-            lambda o, dirs, *given: o["sh_basis_vjp"](dirs[:, ::-1], *given),
-            "x and z are exchanged in the slopes of the basis.",
+    },
+    "sh_basis_vjp": {
+        "x and z are exchanged in the slopes of the basis.": (
             "The columns of a direction are x, y and z.",
+            lambda o, dirs, *given: o["sh_basis_vjp"](dirs[:, ::-1], *given),
         ),
-    ),
-    "colors_from_sh": (
-        (
-            _colors(half=0.0, unit=True),
-            "The half is missing: a Gaussian whose coefficients are 0 is grey, not black.",
+    },
+    "colors_from_sh": {
+        "The half is missing: a Gaussian whose coefficients are 0 is grey, not black.": (
             "c = max(sum_k Y_k h_k + 0.5, 0).",
+            _colors(half=0.0, unit=True),
         ),
-        (
-            _colors(half=0.5, unit=False),
-            "Your direction is used as it is given; the harmonics ask for one of length 1.",
+        "Your direction is used as it is given; the harmonics ask for one of length 1.": (
             "Divide each direction by its length before sh_basis.",
+            _colors(half=0.5, unit=False),
         ),
-    ),
-    "colors_from_sh_vjp": (
-        *(
-            (
-                _colors_back(divided),
-                "The division of the direction by its length is not walked back: a longer direction has the same"
-                " colour, so that nothing may be left along it.",
-                "v_d = (v_u - u (u . v_u)) / |d|, as for the quaternion of chapter 1b.",
-            )
-            for divided in (True, False)
+    },
+    "colors_from_sh_vjp": {
+        "The division of the direction by its length is not walked back: a longer direction has the same"
+        " colour, so that nothing may be left along it.": (
+            "v_d = (v_u - u (u . v_u)) / |d|, as for the quaternion of chapter 1b.",
+            *map(_colors_back, (True, False)),
         ),
-    ),
-    "camera_center": (
-        (
-            lambda o, viewmat: -viewmat[:3, 3],
-            "Your centre is -t, which is in the camera's frame; it is asked for in the world's.",
+    },
+    "camera_center": {
+        "Your centre is -t, which is in the camera's frame; it is asked for in the world's.": (
             "The centre is the point that viewmat takes to 0: solve R c + t = 0.",
+            lambda o, viewmat: -viewmat[:3, 3],
         ),
-        (
-            lambda o, viewmat: -viewmat[:3, :3] @ viewmat[:3, 3],
-            "Your rotation is not transposed: the centre is -R^T t, and yours is -R t.",
+        "Your rotation is not transposed: the centre is -R^T t, and yours is -R t.": (
             "Solve R c + t = 0; the inverse of a rotation is its transpose.",
+            lambda o, viewmat: -viewmat[:3, :3] @ viewmat[:3, 3],
         ),
-        (
-            lambda o, viewmat: viewmat[:3, 3].copy(),
-            "Your centre is t, which is where the camera sees the world's origin.",
+        "Your centre is t, which is where the camera sees the world's origin.": (
             "The centre is the point that viewmat takes to 0: solve R c + t = 0, so c = -R^T t.",
+            lambda o, viewmat: viewmat[:3, 3].copy(),
         ),
-    ),
-    "view_dirs": (
-        (
-            lambda o, means, viewmat: means - viewmat[:3, 3],
-            "You take t for the camera's centre; t is the world's origin as the camera sees it.",
+    },
+    "view_dirs": {
+        "You take t for the camera's centre; t is the world's origin as the camera sees it.": (
             "camera_center(viewmat) has the centre, -R^T t.",
+            lambda o, means, viewmat: means - viewmat[:3, 3],
         ),
-        (
-            lambda o, means, viewmat: means.copy(),
-            "The camera's centre is missing: a direction leads from the camera to the Gaussian.",
+        "The camera's centre is missing: a direction leads from the camera to the Gaussian.": (
             "means - camera_center(viewmat).",
+            lambda o, means, viewmat: means.copy(),
         ),
-    ),
-    "means_cam_from_means": (
-        (
-            _with_transposed_camera("means_cam_from_means"),
-            "Your camera's rotation is transposed.",
+    },
+    "means_cam_from_means": {
+        "Your camera's rotation is transposed.": (
             "viewmat takes the world into the camera: p = R mean + t, without a transpose.",
+            lambda o, means, viewmat: o["means_cam_from_means"](means, with_turned_rotation(viewmat)),
         ),
-        (
-            lambda o, means, viewmat: (means + viewmat[:3, 3]) @ viewmat[:3, :3].T,
-            "You add t before it turns; a point is turned first and moved then.",
+        "You add t before it turns; a point is turned first and moved then.": (
             "p = R mean + t.",
+            lambda o, means, viewmat: (means + viewmat[:3, 3]) @ viewmat[:3, :3].T,
         ),
-        (
-            lambda o, means, viewmat: means @ viewmat[:3, :3].T,
-            "You turn the points and do not move them: t is missing.",
+        "You turn the points and do not move them: t is missing.": (
             "p = R mean + t, with t = viewmat[:3, 3].",
+            lambda o, means, viewmat: means @ viewmat[:3, :3].T,
         ),
-        (
-            lambda o, means, viewmat: o["means_cam_from_means"](means, viewmat) - 2.0 * viewmat[:3, 3],
-            "You take t away; it is added.",
+        "You take t away; it is added.": (
             "p = R mean + t: viewmat takes the world into the camera.",
+            lambda o, means, viewmat: o["means_cam_from_means"](means, viewmat) - 2.0 * viewmat[:3, 3],
         ),
-    ),
-    "means_cam_from_means_vjp": (_rotation_left("means_cam_from_means", "v_mean = R^T v_p, in rows v_p @ R"),),
-    "covars_cam_from_covars": (
-        (
-            _with_transposed_camera("covars_cam_from_covars"),
-            "Your camera's rotation is transposed.",
+    },
+    "means_cam_from_means_vjp": _rotation_left("means_cam_from_means", "v_mean = R^T v_p, in rows v_p @ R"),
+    "covars_cam_from_covars": {
+        "Your camera's rotation is transposed.": (
             "A linear map A turns a covariance S into A S A^T; here A is R = viewmat[:3, :3].",
+            lambda o, covars, viewmat: o["covars_cam_from_covars"](covars, with_turned_rotation(viewmat)),
         ),
-        (
+        "You turn one side of the covariance only; a matrix of second moments is turned on both.": (
+            "A linear map A turns a covariance S into A S A^T; here A is R = viewmat[:3, :3].",
             lambda o, covars, viewmat: viewmat[:3, :3] @ covars,
-            "You turn one side of the covariance only; a matrix of second moments is turned on both.",
-            "A linear map A turns a covariance S into A S A^T; here A is R = viewmat[:3, :3].",
         ),
-        (
+        "The second rotation is not transposed.": (
+            "A linear map A turns a covariance S into A S A^T; here A is R = viewmat[:3, :3].",
             lambda o, covars, viewmat: viewmat[:3, :3] @ covars @ viewmat[:3, :3],
-            "The second rotation is not transposed.",
-            "A linear map A turns a covariance S into A S A^T; here A is R = viewmat[:3, :3].",
         ),
-    ),
-    "covars_cam_from_covars_vjp": (_rotation_left("covars_cam_from_covars", "v_Sigma = R^T V R"),),
-    "project_means": (
-        (
+    },
+    "covars_cam_from_covars_vjp": _rotation_left("covars_cam_from_covars", "v_Sigma = R^T V R"),
+    "project_means": {
+        "The principal point is missing: you measure from the optical axis, pixels are counted from the corner.": (
+            "Add (cx, cy) = (K[0, 2], K[1, 2]).",
             lambda o, means_cam, K, width, height, *profile: (
                 o["project_means"](means_cam, K, width, height, *profile) - K[:2, 2]
             ),
-            "The principal point is missing: you measure from the optical axis, pixels are counted from the corner.",
-            "Add (cx, cy) = (K[0, 2], K[1, 2]).",
         ),
-        (
-            lambda o, means_cam, K, *given: o["project_means"](means_cam, K[[1, 0, 2]][:, [1, 0, 2]], *given),
-            "The numbers of K for x and for y are exchanged: x goes with fx and cx, y with fy and cy.",
+        "The numbers of K for x and for y are exchanged: x goes with fx and cx, y with fy and cy.": (
             "fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2].",
+            lambda o, means_cam, K, *given: o["project_means"](means_cam, K[[1, 0, 2]][:, [1, 0, 2]], *given),
         ),
-        (
-            _point_over_z,
-            "The principal point is divided by z: a point is first divided by its depth and then moved by (cx, cy).",
+        "The principal point is divided by z: a point is first divided by its depth and then moved by (cx, cy).": (
             "u = fx x / z + cx.",
+            _point_over_z,
         ),
-        (
+        "The focal lengths are exchanged: fx is K[0, 0] and goes with x, fy is K[1, 1] and goes with y.": (
+            "u = (fx x / z + cx, fy y / z + cy).",
             lambda o, means_cam, K, *given: (
                 means_cam[:, :2] / means_cam[:, 2:] * np.array([K[1, 1], K[0, 0]]) + K[:2, 2]
             ),
-            "The focal lengths are exchanged: fx is K[0, 0] and goes with x, fy is K[1, 1] and goes with y.",
-            "u = (fx x / z + cx, fy y / z + cy).",
         ),
-        (
-            lambda o, means_cam, K, *given: means_cam[:, :2] * np.diag(K)[:2] + K[:2, 2],
-            "You do not divide by the depth: what is twice as far is half as large.",
+        "You do not divide by the depth: what is twice as far is half as large.": (
             "u = fx x / z + cx and v = fy y / z + cy.",
+            lambda o, means_cam, K, *given: means_cam[:, :2] * np.diag(K)[:2] + K[:2, 2],
         ),
-    ),
-    "project_means_vjp": (
-        (
-            lambda o, means_cam, K, *given: o["project_means_vjp"](means_cam, np.eye(3), *given),
-            "The focal lengths are missing: u changes by fx / z where x changes by 1.",
+    },
+    "project_means_vjp": {
+        "The focal lengths are missing: u changes by fx / z where x changes by 1.": (
             "v_x = fx / z v_u, and v_z has fx x / z^2 and fy y / z^2.",
+            lambda o, means_cam, K, *given: o["project_means_vjp"](means_cam, np.eye(3), *given),
         ),
-        (
+        "The depth is missing under fx and fy: u changes by fx / z where x changes by 1.": (
+            "v_x = fx / z v_u and v_y = fy / z v_v.",
             lambda o, means_cam, *given: (
                 o["project_means_vjp"](means_cam, *given) * np.where(np.arange(3) < 2, means_cam[:, 2:], 1.0)
             ),
-            "The depth is missing under fx and fy: u changes by fx / z where x changes by 1.",
-            "v_x = fx / z v_u and v_y = fy / z v_v.",
         ),
-    ),
-    "projection_jacobians": (
-        (
+    },
+    "projection_jacobians": {
+        "The column of z lacks one division by the depth: the slope of 1 / z is -1 / z^2.": (
+            "The entries of z are -fx tx / z^2 and -fy ty / z^2.",
             lambda o, means_cam, *given: (
                 o["projection_jacobians"](means_cam, *given) * np.where(np.arange(3) < 2, 1.0, means_cam[:, None, 2:])
             ),
-            "The column of z lacks one division by the depth: the slope of 1 / z is -1 / z^2.",
-            "The entries of z are -fx tx / z^2 and -fy ty / z^2.",
         ),
-    ),
-    "projection_jacobians_vjp": (
-        (
-            _without_z_of_the_diagonal,
-            "Two terms of z are missing: fx / z and fy / z on the Jacobian's diagonal depend on z, too.",
+    },
+    "projection_jacobians_vjp": {
+        "Two terms of z are missing: fx / z and fy / z on the Jacobian's diagonal depend on z, too.": (
             "Add -(fx v_xx + fy v_yy) / z^2 to the cotangent of z.",
+            _without_z_of_the_diagonal,
         ),
-        (
-            _once_by_z,
-            "A two is missing from the cotangent of z: fx x / z^2 has z under it twice.",
+        "A two is missing from the cotangent of z: fx x / z^2 has z under it twice.": (
             "The derivative of -fx x / z^2 by z is 2 fx x / z^3 where x/z is not clamped.",
+            _once_by_z,
         ),
-    ),
-    "project_covars": (
-        (
-            lambda o, covars_cam, jacobians: jacobians @ np.swapaxes(jacobians, 1, 2),
-            "The covariance is missing between the two Jacobians.",
+    },
+    "project_covars": {
+        "The covariance is missing between the two Jacobians.": (
             "J S J^T, with the Gaussian's S in the middle.",
+            lambda o, covars_cam, jacobians: jacobians @ np.swapaxes(jacobians, 1, 2),
         ),
-    ),
+    },
 }

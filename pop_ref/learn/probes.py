@@ -30,6 +30,7 @@ from pop_ref.training import Training, start
 Oracle = dict[str, Callable[..., Any]]
 # what is special, empty for a plain input; the arguments
 Probe = tuple[str, tuple[Any, ...]]
+Draw = Callable[[np.random.Generator], Iterator[Probe]]
 
 
 @functools.cache
@@ -68,9 +69,9 @@ def _cotangent(result: Any, rng: np.random.Generator) -> Any:
     return float(v) if shape == () else v
 
 
-def _logs(rng: np.random.Generator) -> Iterator[Probe]:
-    for n in (1, 3, 4):
-        yield "", (rng.uniform(-2.0, 1.0, (n, 3)),)
+def _plain(make: Callable[[np.random.Generator, int], tuple[Any, ...]], *sizes: int) -> Draw:
+    """Draw plain inputs alone, one of each size."""
+    return lambda rng: (("", make(rng, n)) for n in sizes)
 
 
 def _logits(rng: np.random.Generator) -> Iterator[Probe]:
@@ -123,24 +124,12 @@ def _viewmat(rng: np.random.Generator) -> np.ndarray:
     return viewmat
 
 
-def _viewmats(rng: np.random.Generator) -> Iterator[Probe]:
-    for _ in range(3):
-        yield "", (_viewmat(rng),)
-
-
-def _means(rng: np.random.Generator) -> Iterator[Probe]:
-    for n in (1, 2, 4):
-        yield "", (rng.uniform(-3.0, 3.0, (n, 3)), _viewmat(rng))
+_MEANS: Final = _plain(lambda rng, n: (rng.uniform(-3.0, 3.0, (n, 3)), _viewmat(rng)), 1, 2, 4)
 
 
 def _covars(rng: np.random.Generator, n: int, size: int) -> np.ndarray:
     M = rng.uniform(-1.0, 1.0, (n, size, size)) + 1.5 * np.eye(size)
     return M @ M.swapaxes(1, 2)
-
-
-def _covars_world(rng: np.random.Generator) -> Iterator[Probe]:
-    for n in (1, 2, 4):
-        yield "", (_covars(rng, n, 3), _viewmat(rng))
 
 
 def _depths(rng: np.random.Generator) -> Iterator[Probe]:
@@ -163,11 +152,6 @@ def _pinhole(rng: np.random.Generator) -> Iterator[Probe]:
         yield "", (np.column_stack([xy, z]), _K, *_SIZE)
     aside = "a Gaussian is far outside the picture, where x/z and y/z are clamped for the Jacobian"
     yield aside, (np.array([[9.0, 0.2, 2.0], [-8.0, 7.0, 3.0]]), _K, *_SIZE)
-
-
-def _jacobians(rng: np.random.Generator) -> Iterator[Probe]:
-    for n in (1, 2, 4):
-        yield "", (_covars(rng, n, 3), rng.uniform(-4.0, 4.0, (n, 2, 3)))
 
 
 def _project_covars_vjp(rng: np.random.Generator) -> Iterator[Probe]:
@@ -523,8 +507,8 @@ def _looks(rng: np.random.Generator) -> Iterator[Probe]:
         yield where, (state, camera, target, scale, recipe)
 
 
-_PROBES: Final[dict[str, Callable[[np.random.Generator], Iterator[Probe]]]] = {
-    "scales_from_log_scales": _logs,
+_PROBES: Final[dict[str, Draw]] = {
+    "scales_from_log_scales": _plain(lambda rng, n: (rng.uniform(-2.0, 1.0, (n, 3)),), 1, 3, 4),
     "opacities_from_logits": _logits,
     "unit_quats_from_quats": _quats,
     "rotmats_from_quats": _quats,
@@ -532,15 +516,15 @@ _PROBES: Final[dict[str, Callable[[np.random.Generator], Iterator[Probe]]]] = {
     "covars_from_quats_scales_vjp": _covars_vjp,
     "sh_basis": _basis,
     "colors_from_sh": _colors,
-    "camera_center": _viewmats,
-    "view_dirs": _means,
-    "means_cam_from_means": _means,
-    "covars_cam_from_covars": _covars_world,
+    "camera_center": _plain(lambda rng, _: (_viewmat(rng),), *range(3)),
+    "view_dirs": _MEANS,
+    "means_cam_from_means": _MEANS,
+    "covars_cam_from_covars": _plain(lambda rng, n: (_covars(rng, n, 3), _viewmat(rng)), 1, 2, 4),
     "covars_cam_from_covars_vjp": _covars_cam_vjp,
     "in_front": _depths,
     "project_means": _pinhole,
     "projection_jacobians": _pinhole,
-    "project_covars": _jacobians,
+    "project_covars": _plain(lambda rng, n: (_covars(rng, n, 3), rng.uniform(-4.0, 4.0, (n, 2, 3))), 1, 2, 4),
     "project_covars_vjp": _project_covars_vjp,
     "low_pass": _blur,
     "conics_from_covars2d": _covars2d,

@@ -112,14 +112,12 @@ def read_work(folder: Path) -> Work:
         if any(Path(stage.file).exists() for stage in COURSE):
             raise ValueError(f"{folder} has no stubs; you are in a folder that has some: write . for it, at the end")
         raise ValueError(f"{folder} has no stubs; 'pop-learn start {folder}' writes them")
-    written = {}
-    for stage in COURSE:
-        path = folder / stage.file
-        written[stage.name] = _written(stage, path) if path.exists() else ()
-    return Work(folder, written)
+    return Work(folder, {stage.name: _written(stage, folder / stage.file) for stage in COURSE})
 
 
 def _written(stage: Stage, path: Path) -> tuple[str, ...]:
+    if not path.exists():
+        return ()
     functions = {node.name: node for node in _parsed(path).body if isinstance(node, ast.FunctionDef)}
     return tuple(name for name in stage.names if name in functions and not _is_stub(functions[name]))
 
@@ -192,11 +190,7 @@ def _with_settings(function: Callable[..., Any], before: Callable[..., Any]) -> 
 
 
 def _replace(
-    modules: list[ModuleType],
-    borrowed: Borrowed,
-    name: str,
-    function: Callable[..., Any],
-    called: Callable[..., Any],
+    modules: list[ModuleType], borrowed: Borrowed, name: str, function: Callable[..., Any], called: Callable[..., Any]
 ) -> None:
     """Put a student's function wherever the copy has the oracle's, and in the student's own modules."""
     before = borrowed.oracle[name]

@@ -37,11 +37,9 @@ photographs = [view.image / 255.0 for view in capture.views]
 cameras = [(view.viewmat, view.K, WIDTH, HEIGHT) for view in capture.views]
 seen = [k for k in range(16) if k != UNSEEN]
 
-fig, panels = axes(4, height=1.6)
+fig, panels = axes(4, height=1.6, ticks=False)
 for panel, k in zip(panels, (0, 4, 12, UNSEEN), strict=True):
-    title = "put aside" if k == UNSEEN else f"photograph {k}"
-    show_image(panel, photographs[k], title)
-    panel.set(xticks=[], yticks=[])
+    show_image(panel, photographs[k], "put aside" if k == UNSEEN else f"photograph {k}")
 picture(fig, "Four of the sixteen photographs. The last is not trained on.")
 
 # %% [markdown]
@@ -66,26 +64,19 @@ def seen_by(k, where):
     return (p @ K.T)[:, :2] / p[:, 2:], p[:, 2]
 
 
-fig, (left, right) = axes(2, height=2.9)
+fig, (left, right) = axes(2, height=2.9, ticks=False)
 at, depths = seen_by(UNSEEN, points)
 order = np.argsort(-depths)
 # so many dots are kept as an image
 left.scatter(*at[order].T, s=7, c=tints[order], lw=0, rasterized=True)
-left.set(
-    xlim=(0, WIDTH),
-    ylim=(HEIGHT, 0),
-    aspect="equal",
-    title="the points, from the side put aside",
-)
+left.set(xlim=(0, WIDTH), ylim=(HEIGHT, 0), aspect="equal")
+left.set(title="the points, from the side put aside")
 right.scatter(*points[:, :2].T, s=4, c=tints, lw=0, rasterized=True)
 places = np.array([-camera[0][:3, :3].T @ camera[0][:3, 3] for camera in cameras])
 right.plot(*places[seen, :2].T, "^", color=ACCENT, ms=5)
 right.plot(*places[UNSEEN, :2], "^", color=SECOND, ms=7)
 right.set(aspect="equal", title="and from above, with the cameras")
 right.set(xlim=(-1.6, 1.6), ylim=(-1.3, 1.3))
-for panel in (left, right):
-    panel.set(xticks=[], yticks=[])
-    panel.grid(False)
 picture(
     fig,
     "All that training begins with. Triangles: the cameras; orange: the photograph put aside.",
@@ -137,14 +128,10 @@ def psnr(image, photograph):
 small = {**params, "scales": params["scales"] - np.log(3.0), "opacities": np.full(n, 4.0)}
 print(f"{n} Gaussians of 14 numbers each: {14 * n} numbers")
 
-fig, (left, right) = axes(2, height=2.9)
+fig, (left, right) = axes(2, height=2.9, ticks=False)
 show_image(left, drawn(small), "the Gaussians, a third as wide and opaque")
 show_image(right, drawn(params), "the Gaussians as they are")
-for panel in (left, right):
-    panel.set(xticks=[], yticks=[])
-picture(
-    fig, "The same Gaussians twice, from the side that is put aside, before any training."
-)
+picture(fig, "The same Gaussians twice, from the side that is put aside, before any training.")
 
 # %% [markdown]
 # ## Training
@@ -188,13 +175,11 @@ print(f"the side put aside: {first:.1f} dB before, {last:.1f} dB after {STEPS} s
 assert last > first + 1.5
 
 # %%
-fig, panels = axes(3, height=2.0)
+fig, panels = axes(3, height=2.0, ticks=False)
 show_image(panels[0], photographs[UNSEEN], "the photograph")
 show_image(panels[1], drawn(params), "the Gaussians")
 small = {**params, "scales": params["scales"] - np.log(3.0), "opacities": np.full(n, 4.0)}
 show_image(panels[2], drawn(small), "a third as wide, opaque")
-for panel in panels:
-    panel.set(xticks=[], yticks=[])
 picture(
     fig,
     "After seventy steps. The Gaussians have found their sizes and turned into the surfaces.",
@@ -208,16 +193,12 @@ picture(
 # %%
 kept = plt.imread(str(files("pop_ref.walkthrough") / "trained.png"))[..., :3]
 trained, photographed = np.split(kept, 2, axis=1)
-print(
-    f"after 3,000 steps: {psnr(trained, photographed):.1f} dB; after seventy: {last:.1f} dB"
-)
+print(f"after 3,000 steps: {psnr(trained, photographed):.1f} dB; after seventy: {last:.1f} dB")
 assert last + 5.0 < psnr(trained, photographed) < 50.0
 
-fig, panels = axes(2, height=2.3)
+fig, panels = axes(2, height=2.3, ticks=False)
 show_image(panels[0], trained, "the Gaussians after 3,000 steps")
 show_image(panels[1], photographed, "the photograph")
-for panel in panels:
-    panel.set(xticks=[], yticks=[])
 picture(
     fig,
     "A real training takes 30,000 steps on large photographs, and ends with hundreds of thousands of Gaussians.",
@@ -233,6 +214,7 @@ picture(
 
 # %%
 fig, ax = axes(1, height=5.6)
+arrow = {"arrowstyle": "->"}
 for row, stage in enumerate(STAGES):
     y = -row
     kind = ACCENT if row < 8 else SECOND
@@ -247,23 +229,9 @@ for row, stage in enumerate(STAGES):
         9.2, y, f"chapter {stage.chapter}", va="center", ha="right", color=MUTED, fontsize=8
     )
     if row + 1 < len(STAGES):
-        ax.annotate(
-            "",
-            (1.0, y - 0.66),
-            (1.0, y - 0.36),
-            arrowprops={"arrowstyle": "->", "color": MUTED},
-        )
-ax.annotate(
-    "",
-    (-0.25, 0.0),
-    (-0.25, 1.0 - len(STAGES)),
-    arrowprops={
-        "arrowstyle": "->",
-        "color": SECOND,
-        "lw": 1.4,
-        "connectionstyle": "bar,fraction=-0.03",
-    },
-)
+        ax.annotate("", (1.0, y - 0.66), (1.0, y - 0.36), arrowprops={**arrow, "color": MUTED})
+back = {**arrow, "color": SECOND, "lw": 1.4, "connectionstyle": "bar,fraction=-0.03"}
+ax.annotate("", (-0.25, 0.0), (-0.25, 1.0 - len(STAGES)), arrowprops=back)
 ax.text(-0.85, -5.5, "one step later", rotation=90, va="center", color=SECOND)
 ax.set(xlim=(-1.1, 9.3), ylim=(0.6 - len(STAGES), 0.6))
 ax.axis("off")
@@ -322,9 +290,7 @@ picture(
 # The opacities and the colours. A point cloud says nothing of opacities, and a point's colour is that of single pixels,
 # while a splat's must suit all that it covers. The places, which a point cloud knows best, and the rotations change
 # least.
-moved = {
-    name: np.mean(np.abs(params[name] - started[name])) / rates[name] for name in params
-}
+moved = {name: np.mean(np.abs(params[name] - started[name])) / rates[name] for name in params}
 print({name: f"{x:.1f} steps" for name, x in moved.items()})
 assert {"opacities", "sh0"} == set(sorted(moved, key=lambda name: moved[name])[-2:])
 assert {"means", "quats"} == set(sorted(moved, key=lambda name: moved[name])[:2])

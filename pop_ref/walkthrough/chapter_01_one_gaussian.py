@@ -78,9 +78,7 @@ assert np.isclose(sigma, by_hand)
 long_axis = math.sqrt(lambdas[1]) * directions[:, 1]
 for k in (1, 2, 3):
     assert np.isclose(sigma_at(*(mean2d + k * long_axis)), k * k / 2)
-print(
-    f"sigma = {sigma:.4f}: the pixel is {math.sqrt(2 * sigma):.2f} standard deviations away"
-)
+print(f"sigma = {sigma:.4f}: the pixel is {math.sqrt(2 * sigma):.2f} standard deviations away")
 
 # %% [markdown]
 # ## Falloff and alpha
@@ -150,13 +148,8 @@ left.set(xlim=(0, WIDTH), ylim=(HEIGHT, 0), aspect="equal", xlabel="x, px", ylab
 left.set(title="Ellipses of 1, 2 and $k$ standard deviations")
 left.set(xticks=range(0, WIDTH + 1, 4), yticks=range(0, HEIGHT + 1, 4))
 left.grid(False)
-drawn = show_image(
-    right,
-    np.where(alphas > 0, alphas, np.nan),
-    "Alpha, where it is not skipped",
-    vmin=0,
-    vmax=1,
-)
+seen = np.where(alphas > 0, alphas, np.nan)
+drawn = show_image(right, seen, "Alpha, where it is not skipped", vmin=0, vmax=1)
 right.set(xticks=range(0, WIDTH + 1, 4), xlabel="x, px")
 fig.colorbar(drawn, ax=right, shrink=0.75, label="alpha")
 picture(
@@ -186,13 +179,8 @@ for (o, edge), shade in zip(reach_of.items(), (ACCENT, SECOND, THIRD, MUTED), st
     ax.plot([edge], [1 / 255], "o", color=shade, ms=4)
 ax.axhline(1 / 255, color=INK, lw=0.8)
 ax.annotate("floor, 1/255", (0.02, 1 / 255), (0, 3), textcoords="offset points")
-ax.set(
-    yscale="log",
-    ylim=(5e-4, 1.5),
-    xlim=(0, 4),
-    xlabel="distance, standard deviations",
-    ylabel="alpha",
-)
+ax.set(yscale="log", ylim=(5e-4, 1.5), xlim=(0, 4))
+ax.set(xlabel="distance, standard deviations", ylabel="alpha")
 ax.legend(loc="upper right")
 picture(
     fig,
@@ -217,9 +205,7 @@ picture(
 # %%
 rows = SplatRows([mean2d.tolist()], [conic], [opacity], [color.tolist()])
 pixel = composite_pixel([0], rows, p[0], p[1], background.tolist())
-print(
-    "colour of the pixel", np.round(pixel.color, 3), " light left", round(pixel.T_final, 3)
-)
+print("colour of the pixel", np.round(pixel.color, 3), " light left", round(pixel.T_final, 3))
 assert np.allclose(pixel.color, alpha * color + (1 - alpha) * background)
 assert np.isclose(pixel.T_final, 1 - alpha)
 

@@ -153,14 +153,8 @@ assert np.allclose(np.abs(with_adam[1] - with_adam[0]), 0.1)
 
 fig, (left, right) = axes(2, height=2.8, width_ratios=[1.3, 1])
 a, b = np.meshgrid(np.linspace(-1.3, 1.3, 80), np.linspace(-2.3, 0.8, 80))
-left.contour(
-    a,
-    b,
-    50 * a * a + 0.5 * b * b,
-    levels=[0.5, 1, 2, 5, 10, 20, 40, 80],
-    colors=MUTED,
-    linewidths=0.6,
-)
+bowl, heights = 50 * a * a + 0.5 * b * b, [0.5, 1, 2, 5, 10, 20, 40, 80]
+left.contour(a, b, bowl, levels=heights, colors=MUTED, linewidths=0.6)
 for places, shade, name in (
     (just_right, SECOND, "gradient descent"),
     (with_adam, ACCENT, "Adam"),
@@ -171,8 +165,7 @@ left.set(xlabel="$x_1$, steep", ylabel="$x_2$, flat")
 right.set(xlabel="step", title="loss")
 right.legend()
 picture(
-    fig,
-    "Sixty steps in a valley that is a hundred times steeper along $x_1$ than along $x_2$.",
+    fig, "Sixty steps in a valley that is a hundred times steeper along $x_1$ than along $x_2$."
 )
 
 # %% [markdown]
@@ -198,8 +191,7 @@ def first_step(gradient: float, eps: float) -> float:
 
 steps = {eps: np.array([first_step(size, eps) for size in sizes]) for eps in (1e-15, 1e-8)}
 print(
-    "gradient 1e-10: step of",
-    *(f"{first_step(1e-10, eps):.3f} (eps {eps:g})" for eps in steps),
+    "gradient 1e-10: step of", *(f"{first_step(1e-10, eps):.3f} (eps {eps:g})" for eps in steps)
 )
 assert np.allclose(first_step(1e-10, 1e-15), 1.0, rtol=1e-4)
 assert np.isclose(first_step(1e-10, 1e-8), 1 / 101)
@@ -279,18 +271,14 @@ def drawn(params):
     return render(gaussians_from_params(params), camera, background=np.ones(3)).image
 
 
-target = drawn(
-    one(0.45, -0.2, [0.5, 0.2, 0.2], [0.95, 0.0, 0.0, 0.3], 0.9, [0.95, 0.55, 0.1])
-)
+target = drawn(one(0.45, -0.2, [0.5, 0.2, 0.2], [0.95, 0.0, 0.0, 0.3], 0.9, [0.95, 0.55, 0.1]))
 first = one(-0.3, 0.2, [0.25, 0.3, 0.2], [1.0, 0.0, 0.0, 0.1], 0.5, [0.2, 0.4, 0.9])
 rates = {"means": 0.02, "quats": 0.03, "scales": 0.04, "opacities": 0.08, "sh0": 0.08}
 
 
 def learned(params, n_steps=90):
     """Train one splat; return its parameters before every step and at the end, and the losses."""
-    m, v = (
-        {name: np.zeros_like(value) for name, value in params.items()} for _ in range(2)
-    )
+    m, v = ({name: np.zeros_like(value) for name, value in params.items()} for _ in range(2))
     path, losses = [params], []
     for step in range(1, n_steps + 1):
         image = drawn(params)
@@ -336,9 +324,7 @@ for third_width, place in ((0.05, -0.3), (0.4, -0.1)):
     other_path, other_losses = learned(other)
     widths = np.exp(other_path[-1]["scales"])[0]
     depth = other_path[-1]["means"][0, 2]
-    print(
-        f"third width {third_width} at first, {widths[2]:.3f} at the end; depth {depth:.2f}"
-    )
+    print(f"third width {third_width} at first, {widths[2]:.3f} at the end; depth {depth:.2f}")
     # it fits as well, ...
     assert other_losses[-1] < 0.02 * other_losses[0]
     # ... and is another splat: neither the target's nor the one that was found before

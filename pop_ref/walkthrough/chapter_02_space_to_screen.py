@@ -35,12 +35,7 @@ import numpy as np
 from pop_ref.camera import covars_cam_from_covars, means_cam_from_means
 from pop_ref.constants import PAPER
 from pop_ref.covariance import covars_from_quats_scales, rotmats_from_quats
-from pop_ref.footprint import (
-    compensations,
-    conics_from_covars2d,
-    low_pass,
-    radii_from_covars2d,
-)
+from pop_ref.footprint import compensations, conics_from_covars2d, low_pass, radii_from_covars2d
 from pop_ref.pixel import SplatRows, composite_pixel
 from pop_ref.projection import project_covars, project_means, projection_jacobians
 from pop_ref.records import Camera, Gaussians
@@ -128,14 +123,8 @@ for axis in range(3):
     ahead = project_means(means_cam + nudge, K, width, height)
     behind = project_means(means_cam - nudge, K, width, height)
     column = (ahead - behind) / (2 * step)
-    print(
-        "along",
-        "xyz"[axis],
-        "by a difference",
-        column[0].round(4),
-        " in J",
-        J[0, :, axis].round(4),
-    )
+    found, wanted = column[0].round(4), J[0, :, axis].round(4)
+    print("along", "xyz"[axis], "by a difference", found, " in J", wanted)
     assert np.allclose(column, J[:, :, axis], atol=1e-5)
 
 means2d = project_means(means_cam, K, width, height)
@@ -153,9 +142,7 @@ assert np.allclose(covars2d[0], J[0] @ covars_cam[0] @ J[0].T)
 # %%
 def sides(k: int, seed: int) -> np.ndarray:
     """Send points of Gaussian k through the pinhole; tell how far the middle 68 % reach."""
-    points = np.random.default_rng(seed).multivariate_normal(
-        means_cam[k], covars_cam[k], 6000
-    )
+    points = np.random.default_rng(seed).multivariate_normal(means_cam[k], covars_cam[k], 6000)
     cloud = project_means(points[points[:, 2] > 0.01], K, width, height)
     lambdas, directions = np.linalg.eigh(covars2d[k])
     along = (cloud - means2d[k]) @ directions[:, 1] / np.sqrt(lambdas[1])
@@ -217,9 +204,7 @@ side.plot(0, 0, "o", color=INK)
 side.annotate("camera", (0, 0), (-8, -15), textcoords="offset points")
 side.set(xlim=(-0.3, 6.2), ylim=(-2.4, 2.6), aspect="equal", xlabel="depth z, world units")
 side.set(title="From the side", ylabel="x, world units")
-screen.set(
-    xlim=(-14, width), ylim=(height, 0), aspect="equal", xlabel="x, px", ylabel="y, px"
-)
+screen.set(xlim=(-14, width), ylim=(height, 0), aspect="equal", xlabel="x, px", ylabel="y, px")
 screen.set(title="On the screen")
 picture(
     fig,
@@ -280,12 +265,8 @@ def paint(covar2d: np.ndarray, opacity: float, x: float) -> float:
     """Add up the alphas of a splat at (x, 16) on a screen of 24 x 32 px."""
     conic = conics_from_covars2d(covar2d)[0].tolist()
     rows = SplatRows([[x, 16.0]], [conic], [opacity], [[1.0]])
-    pixels = [
-        composite_pixel([0], rows, i + 0.5, j + 0.5, [0.0])
-        for i in range(24)
-        for j in range(32)
-    ]
-    return sum(pixel.color[0] for pixel in pixels)
+    centres = [(i + 0.5, j + 0.5) for i, j in np.ndindex(24, 32)]
+    return sum(composite_pixel([0], rows, *at, [0.0]).color[0] for at in centres)
 
 
 places = np.arange(10.0, 13.0, 0.05)
@@ -319,12 +300,8 @@ for curve, name, shade in (
     ax.plot(places, curve, color=shade, label=name)
 for centre in (10.5, 11.5, 12.5):
     ax.axvline(centre, color=MUTED, lw=0.8, ls=":")
-ax.set(
-    xlim=(10, 13),
-    ylim=(0, 11),
-    xlabel="x of the needle, px (dotted: pixel centres)",
-    ylabel="sum of alphas",
-)
+ax.set(xlim=(10, 13), ylim=(0, 11), ylabel="sum of alphas")
+ax.set(xlabel="x of the needle, px (dotted: pixel centres)")
 ax.legend(loc="upper center", ncols=3, bbox_to_anchor=(0.5, 1.17))
 picture(
     fig,
@@ -348,9 +325,7 @@ assert np.allclose(splats.means2d, means2d)
 assert np.allclose(splats.conics, conics_from_covars2d(ours))
 assert np.array_equal(splats.radii, radii_from_covars2d(ours, scene.opacities))
 assert np.allclose(splats.depths, depths)
-print(
-    "centres, px:", splats.means2d.round(1).tolist(), " extents, px:", splats.radii.tolist()
-)
+print("centres, px:", splats.means2d.round(1).tolist(), " extents, px:", splats.radii.tolist())
 assert splats.visible.all()
 
 
@@ -428,9 +403,7 @@ def to_screen(mean, quat, scale, viewmat, K):
     )
     M = viewmat[:3, :3] @ R @ np.diag(scale)
     x, y, z = viewmat[:3, :3] @ mean + viewmat[:3, 3]
-    J = np.array(
-        [[K[0, 0] / z, 0, -K[0, 0] * x / z**2], [0, K[1, 1] / z, -K[1, 1] * y / z**2]]
-    )
+    J = np.array([[K[0, 0] / z, 0, -K[0, 0] * x / z**2], [0, K[1, 1] / z, -K[1, 1] * y / z**2]])
     centre = np.array([K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]])
     return centre, J @ M @ M.T @ J.T + 0.3 * np.eye(2)
 

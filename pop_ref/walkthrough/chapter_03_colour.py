@@ -90,9 +90,7 @@ for k in range(16):
     degree = math.isqrt(k)
     order = k - degree * degree - degree
     panel = panels[7 * degree + 3 + order]
-    panel.imshow(
-        np.where(on_globe, values[:, :, k], np.nan), cmap=DIVERGING, vmin=-1, vmax=1
-    )
+    panel.imshow(np.where(on_globe, values[:, :, k], np.nan), cmap=DIVERGING, vmin=-1, vmax=1)
     panel.set_title(f"$Y_{{{k}}}$", loc="center", pad=2, fontsize=8)
 picture(fig, "The sixteen harmonics, one row a degree.")
 
@@ -169,9 +167,7 @@ as_sh = np.repeat(h[None, :, None], 3, axis=2)
 
 turn = np.linspace(-np.pi, np.pi, 361)
 meridian = np.stack([np.sin(turn), np.zeros(361), np.cos(turn)], axis=1)
-series = [
-    colors_from_sh(np.repeat(as_sh, 361, axis=0), meridian, n)[:, 0] for n in range(4)
-]
+series = [colors_from_sh(np.repeat(as_sh, 361, axis=0), meridian, n)[:, 0] for n in range(4)]
 
 errors = []
 for n in range(4):
@@ -291,12 +287,8 @@ assert np.allclose(sh_basis(-sphere, 3), sign * Y)
 # %% answer
 # $Y h = c - \frac12$, one row a photograph, four unknowns: `lstsq` does it. Where a colour was cut off at 0, the fit
 # would be wrong; here none is.
-around = np.array(
-    [
-        [math.sin(2 * math.pi * k / 8), 0.2 * (k % 3), math.cos(2 * math.pi * k / 8)]
-        for k in range(8)
-    ]
-)
+k = np.arange(8)
+around = np.stack([np.sin(2 * np.pi * k / 8), 0.2 * (k % 3), np.cos(2 * np.pi * k / 8)], axis=1)
 around /= np.linalg.norm(around, axis=1, keepdims=True)
 reds = colors_from_sh(np.repeat(coefficients, 8, axis=0), around, 1)[:, 0]
 fitted, *_ = np.linalg.lstsq(sh_basis(around, 1), reds - 0.5, rcond=None)

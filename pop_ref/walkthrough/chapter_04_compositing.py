@@ -45,9 +45,7 @@ def blend(alphas: np.ndarray, colors: np.ndarray, background: np.ndarray) -> np.
 def stack(alphas: np.ndarray, colors: np.ndarray) -> SplatRows:
     """Put splats right over one pixel centre, (0.5, 0.5), where alpha is the opacity."""
     n = len(alphas)
-    return SplatRows(
-        [[0.5, 0.5]] * n, [[1.0, 0.0, 1.0]] * n, alphas.tolist(), colors.tolist()
-    )
+    return SplatRows([[0.5, 0.5]] * n, [[1.0, 0.0, 1.0]] * n, alphas.tolist(), colors.tolist())
 
 
 rng = np.random.default_rng(4)
@@ -81,9 +79,7 @@ assert np.allclose(pixel.weights, -np.diff([*pixel.transmittances, pixel.T_final
 # the same. But only the walk from the front knows when to stop.
 
 # %%
-assert not np.allclose(
-    blend(alphas[::-1], colors[::-1], background), pixel.color, atol=0.01
-)
+assert not np.allclose(blend(alphas[::-1], colors[::-1], background), pixel.color, atol=0.01)
 
 behind = background
 for alpha, c in zip(alphas[::-1], colors[::-1], strict=True):
@@ -125,18 +121,11 @@ steps = np.arange(0, 61)
 for alpha, shade in ((0.1, ACCENT), (0.3, SECOND), (0.8, THIRD)):
     T = (1 - alpha) ** steps
     alive = T > 1e-4
-    ax.plot(
-        steps[alive], T[alive], ".-", ms=4, lw=1, color=shade, label=rf"$\alpha$ = {alpha}"
-    )
+    ax.plot(steps[alive], T[alive], ".-", ms=4, lw=1, color=shade, label=rf"$\alpha$ = {alpha}")
 ax.axhline(1e-4, color=INK, lw=0.8)
 ax.annotate("stop", (60, 1e-4), (-4, 4), textcoords="offset points", ha="right")
-ax.set(
-    yscale="log",
-    ylim=(3e-5, 1.4),
-    xlim=(0, 60),
-    xlabel="splats passed",
-    ylabel="transmittance $T$",
-)
+ax.set(yscale="log", ylim=(3e-5, 1.4), xlim=(0, 60))
+ax.set(xlabel="splats passed", ylabel="transmittance $T$")
 ax.legend(loc="upper right")
 picture(
     fig,
@@ -201,17 +190,13 @@ print(f"splats visited per pixel: {soft:.0f} and {hard:.0f}")
 sparse = [render(box_of(60, o), camera, white, tile_size=4) for o in (0.2, 0.98)]
 assert sparse[0].n_traversed.mean() < sparse[1].n_traversed.mean()
 
-fig, panels = axes(3, 2, height=3.9)
+fig, panels = axes(3, 2, height=3.9, ticks=False)
 most = max(view.n_traversed.max() for view in views)
-for row, (view, name) in enumerate(
-    zip(views, ("opacity 0.2", "opacity 0.98"), strict=True)
-):
+for row, (view, name) in enumerate(zip(views, ("opacity 0.2", "opacity 0.98"), strict=True)):
     image, light, visits = panels[3 * row : 3 * row + 3]
     show_image(image, view.image, name)
     left = show_image(light, view.T_final, "light left", vmin=0, vmax=1)
     seen = show_image(visits, view.n_traversed, "splats visited", vmin=0, vmax=most)
-    for panel in (image, light, visits):
-        panel.set(xticks=[], yticks=[])
     fig.colorbar(left, ax=light, shrink=0.8)
     fig.colorbar(seen, ax=visits, shrink=0.8)
 picture(

@@ -41,9 +41,7 @@ scene = Gaussians(
     opacities=rng.uniform(0.2, 0.95, 150),
     sh=rng.normal(size=(150, 1, 3)),
 )
-views = {
-    size: render(scene, camera, np.ones(3), tile_size=size) for size in (4, 8, 16, 32, 80)
-}
+views = {size: render(scene, camera, np.ones(3), tile_size=size) for size in (4, 8, 16, 32, 80)}
 for view in views.values():
     assert np.allclose(view.image, views[16].image, rtol=0, atol=1e-14)
 print("tiles of 16 px:", grid_size(80, 48, 16))
@@ -69,9 +67,7 @@ print(f"radii {radii[0]}; tiles {x0} to {x1 - 1} across and {y0} to {y1 - 1} dow
 
 def reaches(tile_x: int, tile_y: int) -> bool:
     """Tell whether some pixel of a tile is over the floor."""
-    px, py = np.meshgrid(
-        16 * tile_x + np.arange(16) + 0.5, 16 * tile_y + np.arange(16) + 0.5
-    )
+    px, py = np.meshgrid(16 * tile_x + np.arange(16) + 0.5, 16 * tile_y + np.arange(16) + 0.5)
     A, B, C = conics_from_covars2d(covar2d)[0]
     dx, dy = centre[0, 0] - px, centre[0, 1] - py
     alpha = 0.9 * np.exp(-(0.5 * (A * dx * dx + C * dy * dy) + B * dx * dy))
@@ -86,12 +82,8 @@ assert needed < touched
 fig, ax = axes(1, width=5.4, height=3.3)
 for x, y in touched:
     shade = ACCENT if (x, y) in needed else SECOND
-    ax.fill(
-        [16 * x, 16 * x + 16, 16 * x + 16, 16 * x],
-        [16 * y, 16 * y, 16 * y + 16, 16 * y + 16],
-        color=shade,
-        alpha=0.25,
-    )
+    across, down = 16 * np.array([x, x + 1, x + 1, x]), 16 * np.array([y, y, y + 1, y + 1])
+    ax.fill(across, down, color=shade, alpha=0.25)
 turn = np.linspace(0, 2 * np.pi, 200)
 k = np.sqrt(2 * np.log(255 * 0.9))
 ellipse = centre[0][:, None] + k * np.linalg.cholesky(covar2d[0]) @ np.stack(
@@ -99,19 +91,13 @@ ellipse = centre[0][:, None] + k * np.linalg.cholesky(covar2d[0]) @ np.stack(
 )
 ax.plot(*ellipse, color=INK, lw=1.6)
 (u, v), (rx, ry) = centre[0], radii[0]
-ax.plot(
+across, down = (
     [u - rx, u + rx, u + rx, u - rx, u - rx],
     [v - ry, v - ry, v + ry, v + ry, v - ry],
-    "--",
-    color=INK,
-    lw=1,
 )
+ax.plot(across, down, "--", color=INK, lw=1)
 ax.set(
-    xlim=(0, 80),
-    ylim=(48, 0),
-    xticks=range(0, 81, 16),
-    yticks=range(0, 49, 16),
-    aspect="equal",
+    xlim=(0, 80), ylim=(48, 0), xticks=range(0, 81, 16), yticks=range(0, 49, 16), aspect="equal"
 )
 ax.set(xlabel="x, px", ylabel="y, px")
 picture(
@@ -167,9 +153,7 @@ splats = views[16].splats
 mine = sorted_lists(splats, 80, 48, 16)
 theirs = tile_lists(splats.means2d, splats.radii, splats.depths, 80, 48, 16)
 assert mine == theirs
-print(
-    f"{sum(map(len, mine))} entries of {np.sum(splats.visible)} splats in {len(mine)} lists"
-)
+print(f"{sum(map(len, mine))} entries of {np.sum(splats.visible)} splats in {len(mine)} lists")
 
 # %% [markdown]
 # The oracle sorts the splats once by depth and then hands each to its tiles, which comes to the same:
@@ -241,16 +225,11 @@ print("visits of all pixels: ", *(f"{n:7}" for n in visits.values()))
 assert list(entries.values()) == sorted(entries.values(), reverse=True)
 assert list(visits.values()) == sorted(visits.values())
 
-fig, (left, right) = axes(2, height=2.4)
+fig, (left, right) = axes(2, height=2.4, ticks=False)
 for panel, size in ((left, 16), (right, 4)):
     shown = show_image(
-        panel,
-        views[size].n_traversed,
-        f"visits per pixel, tiles of {size} px",
-        vmin=0,
-        vmax=60,
+        panel, views[size].n_traversed, f"visits per pixel, tiles of {size} px", vmin=0, vmax=60
     )
-    panel.set(xticks=[], yticks=[])
 fig.colorbar(shown, ax=[left, right], shrink=0.8)
 picture(
     fig,
@@ -296,9 +275,7 @@ for size, wanted in ((16, 4.0), (8, 9.0)):
 # than about two millionths of their size count as equal and keep the order of their indices. Here nothing changes.
 def short_key(tile: int, depth: float, n_tiles: int) -> int:
     bits_of_tile = max(1, (n_tiles - 1).bit_length())
-    return (
-        tile << (32 - bits_of_tile) | int(np.float32(depth).view(np.uint32)) >> bits_of_tile
-    )
+    return tile << (32 - bits_of_tile) | int(np.float32(depth).view(np.uint32)) >> bits_of_tile
 
 
 for tile, ids in enumerate(theirs):

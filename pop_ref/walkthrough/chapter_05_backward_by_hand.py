@@ -38,15 +38,7 @@ from pop_ref.records import Camera, Gaussians
 from pop_ref.render import render, render_vjp
 from pop_ref.walkthrough.bugs import caught
 from pop_ref.walkthrough.pages import picture
-from pop_ref.walkthrough.style import (
-    ACCENT,
-    DIVERGING,
-    INK,
-    MUTED,
-    SECOND,
-    axes,
-    show_image,
-)
+from pop_ref.walkthrough.style import ACCENT, DIVERGING, INK, MUTED, SECOND, axes, show_image
 
 
 def stack(alphas, greys):
@@ -112,9 +104,7 @@ assert np.array_equal(v_alphas > 0.0, q > beta)
 
 fig, (left, right) = axes(2, height=3.0)
 where = np.arange(1, n + 1)
-left.bar(
-    where, q, color=[str(grey) for grey in q], edgecolor=MUTED, label=r"the splat, $q_i$"
-)
+left.bar(where, q, color=[str(grey) for grey in q], edgecolor=MUTED, label=r"the splat, $q_i$")
 left.plot(where, beta, color=SECOND, marker="o", ms=4, label=r"light behind $\beta_i$")
 left.set(xlabel="splat, front to back", ylabel="grey", xticks=where, ylim=(0.0, 1.3))
 left.legend(loc="upper right", ncols=2)
@@ -257,20 +247,12 @@ tip = centre + 6.0 * downhill / np.linalg.norm(downhill)
 span = np.max(np.abs(gain[pushed]))
 fig, (left, right) = axes(2)
 show_image(left, view.image, "render")
-shown = show_image(
-    right,
-    gain[pushed],
-    r"$\Gamma$ of the splat at the cross",
-    cmap=DIVERGING,
-    vmin=-span,
-    vmax=span,
-)
+signs = {"cmap": DIVERGING, "vmin": -span, "vmax": span}
+shown = show_image(right, gain[pushed], r"$\Gamma$ of the splat at the cross", **signs)
 fig.colorbar(shown, ax=right, shrink=0.8)
 for ax, colour in ((left, "white"), (right, INK)):
     ax.plot(*centre, "+", color=colour)
-    ax.annotate(
-        "", tip, centre, arrowprops={"arrowstyle": "->", "color": colour, "lw": 1.5}
-    )
+    ax.annotate("", tip, centre, arrowprops={"arrowstyle": "->", "color": colour, "lw": 1.5})
     ax.set(xlabel="x, px", ylabel="y, px")
 picture(
     fig,
@@ -339,11 +321,7 @@ np.testing.assert_allclose(stuck[:-1], 1e-3, rtol=0.01)
 fig, ax = axes(1, width=4.6, height=2.8)
 ax.loglog(steps, errors, "o-", color=ACCENT, label="all 56 parameters")
 ax.loglog(
-    steps[-4:],
-    errors[-1] * (steps[-4:] / steps[-1]) ** 2,
-    "--",
-    color=MUTED,
-    label=r"$h^2$",
+    steps[-4:], errors[-1] * (steps[-4:] / steps[-1]) ** 2, "--", color=MUTED, label=r"$h^2$"
 )
 ax.set(xlabel="step h", ylabel="relative difference")
 ax.legend()

@@ -181,9 +181,7 @@ assert np.allclose(v_J[i], 2.0 * v_covar2d @ J[i] @ covars_cam[i])
 
 through_center = project_means_vjp(means_cam, K, SIZE, SIZE, v_means2d)
 through_J = projection_jacobians_vjp(means_cam, K, SIZE, SIZE, v_J)
-print(
-    "gradient of the camera-space position, through the centre", through_center[i].round(5)
-)
+print("gradient of the camera-space position, through the centre", through_center[i].round(5))
 print("                                       through J         ", through_J[i].round(5))
 
 x, y, z = means_cam[i]
@@ -224,15 +222,11 @@ v_p, V_cam = through_center + through_J, v_covars_cam
 _, v_view = means_cam_from_means_vjp(scene.means, viewmat, v_p)
 assert np.allclose(v_view[:3], np.column_stack([v_p.T @ scene.means, v_p.sum(axis=0)]))
 _, v_view = covars_cam_from_covars_vjp(covars, viewmat, V_cam)
-turned = (
-    V_cam @ R_cam @ np.swapaxes(covars, 1, 2) + np.swapaxes(V_cam, 1, 2) @ R_cam @ covars
-)
+turned = V_cam @ R_cam @ np.swapaxes(covars, 1, 2) + np.swapaxes(V_cam, 1, 2) @ R_cam @ covars
 assert np.allclose(v_view[:3, :3], turned.sum(axis=0))
 v_e = np.array([1.0, -2.0, 0.5])
 v_view = camera_center_vjp(viewmat, v_e)
-assert np.allclose(
-    v_view[:3], np.column_stack([-np.outer(viewmat[:3, 3], v_e), -R_cam @ v_e])
-)
+assert np.allclose(v_view[:3], np.column_stack([-np.outer(viewmat[:3, 3], v_e), -R_cam @ v_e]))
 _, v_view = view_dirs_vjp(scene.means, viewmat, v_p)
 assert np.allclose(v_view, camera_center_vjp(viewmat, -v_p.sum(axis=0)))
 
@@ -309,12 +303,7 @@ print("the same position, through the colour:", v_dirs[i].round(5))
 # %%
 total = v_means + v_dirs
 whole = render_vjp(scene, camera, v_image, background=np.ones(3))
-for name, mine in (
-    ("means", total),
-    ("quats", v_quats),
-    ("scales", v_scales),
-    ("sh", v_sh),
-):
+for name, mine in (("means", total), ("quats", v_quats), ("scales", v_scales), ("sh", v_sh)):
     theirs = getattr(whole, name)
     print(
         f"{name:7} largest {np.abs(theirs).max():.4f}, off by {np.abs(mine - theirs).max():.0e}"
@@ -358,9 +347,9 @@ assert np.mean(np.argmax(sizes, axis=0) == 0) > 0.5
 # direction of view does not change the direction. The diagonal of $J$, $f/z$, shrinks as the Gaussian moves away.
 axis = np.array([[0.0, 0.0, 3.0]])
 one = project_means_vjp(axis, K, SIZE, SIZE, np.array([[1.0, -2.0]]))[0]
-two = projection_jacobians_vjp(
-    axis, K, SIZE, SIZE, np.array([[[1.0, 0, 0.3], [0, 1.0, 0.3]]])
-)[0]
+two = projection_jacobians_vjp(axis, K, SIZE, SIZE, np.array([[[1.0, 0, 0.3], [0, 1.0, 0.3]]]))[
+    0
+]
 print("through the centre", one, " through J", two.round(2))
 assert one[2] == 0.0
 assert two[2] < 0.0
@@ -375,11 +364,8 @@ assert two[2] < 0.0
 # (\Sigma + \epsilon I)^{-1}, d\Sigma \rangle$ and $v_\Sigma = v_\rho \frac{\rho}{2} (\Sigma^{-1} - (\Sigma + \epsilon
 # I)^{-1})$.
 rho = compensations(covars2d, 0.3)
-mine = (
-    0.5
-    * rho[:, None, None]
-    * (np.linalg.inv(covars2d) - np.linalg.inv(covars2d + 0.3 * np.eye(2)))
-)
+inverse, of_blurred = (np.linalg.inv(covars2d + eps * np.eye(2)) for eps in (0.0, 0.3))
+mine = 0.5 * rho[:, None, None] * (inverse - of_blurred)
 assert np.allclose(mine, compensations_vjp(covars2d, 0.3, np.ones(n)))
 
 # %% [markdown]

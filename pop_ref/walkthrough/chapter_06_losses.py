@@ -86,19 +86,12 @@ np.testing.assert_allclose(rest_l2, np.minimum(priors / 2.0, 0.8), atol=1e-9)
 fig, (left, right) = axes(2)
 left.plot(errors[1:], pull_l1[1:], color=SECOND, label="L1")
 left.plot(errors, pull_l2, color=ACCENT, label="L2")
-left.set(
-    xlabel="error of a colour",
-    ylabel="pull, in 1 / (3HW)",
-    title="pull of a loss",
-    ylim=(0.0, 2.1),
-)
+left.set(xlabel="error of a colour", ylabel="pull, in 1 / (3HW)")
+left.set(title="pull of a loss", ylim=(0.0, 2.1))
 right.plot(priors[~undecided], rest_l1[~undecided], color=SECOND, label="L1")
 right.plot(priors, rest_l2, color=ACCENT, label="L2")
-right.set(
-    xlabel=r"weight $\lambda$ of the prior",
-    ylabel="error at rest",
-    title="a splat that a prior wants opaque",
-)
+right.set(xlabel=r"weight $\lambda$ of the prior", ylabel="error at rest")
+right.set(title="a splat that a prior wants opaque")
 for ax in (left, right):
     ax.legend()
 picture(
@@ -220,14 +213,12 @@ error = image - photo
 pulls = {"L1": l1_vjp, "D-SSIM": d_ssim_vjp, "L2": l2_vjp}
 pulls = {name: vjp(image, photo, 1.0) for name, vjp in pulls.items()}
 
-fig, panels = axes(3, 2, height=4.7)
+fig, panels = axes(3, 2, height=4.7, ticks=False)
 show_image(panels[0], photo, "photograph")
 show_image(panels[1], image, "every opacity 1")
 show_image(panels[2], np.abs(error).mean(axis=2), "error", vmin=0.0)
 for ax, name in zip(panels[3:], pulls, strict=True):
     show_image(ax, np.abs(pulls[name]).mean(axis=2), f"|gradient| of {name}", vmin=0.0)
-for ax in panels:
-    ax.set(xticks=[], yticks=[])
 picture(
     fig,
     "The paper's figure 3 in small, each map scaled to its own maximum: blobs of haze, and the pull of each loss.",

@@ -124,13 +124,7 @@ mosaic = ListedColormap(
 def show_winners(ax, dominant_ids, title):
     """Draw the map of winners."""
     show_image(
-        ax,
-        dominant_ids + 1,
-        title,
-        cmap=mosaic,
-        vmin=0,
-        vmax=1000,
-        interpolation_stage="rgba",
+        ax, dominant_ids + 1, title, cmap=mosaic, vmin=0, vmax=1000, interpolation_stage="rgba"
     )
     ax.set(xticks=[], yticks=[])
 
@@ -227,12 +221,10 @@ print(f"pixels won: {over_rings.dominant_counts[0]}")
 assert signed < 1e-9 * unsigned
 assert over_rings.dominant_counts[0] > 300
 
-fig, panels = axes(3)
+fig, panels = axes(3, ticks=False)
 show_image(panels[0], rings, "photograph")
 show_image(panels[1], over_rings.image, "render: one splat")
 show_image(panels[2], np.abs(pull).mean(axis=2), "|gradient| of L2")
-for ax in panels:
-    ax.set(xticks=[], yticks=[])
 picture(
     fig,
     "Every pixel pulls, and the pulls on the splat's centre cancel. It still wins its pixels.",
@@ -254,14 +246,8 @@ camera = Camera(
     np.eye(4), np.array([[32.0, 0, 12.0], [0, 32.0, 12.0], [0, 0, 1.0]]), SMALL, SMALL
 )
 y, x = (np.indices((SMALL, SMALL)) + 0.5) / 8.0 - 1.5
-target = np.stack(
-    [
-        0.5 + 0.4 * np.sin(4 * x + 1.5 * y),
-        0.5 + 0.3 * np.cos(3 * np.hypot(x, y)),
-        0.45 - 0.2 * y,
-    ],
-    axis=2,
-)
+red, green = 0.5 + 0.4 * np.sin(4 * x + 1.5 * y), 0.5 + 0.3 * np.cos(3 * np.hypot(x, y))
+target = np.stack([red, green, 0.45 - 0.2 * y], axis=2)
 target[np.hypot(x - 0.5, y + 0.5) < 0.5] = 0.95, 0.8, 0.2
 
 config = replace(POP, theta_blur=THETA_HERE, grow_on_gradient=False)
@@ -301,15 +287,13 @@ for number in range(10):
         rows, window, 1.0, 3000, lambda k: rng.standard_normal((2, k, 3)), config
     )
 
-fig, panels = axes(5, 2, height=2.9)
+fig, panels = axes(5, 2, height=2.9, ticks=False)
 show_image(panels[4], target, "photograph")
 panels[9].axis("off")
 for column, number in enumerate((0, 3, 6, 9)):
     n, view = history[number]
     show_image(panels[column], view.image, f"{n} Gaussians")
     show_winners(panels[column + 5], view.dominant_ids, "")
-for ax in panels:
-    ax.set(xticks=[], yticks=[])
 picture(
     fig,
     "Before densification steps 1, 4, 7 and 10: the render above, and which Gaussian wins which pixel below.",

@@ -49,9 +49,7 @@ from pop_ref.walkthrough.style import ACCENT, MUCH, MUTED, SECOND, axes
 def gradients_of(opacities, offset=0.0, v_color=1.0):
     """Blend white splats at a pixel that lies `offset` px from their centres; go back."""
     n = len(opacities)
-    rows = SplatRows(
-        [[0.5 + offset, 0.5]] * n, [[0.1, 0.0, 0.1]] * n, opacities, [[1.0]] * n
-    )
+    rows = SplatRows([[0.5 + offset, 0.5]] * n, [[0.1, 0.0, 0.1]] * n, opacities, [[1.0]] * n)
     pixel = composite_pixel(range(n), rows, 0.5, 0.5, [0.0])
     totals = zero_gradients(n, 1)
     composite_pixel_vjp(pixel, rows, 0.5, 0.5, [0.0], [v_color], 0.0, totals)
@@ -78,19 +76,10 @@ fig, (left, right) = axes(2)
 seen = hidden > 0.0
 left.semilogy(layers[seen], hidden[seen], color=ACCENT)
 left.axvspan(0.99, 1.0, color=SECOND, alpha=0.35, lw=0.0)
-left.annotate(
-    "stopped",
-    (0.995, 1e-3),
-    (0.7, 1e-3),
-    color=SECOND,
-    arrowprops={"arrowstyle": "->", "color": SECOND},
-    va="center",
-)
-left.set(
-    xlabel="opacity of the two layers in front",
-    ylabel="gradient of the hidden opacity",
-    title="hidden behind two",
-)
+arrow = {"color": SECOND, "va": "center", "arrowprops": {"arrowstyle": "->", "color": SECOND}}
+left.annotate("stopped", (0.995, 1e-3), (0.7, 1e-3), **arrow)
+left.set(xlabel="opacity of the two layers in front", title="hidden behind two")
+left.set(ylabel="gradient of the hidden opacity")
 right.plot(own, np.abs(fixed), color=ACCENT, label="fixed error")
 right.plot(own, np.abs(photographed), color=SECOND, label="L2 to grey 0.3")
 right.set(xlabel="its own opacity", ylabel="pull on its centre", title="its own opacity")
@@ -301,20 +290,10 @@ for row, (name, scenes) in enumerate(runs.items()):
             scene.means, scene.scales, scene.opacities, colours, strict=True
         ):
             ax.add_patch(
-                Circle(
-                    (mean[0], mean[2]),
-                    1.5 * scale[0],
-                    fc=(*colour, o),
-                    ec=MUTED,
-                    lw=0.5,
-                )
+                Circle((mean[0], mean[2]), 1.5 * scale[0], fc=(*colour, o), ec=MUTED, lw=0.5)
             )
-        ax.set(
-            xlim=(-2, 2),
-            ylim=(-1.3, 1.3),
-            aspect="equal",
-            title=f"step {step}" if row == 0 else "",
-        )
+        ax.set(xlim=(-2, 2), ylim=(-1.3, 1.3), aspect="equal")
+        ax.set(title=f"step {step}" if row == 0 else "")
     panels[4 * row].set(ylabel=f"{name} the prior")
 picture(
     fig,
@@ -330,13 +309,7 @@ for ax, (name, scenes) in zip((left, right), runs.items(), strict=True):
         [np.histogram(scene.opacities, bins)[0] / len(scene) for scene in scenes]
     ).T
     ax.imshow(
-        shares,
-        origin="lower",
-        extent=(0, STEPS, 0, 1),
-        aspect="auto",
-        vmin=0.0,
-        vmax=0.4,
-        cmap=MUCH,
+        shares, MUCH, origin="lower", extent=(0, STEPS, 0, 1), aspect="auto", vmin=0.0, vmax=0.4
     )
     ax.set(xlabel="step", title=f"{name} the prior")
     ax.grid(False)
@@ -376,9 +349,7 @@ assert blended_with < 0.875 * blended_without
 faint = with_prior[POP_STEPS].opacities < 0.1
 view = render(with_prior[POP_STEPS], cameras[1])
 v_image = l2_vjp(view.image, photos[1], 1.0)
-assert np.any(
-    render_vjp(with_prior[POP_STEPS], cameras[1], v_image).opacities[faint] != 0.0
-)
+assert np.any(render_vjp(with_prior[POP_STEPS], cameras[1], v_image).opacities[faint] != 0.0)
 
 fig, (left, right) = axes(2, height=2.8)
 for name, colour in (("without", MUTED), ("with", ACCENT)):
@@ -409,9 +380,7 @@ print(f"it leaves {n_faint} faint Gaussians and has pruned {n_pruned}")
 assert error_with > 2.0 * error_without
 assert final_with > 10.0**0.2 * final_without
 assert n_pruned > 0 < n_faint
-assert np.allclose(
-    np.sqrt(2.0 * np.log(255.0 * np.array([0.8, 0.03]))), [3.3, 2.0], atol=0.05
-)
+assert np.allclose(np.sqrt(2.0 * np.log(255.0 * np.array([0.8, 0.03]))), [3.3, 2.0], atol=0.05)
 # what pixels went through, of what was listed for their tiles
 shares = []
 for camera in cameras:
@@ -450,9 +419,7 @@ assert unseen == [132, 132]
 # An empty sum is 0, so its mean is taken as 0; dividing by `max(n, 1)` does it without a branch.
 def prior(o, mask):
     n, rest = max(mask.sum(), 1), max((~mask).sum(), 1)
-    return np.sum(1 - o[mask]) / n + np.sum(o[~mask]) / rest, np.where(
-        mask, -1 / n, 1 / rest
-    )
+    return np.sum(1 - o[mask]) / n + np.sum(o[~mask]) / rest, np.where(mask, -1 / n, 1 / rest)
 
 
 for mask in (important, np.ones(5, dtype=bool), np.zeros(5, dtype=bool)):

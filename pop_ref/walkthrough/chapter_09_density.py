@@ -245,9 +245,7 @@ def a_start(seed, first_opacity: float | np.ndarray = 0.1):
     rng = np.random.default_rng(seed)
     hue = rng.uniform(0.1, 0.9, (6, 3))
     any_hue = rng.uniform(0.0, 1.0, (6, 3))
-    guess = np.concatenate(
-        [hue + rng.normal(0.0, 0.1, (6, 3)), any_hue, np.full((2, 3), 0.5)]
-    )
+    guess = np.concatenate([hue + rng.normal(0.0, 0.1, (6, 3)), any_hue, np.full((2, 3), 0.5)])
     true = {"who": np.arange(6), "opacities": np.full(6, 4.0), "colors": hue}
     return blended(true)[0], {
         "who": np.arange(14),
@@ -258,14 +256,9 @@ def a_start(seed, first_opacity: float | np.ndarray = 0.1):
 
 # the oracle blends and differentiates this toy in the same way
 photograph, first = a_start(0)
-splats = Splats(
-    place,
-    depth,
-    spread[:, None] ** -2.0 * [1.0, 0.0, 1.0],
-    opacities_from_logits(first["opacities"]),
-    first["colors"],
-    np.full((14, 2), 9),
-)
+conics = spread[:, None] ** -2.0 * [1.0, 0.0, 1.0]
+opacities = opacities_from_logits(first["opacities"])
+splats = Splats(place, depth, conics, opacities, first["colors"], np.full((14, 2), 9))
 lists = tile_lists(splats.means2d, splats.radii, splats.depths, WIDTH, HEIGHT, 16)
 theirs = composite(splats, lists, WIDTH, HEIGHT, 16)
 image, *chain = blended(first)
@@ -312,8 +305,7 @@ METHODS = {
     "prior": {"lambda_pop": 1e-3 * 15_000 / PRIOR_STEPS},
 }
 runs = {
-    name: [trained(seed, **how) for seed in range(N_STARTS)]
-    for name, how in METHODS.items()
+    name: [trained(seed, **how) for seed in range(N_STARTS)] for name, how in METHODS.items()
 }
 
 print("mean of the opacities at the end (pruned ones count as 0)")
@@ -325,9 +317,7 @@ for name, each in runs.items():
     ends[name] = {kind: last[:, rows].mean() for kind, rows in KINDS.items()}
     ends[name] |= {"psnr": psnr, "left": (last > 0).sum(axis=1)}
     told = "   ".join(f"{ends[name][kind]:.2f}" for kind in KINDS)
-    print(
-        f"{name:9} {'  '.join(f'{x:5.1f}' for x in psnr):24}   {told}   {ends[name]['left']}"
-    )
+    print(f"{name:9} {'  '.join(f'{x:5.1f}' for x in psnr):24}   {told}   {ends[name]['left']}")
 
 assert density.GSPLAT.reset_every == 3000
 assert density.GSPLAT.reset_opa == 0.01
@@ -362,9 +352,7 @@ for panel, (name, each) in zip(panels, runs.items(), strict=False):
     panel.set(title=f"opacities: {name}", xlabel="step", ylim=(-0.02, 1.25))
 panels[0].legend(loc="upper left", ncols=3)
 for (name, each), shade in zip(runs.items(), (INK, SECOND, ACCENT), strict=True):
-    panels[3].plot(
-        np.mean([run[0] for run in each], axis=0), color=shade, lw=1.2, label=name
-    )
+    panels[3].plot(np.mean([run[0] for run in each], axis=0), color=shade, lw=1.2, label=name)
 panels[3].set(title="mean PSNR, dB", xlabel="step")
 panels[3].legend(loc="lower right")
 picture(
@@ -409,9 +397,7 @@ picture(
 measured = {}
 for size in (24, 48):
     wish = drawn(params_of("0.3 0.0 0.6 0.6 0.9 blue"), camera_of(size)).image
-    _, v = pulled(
-        params_of("0.0 0.0 0.6 0.6 0.9 blue"), camera_of(size), wish, lambda_ssim=0.0
-    )
+    _, v = pulled(params_of("0.0 0.0 0.6 0.6 0.9 blue"), camera_of(size), wish, lambda_ssim=0.0)
     one = density.accumulate(
         density.zero_statistics(1), v.means2d, np.array([True]), np.array([1]), size, size
     )
@@ -431,14 +417,7 @@ assert abs(per_half_image - 1.0) < 0.06
 # 1110$. New rows begin with zero moments: 140 copies and 120 children, 260 less those of them that are pruned.
 clones, splits, pruned = 140, 60, 90
 assert 1000 + clones + splits - pruned == 1110
-few = density.rows_from_params(
-    {
-        "opacities": np.zeros(10),
-        "means": np.zeros((10, 3)),
-        "scales": np.zeros((10, 3)),
-        "quats": np.tile([1.0, 0.0, 0.0, 0.0], (10, 1)),
-    }
-)
+few = density.rows_from_params({"means": np.zeros((10, 3))})
 copied = density.clone_rows(few, np.arange(10) < 3)
 print(1000 + clones + splits - pruned, "Gaussians")
 assert len(copied) == 13
@@ -458,22 +437,16 @@ parent = {
     "quats": np.array([[1.0, 0.0, 0.0, 0.0]]),
     "scales": np.log([[0.4, 0.2, 0.1]]),
 }
-draws = np.random.default_rng(0)
+draws, one = np.random.default_rng(0), density.rows_from_params(parent)
 children = [
-    density.split_rows(
-        density.rows_from_params(parent), np.array([True]), draws.standard_normal((2, 1, 3))
-    ).params
+    density.split_rows(one, np.array([True]), draws.standard_normal((2, 1, 3))).params
     for _ in range(4000)
 ]
 places = np.concatenate([child["means"] for child in children])
 width = np.sqrt(np.var(places, axis=0) + np.exp(children[0]["scales"][0]) ** 2)
-print(
-    "mixture / parent:",
-    (width / [0.4, 0.2, 0.1]).round(3),
-    " predicted",
-    round(np.sqrt(1 + 1 / 1.6**2), 3),
-)
-assert np.allclose(width / [0.4, 0.2, 0.1], np.sqrt(1 + 1 / 1.6**2), rtol=0.03)
+ratio, predicted = width / [0.4, 0.2, 0.1], np.sqrt(1 + 1 / 1.6**2)
+print("mixture / parent:", ratio.round(3), " predicted", round(predicted, 3))
+assert np.allclose(ratio, predicted, rtol=0.03)
 
 # %% [markdown]
 # ### Exercise 4: predict
@@ -486,9 +459,7 @@ assert np.allclose(width / [0.4, 0.2, 0.1], np.sqrt(1 + 1 / 1.6**2), rtol=0.03)
 # the answer that it looks for.
 guided, haze = np.repeat([0.5, 0.3, 0.1], [6, 6, 2]), {}
 for name, start in (("guided", guided), ("all at 0.5", 0.5)):
-    each = [
-        trained(seed, **METHODS["prior"], first_opacity=start) for seed in range(N_STARTS)
-    ]
+    each = [trained(seed, **METHODS["prior"], first_opacity=start) for seed in range(N_STARTS)]
     last = np.array([np.nan_to_num(run[1][-1]) for run in each])
     haze[name] = last[:, KINDS["haze"]].mean()
     print(

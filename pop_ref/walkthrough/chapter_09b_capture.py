@@ -136,8 +136,7 @@ assert {"cameras.bin", "images.bin", "points3D.bin"} <= {Path(each).name for eac
 at, depths = pixels_of(view, capture.points)
 # mix-ups of the first table: OpenGL's axes show what is behind, the inverse another view, a corner a shifted one
 open_gl, inverse = (
-    replace(view, viewmat=pose)
-    for pose in (flip @ view.viewmat, np.linalg.inv(view.viewmat))
+    replace(view, viewmat=pose) for pose in (flip @ view.viewmat, np.linalg.inv(view.viewmat))
 )
 by_corner = replace(view, K=view.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]))
 assert np.allclose(pixels_of(open_gl, capture.points)[1], -depths)
@@ -147,19 +146,16 @@ inside = (depths > 0) & np.all((at > 0) & (at < [view.width, view.height]), axis
 print(f"{len(capture.points)} points, {inside.sum()} of them in photograph 0,", end=" ")
 print(f"at depths {depths[inside].min():.1f} to {depths[inside].max():.1f}")
 
-fig, (left, right) = axes(2, height=2.9, width_ratios=[1.25, 1])
+fig, (left, right) = axes(2, height=2.9, ticks=False, width_ratios=[1.25, 1])
 show_image(left, view.image / 255.0, "photograph 0 and the points")
 left.scatter(*at[inside].T, s=5, c=ACCENT, lw=0)
-left.set(xticks=[], yticks=[], xlim=(0, view.width), ylim=(view.height, 0))
+left.set(xlim=(0, view.width), ylim=(view.height, 0))
 right.scatter(*capture.points[:, :2].T, s=3, c=capture.points_rgb / 255.0, lw=0)
 for k, each in enumerate(capture.views):
     forward = each.viewmat[2, :3]
     right.plot(*each.camera_center[:2], "o", ms=4, color=SECOND if k == 0 else INK)
-    right.arrow(
-        *each.camera_center[:2], *(0.25 * forward[:2]), color=MUTED, head_width=0.04
-    )
-right.set(aspect="equal", xticks=[], yticks=[], title="from above")
-right.grid(False)
+    right.arrow(*each.camera_center[:2], *(0.25 * forward[:2]), color=MUTED, head_width=0.04)
+right.set(aspect="equal", title="from above")
 picture(
     fig,
     "Left: where the points fall in a photograph. Right: the points and the cameras; orange took it.",
@@ -197,9 +193,7 @@ assert np.isclose(capture.scene_scale(), 1.1 * radius)
 squared = np.sum((capture.points[:, None] - capture.points) ** 2, axis=2)
 # the nearest to a point is the point itself
 widths = np.sqrt(np.sort(squared, axis=1)[:, 1:4].mean(axis=1))
-print(
-    f"widths: median {np.median(widths):.3f}, from {widths.min():.3f} to {widths.max():.3f}"
-)
+print(f"widths: median {np.median(widths):.3f}, from {widths.min():.3f} to {widths.max():.3f}")
 
 
 def first_scene(factor=1.0, opacity=0.1):
@@ -219,12 +213,10 @@ K = view.K * [[0.5], [0.5], [1.0]]
 half = Camera(view.viewmat, K, 40, 30)
 grey = np.full(3, 0.6)
 drawn = {factor: render(first_scene(factor), half, grey) for factor in (0.25, 1.0, 3.0)}
-fig, panels = axes(4, height=1.7)
+fig, panels = axes(4, height=1.7, ticks=False)
 show_image(panels[0], view.image / 255.0, "photograph")
 for panel, (factor, each) in zip(panels[1:], drawn.items(), strict=True):
     show_image(panel, each.image, f"widths × {factor:g}")
-for panel in panels:
-    panel.set(xticks=[], yticks=[])
 picture(
     fig,
     "The first Gaussians with a quarter of these widths, with them, and with three times as much.",
@@ -251,13 +243,8 @@ assert light == sorted(light, reverse=True)
 # the pose has no pixels in it and stays.
 wrong = render(first_scene(), Camera(view.viewmat, view.K, 40, 30), grey).image
 full = render(first_scene(), Camera(view.viewmat, view.K, 80, 60), grey).image
-print(
-    "the same as a quarter of the whole view:",
-    np.allclose(wrong, full[:30, :40], atol=0.05),
-)
-assert (
-    np.abs(wrong - full[:30, :40]).mean() < 0.01 < np.abs(wrong - drawn[1.0].image).mean()
-)
+print("the same as a quarter of the whole view:", np.allclose(wrong, full[:30, :40], atol=0.05))
+assert np.abs(wrong - full[:30, :40]).mean() < 0.01 < np.abs(wrong - drawn[1.0].image).mean()
 
 # %% [markdown]
 # ### Exercise 2: derive
@@ -298,9 +285,7 @@ def look_at(eye, target, up):
     return viewmat
 
 
-mine = look_at(
-    np.array([2.0, 1.0, 1.5]), np.array([0.0, 0.0, 0.3]), np.array([0.0, 0.0, 1.0])
-)
+mine = look_at(np.array([2.0, 1.0, 1.5]), np.array([0.0, 0.0, 0.3]), np.array([0.0, 0.0, 1.0]))
 middle, above = (
     mine[:3, :3] @ point + mine[:3, 3] for point in ([0.0, 0.0, 0.3], [0.0, 0.0, 0.6])
 )

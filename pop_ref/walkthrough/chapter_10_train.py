@@ -106,10 +106,9 @@ points = np.concatenate([good, stray])
 capture = Capture("two balls", tuple(views), points, rgb.astype(np.uint8), "made up")
 assert len(capture.test_views(test_every=5)) == 2
 
-fig, panels = axes(5, height=1.7)
+fig, panels = axes(5, height=1.7, ticks=False)
 for i, panel in enumerate(panels):
     show_image(panel, photographs[i] / 255.0, f"{i:02}.png" + (" *" if i % 5 == 0 else ""))
-    panel.set(xticks=[], yticks=[])
 picture(fig, "Five of the ten. Every fifth, starred, is held out: no step sees it.")
 
 # %% [markdown]
@@ -311,17 +310,8 @@ print(*sorted(path.name for path in report.parent.iterdir() if path != report))
 scene, out = str(home / "scene"), str(home / "demo")
 with redirect_stdout(io.StringIO()) as said:
     made = command(["demo", scene, "--views", "16", "--width", "96", "--height", "72"])
-    asked = [
-        "--out",
-        out,
-        "--steps-scaler",
-        "0.1",
-        "--pop.blur-min-pixels",
-        "10",
-        "--max-steps",
-        "500",
-    ]
-    trained = command(["train", scene, *asked])
+    asked = ["--steps-scaler", "0.1", "--pop.blur-min-pixels", "10", "--max-steps", "500"]
+    trained = command(["train", scene, "--out", out, *asked])
 assert (made, trained) == (0, 0)
 print(*[line for line in said.getvalue().splitlines() if line.startswith("PSNR")], sep="\n")
 held_out = sorted((home / "demo" / "report_data").glob("val_step*_0000.npz"))[-1]
@@ -332,16 +322,13 @@ wrong = np.mean(np.abs(render - photo), axis=2)
 corners = [wrong[i : i + 70, j : j + 94] for i in range(3) for j in range(3)]
 blocks = np.mean(corners, axis=0)
 y, x = np.array(np.unravel_index(blocks.argmax(), blocks.shape)) + 1
-print(
-    f"the worst: column {x}, row {y}; error {wrong[y, x]:.2f}, on average {wrong.mean():.3f}"
-)
+print(f"the worst: column {x}, row {y}; error {wrong[y, x]:.2f}, on average {wrong.mean():.3f}")
 
-fig, panels = axes(3, height=2.1)
+fig, panels = axes(3, height=2.1, ticks=False)
 show_image(panels[0], photo, "photograph, held out")
 show_image(panels[1], render, "render")
 show_image(panels[2], wrong, "absolute error", vmin=0, vmax=0.4)
 for panel in panels:
-    panel.set(xticks=[], yticks=[])
     panel.plot(x + 0.5, y + 0.5, "o", ms=11, mfc="none", mec=SECOND, mew=1.6)
 picture(fig, "A view that no step has seen, and the pixel that is furthest off.")
 

@@ -102,14 +102,12 @@ for k in ids:
         wanted, skipped = alpha_from_sigma(sigma, splats.opacities[k])
         assert abs(alpha[k, j] - (0.0 if skipped else wanted)) < 1e-12
 
-fig, panels = axes(7, height=1.5)
+fig, panels = axes(7, height=1.5, ticks=False)
 names = ("$1$", "$x$", "$y$", "$x^2$", "$xy$", "$y^2$")
 for panel, row, name in zip(panels, P, names, strict=False):
     most = np.abs(row).max()
     show_image(panel, row.reshape(TILE, TILE), name, vmin=-most, vmax=most, cmap=DIVERGING)
 show_image(panels[6], alpha[6].reshape(TILE, TILE), "alpha of one", vmin=0, vmax=1)
-for panel in panels:
-    panel.set(xticks=[], yticks=[])
 picture(
     fig,
     "The six rows of $P$ as pictures of the tile. Every exponent is a weighted sum of these six; the last panel is "

@@ -82,14 +82,13 @@ assert len(visible) < len(MUTANTS) / 2
 
 shown = ("xyzw", "jacobian_sign", "low_pass_after_inversion", "half_pixel_shift")
 shown += ("background_not_scaled", "seen_from_behind", "edge_exact_splat_dropped")
-fig, panels = axes(4, 4, height=6.2)
+fig, panels = axes(4, 4, height=6.2, ticks=False)
 show_image(panels[0], true.image, "the oracle")
 panels[4].axis("off")
 for place, name in zip((1, 2, 3, 8, 9, 10, 11), shown, strict=True):
     show_image(panels[place], views[name].image, name.replace("_", " "))
     show_image(panels[place + 4], off[name], vmin=0.0, vmax=0.5)
 for panel in panels:
-    panel.set(xticks=[], yticks=[])
     panel.title.set_fontsize(7.5)
 picture(
     fig,
@@ -180,8 +179,7 @@ assert broken.sum() < 0.25 * broken.size
 # %%
 print(f"{len(MUTANTS)} mutants, {len(every_law())} laws; * was tried above\n")
 of_files = {
-    mutant.file: [other for other in MUTANTS if other.file == mutant.file]
-    for mutant in MUTANTS
+    mutant.file: [other for other in MUTANTS if other.file == mutant.file] for mutant in MUTANTS
 }
 for mutant in (same[0] for same in of_files.values()):
     law = mutant.law.partition(":")[2].replace("_", " ")
@@ -246,9 +244,7 @@ screen = Camera(np.eye(4), K, WIDTH, HEIGHT)
 one = Scene(pack([Record(6.0, 12.0, 2.0, (3.0, 3.0, 3.0), opacity=1.0)], screen), screen)
 for name in ("weight_above_one", "tie_to_the_back", "extent_of_three_deviations"):
     with living(BY_NAME[name]) as backend:
-        differs = np.abs(
-            backend.render(one).image - OracleAdapter().render(one).image
-        ).max()
+        differs = np.abs(backend.render(one).image - OracleAdapter().render(one).image).max()
     print(f"{name:28} {differs:.4f}")
     assert (differs > 0) == (name == "extent_of_three_deviations")
 

@@ -67,16 +67,18 @@ def picture(figure: Figure, caption: str) -> None:
 
 def _show_in_notebook(figure: Figure, caption: str) -> None:
     """Show a figure and its caption where this runs in Jupyter, which alone has both modules and a kernel."""
-    jupyter, shown = (
-        sys.modules.get("ipykernel.zmqshell"),
-        sys.modules.get("IPython.display"),
-    )
+    jupyter = sys.modules.get("ipykernel.zmqshell")
+    shown = sys.modules.get("IPython.display")
     if jupyter is None or shown is None or not jupyter.ZMQInteractiveShell.initialized():
         return
+    width = round(100 * float(figure.get_size_inches()[0]))
+    shown.display(shown.Image(_png(figure), width=width), shown.Markdown(caption))
+
+
+def _png(figure: Figure) -> bytes:
     png = io.BytesIO()
     figure.savefig(png, format="png", dpi=_DPI, facecolor="white")
-    width = round(100 * float(figure.get_size_inches()[0]))
-    shown.display(shown.Image(png.getvalue(), width=width), shown.Markdown(caption))
+    return png.getvalue()
 
 
 def film(
@@ -100,19 +102,16 @@ def film(
         )
         return
     shown = [round(float(k)) for k in np.linspace(0, len(images) - 1, min(5, len(images)))]
-    figure, panels = style.axes(len(shown), height=7.2 / len(shown))
+    figure, panels = style.axes(len(shown), height=7.2 / len(shown), ticks=False)
     for panel, k in zip(np.atleast_1d(panels), shown, strict=True):
         style.show_image(panel, images[k], labels[k])
-        panel.set(xticks=[], yticks=[])
     picture(figure, caption)
 
 
 def _enlarged(image: np.ndarray, times: int) -> bytes:
     file = io.BytesIO()
     plt.imsave(
-        file,
-        np.clip(image, 0.0, 1.0).repeat(times, axis=0).repeat(times, axis=1),
-        format="png",
+        file, np.clip(image, 0.0, 1.0).repeat(times, axis=0).repeat(times, axis=1), format="png"
     )
     return file.getvalue()
 
@@ -130,15 +129,11 @@ def run_chapter(chapter: Chapter) -> list[Outcome]:
         ChapterError: a cell raised; the message names the chapter's file, the line and the error.
     """
     style.apply()
-    outcomes = []
     with _module(chapter.module) as namespace:
-        for cell in chapter.cells:
-            outcomes.append(
-                Outcome(cell)
-                if cell.kind == "prose"
-                else _run_cell(chapter, cell, namespace)
-            )
-    return outcomes
+        return [
+            Outcome(cell) if cell.kind == "prose" else _run_cell(chapter, cell, namespace)
+            for cell in chapter.cells
+        ]
 
 
 @contextmanager
@@ -187,11 +182,7 @@ def _drawn(figure: Figure, caption: str) -> Picture:
     # no date and a fixed salt: the same chapter makes the same bytes
     with plt.rc_context({"svg.hashsalt": "walk-through"}):
         svg = io.StringIO()
-        figure.savefig(
-            svg, format="svg", dpi=_DPI, transparent=True, metadata={"Date": None}
-        )
+        figure.savefig(svg, format="svg", dpi=_DPI, transparent=True, metadata={"Date": None})
     if len(svg.getvalue()) <= _LARGEST_SVG:
         return Picture(svg.getvalue(), None, width, caption)
-    png = io.BytesIO()
-    figure.savefig(png, format="png", dpi=_DPI, facecolor="white")
-    return Picture(None, png.getvalue(), width, caption)
+    return Picture(None, _png(figure), width, caption)

@@ -78,6 +78,7 @@ def axes(
     n_rows: int = 1,
     width: float = 7.2,
     height: float | None = None,
+    ticks: bool = True,
     **options: Any,
 ) -> tuple[Figure, Any]:
     """Make a figure as wide as the page's text and axes on it.
@@ -87,6 +88,7 @@ def axes(
         n_rows: rows of panels.
         width: inches; 7.2 fills the page.
         height: inches, default 0.95 of a panel's width per row, at most 3.2.
+        ticks: False for pictures, whose axes need no numbers.
         options: passed to `plt.subplots`, for example `sharey=True` or `width_ratios=[2, 1]`.
 
     Returns:
@@ -95,7 +97,8 @@ def axes(
     apply()
     panel = min(0.95 * width / n_columns, 3.2)
     size = (width, panel * n_rows if height is None else height)
-    figure, panels = plt.subplots(n_rows, n_columns, figsize=size, **options)
+    bare = {} if ticks else {"subplot_kw": {"xticks": [], "yticks": []}}
+    figure, panels = plt.subplots(n_rows, n_columns, figsize=size, **bare, **options)
     return figure, panels.ravel() if isinstance(panels, np.ndarray) else panels
 
 

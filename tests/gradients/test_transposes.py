@@ -55,13 +55,12 @@ def central_gradient(f: Callable[[np.ndarray], float], x: np.ndarray, step: floa
     """
     gradient = np.zeros_like(x)
     for index in np.ndindex(*x.shape):
-        h = step * max(1.0, abs(float(x[index])))
-        values: dict[int, float] = {}
+        h, values = step * max(1.0, abs(float(x[index]))), list[float]()
         for k in (-2, -1, 1, 2):
             moved = x.copy()
             moved[index] += k * h
-            values[k] = f(moved)
-        gradient[index] = (8.0 * (values[1] - values[-1]) - (values[2] - values[-2])) / (12.0 * h)
+            values.append(f(moved))
+        gradient[index] = (8.0 * (values[2] - values[1]) - (values[3] - values[0])) / (12.0 * h)
     return gradient
 
 

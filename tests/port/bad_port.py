@@ -51,26 +51,23 @@ def main(mode: str) -> None:
             sys.exit("out of memory, says the port")
         if mode == "hangs":
             time.sleep(1000)
-        if mode == "refuses":
-            write("error harmonics are not for me")
-        elif mode == "babbles":
-            write("image follows", *image)
-        elif mode == "has no end":
+        if mode == "has no end":
             sys.stdout.buffer.write(b"ok" * 50000)
             sys.stdout.buffer.flush()
-        elif mode == "stops halfway":
-            write("ok image T_final dominant_ids", *image[1:])
+            continue
+        whole = "ok image T_final dominant_ids"
+        answers = {
+            "refuses": ("error harmonics are not for me",),
+            "babbles": ("image follows", *image),
+            "stops halfway": (whole, *image[1:]),
+            "forgets": ("ok image", *image),
+            "invents": (f"{whole} colour", *image, *T, *ids, *image),
+            "splits": (whole, *image, *T, *[0.5] * pixels),
+            "says more": (whole, *image, *T, *ids, 0.0),
+        }
+        write(*answers.get(mode, (whole, *image, *T, *ids)))
+        if mode == "stops halfway":
             sys.exit(3)
-        elif mode == "forgets":
-            write("ok image", *image)
-        elif mode == "invents":
-            write("ok image T_final dominant_ids colour", *image, *T, *ids, *image)
-        elif mode == "splits":
-            write("ok image T_final dominant_ids", *image, *T, *[0.5] * pixels)
-        elif mode == "says more":
-            write("ok image T_final dominant_ids", *image, *T, *ids, 0.0)
-        else:
-            write("ok image T_final dominant_ids", *image, *T, *ids)
 
 
 main(" ".join(sys.argv[1:]))

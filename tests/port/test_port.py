@@ -7,6 +7,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -46,24 +47,28 @@ def bad(mode: str, timeout: float = 30.0) -> ProgramAdapter:
     return ProgramAdapter(f"{sys.executable} -S -E {HERE / 'bad_port.py'} {mode}", timeout)
 
 
-def judged(folder: Path, *options: str, profile: str = "dev") -> subprocess.CompletedProcess[str]:
-    """Run the kit as its users do."""
+def judged(
+    folder: Path, program: str, stages: Sequence[str] = (), *options: str, profile: str = "dev"
+) -> subprocess.CompletedProcess[str]:
+    """Run the kit on a program as its users do."""
     environment = {**os.environ, "HYPOTHESIS_PROFILE": profile, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--pyargs", "pop_ref.conformance"]
-    return subprocess.run(
-        [*command, *options], capture_output=True, text=True, cwd=folder, env=environment, check=False
-    )
+    command += ["--program", program, *(word for stage in stages for word in ("--stage", stage)), *options]
+    return subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment, check=False)
+
+
+def n_passed(done: subprocess.CompletedProcess[str]) -> int:
+    """Read how many laws held."""
+    return int(done.stdout.split(" passed")[0].split()[-1])
 
 
 @pytest.mark.slow  # it compiles a port
 @pytest.mark.parametrize("words", ["", "double splats"])
 def test_a_port_in_cpp_obeys_the_laws_of_images_and_gradients(port: Path, tmp_path: Path, words: str) -> None:
     stages = ("alpha", "compositing", "dominance", "gradients", "whole")
-    chosen = (word for stage in stages for word in ("--stage", stage))
-    done = judged(tmp_path, "--program", f"{port} {words}", *chosen)
+    done = judged(tmp_path, f"{port} {words}", stages)
     assert done.returncode == 0, done.stdout
-    passed = int(done.stdout.split(" passed")[0].split()[-1])
-    assert passed >= 60, done.stdout
+    assert n_passed(done) >= 60, done.stdout
 
 
 @pytest.mark.parametrize(
@@ -80,12 +85,9 @@ def test_the_port_of_the_page_obeys_the_laws_of_images_and_a_broken_one_does_not
     code = page.partition("```js\n")[2].partition("```")[0]
     assert right in code
     (tmp_path / "port.js").write_text(code.replace(right, wrong) if right else code, encoding="utf-8")
-    stages = ("compositing", "dominance", "whole")
-    done = judged(
-        tmp_path, "--program", f"{node} port.js", *(w for s in stages for w in ("--stage", s)), profile="quick"
-    )
+    done = judged(tmp_path, f"{node} port.js", ("compositing", "dominance", "whole"), profile="quick")
     assert done.returncode == status, done.stdout
-    assert int(done.stdout.split(" passed")[0].split()[-1]) >= (30 if status == 0 else 1), done.stdout
+    assert n_passed(done) >= (30 if status == 0 else 1), done.stdout
 
 
 def oracle_port(*broken: str) -> str:
@@ -96,11 +98,10 @@ def oracle_port(*broken: str) -> str:
 @pytest.mark.slow  # most laws, through a pipe
 def test_losses_density_control_adam_and_calls_with_several_cameras_cross_a_pipe_without_loss(tmp_path: Path) -> None:
     stages = ("losses", "density", "optimizer", "signature", "gradients")
-    words = (word for stage in stages for word in ("--stage", stage))
-    done = judged(tmp_path, "--program", oracle_port(), *words, "-rs", profile="quick")
+    done = judged(tmp_path, oracle_port(), stages, "-rs", profile="quick")
     assert done.returncode == 0, done.stdout
     # packed rows, and what only meta tells, are skipped
-    assert int(done.stdout.split(" passed")[0].split()[-1]) >= 90, done.stdout
+    assert n_passed(done) >= 90, done.stdout
     assert "refuses the request call rasterization: covariances are not supported" in done.stdout
 
 
@@ -122,7 +123,7 @@ def test_losses_density_control_adam_and_calls_with_several_cameras_cross_a_pipe
 def test_a_program_with_one_wrong_function_breaks_a_law_about_it(
     tmp_path: Path, broken: str, stage: str, law: str
 ) -> None:
-    done = judged(tmp_path, "--program", oracle_port(broken), "--stage", stage, "-x", "-k", law, profile="quick")
+    done = judged(tmp_path, oracle_port(broken), [stage], "-x", "-k", law, profile="quick")
     assert done.returncode == 1, done.stdout
     assert law in done.stdout
 
@@ -250,8 +251,7 @@ def test_exact_lists_of_the_kernels_own_tiles_change_no_bit_of_the_image(port: P
 @pytest.mark.slow  # most laws, through a pipe
 def test_a_black_port_breaks_laws_and_is_skipped_by_name_for_what_it_lacks(tmp_path: Path) -> None:
     command = f"{sys.executable} -S -E {HERE / 'bad_port.py'} black"
-    words = ("--program", command, "--stage", "compositing", "--stage", "gradients", "-rs")
-    done = judged(tmp_path, *words, profile="quick")
+    done = judged(tmp_path, command, ("compositing", "gradients"), "-rs", profile="quick")
     assert done.returncode == 1
     assert "bad has no gradients" in done.stdout
     assert "failed" in done.stdout
@@ -260,10 +260,7 @@ def test_a_black_port_breaks_laws_and_is_skipped_by_name_for_what_it_lacks(tmp_p
 @pytest.mark.parametrize(
     ("mode", "words"),
     [
-        (
-            "ends",
-            "ended with status 1 before it had answered render, waiting for a line; it wrote to .* error: out of",
-        ),
+        ("ends", "ended with status 1 before it had answered render, waiting for a line; it wrote to .* error: out of"),
         ("refuses", "refuses the request render: harmonics are not for me"),
         ("babbles", "answers 'image follows', which begins neither with ok nor with error"),
         ("stops halfway", "ended with status 3 before it had answered render, waiting for the"),
@@ -317,7 +314,7 @@ def test_a_wrong_greeting_is_refused(mode: str, words: str) -> None:
 
 
 def test_a_program_that_is_not_there_is_a_usage_error(tmp_path: Path) -> None:
-    done = judged(tmp_path, "--program", "./no-such-port")
+    done = judged(tmp_path, "./no-such-port")
     assert done.returncode == 4
     assert "program ./no-such-port cannot be started" in done.stderr + done.stdout
 

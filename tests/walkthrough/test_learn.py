@@ -43,6 +43,11 @@ SOLUTIONS = tomllib.loads((Path(__file__).parent / "solutions.toml").read_text(e
 WRONG, RIGHT = SOLUTIONS["wrong"], SOLUTIONS["right"]
 
 
+def functions_in(text: str) -> dict[str, ast.FunctionDef]:
+    """Return the functions of a module's text by name."""
+    return {node.name: node for node in ast.parse(text).body if isinstance(node, ast.FunctionDef)}
+
+
 def oracles_text(name: str) -> str:
     """Write the oracle's own code of a stage in one file."""
     future = "from __future__ import annotations\n"
@@ -80,14 +85,10 @@ def mine(started: Path, tmp_path: Path) -> Path:
 def test_the_stubs_are_thirteen_modules_with_the_oracles_names_signatures_and_no_bodies(mine: Path) -> None:
     assert len(COURSE) == 13 == len(list(mine.glob("*.py")))
     for stage in COURSE:
-        found = {n.name: n for n in ast.parse((mine / stage.file).read_text()).body if isinstance(n, ast.FunctionDef)}
+        found = functions_in((mine / stage.file).read_text())
         assert tuple(found) == stage.names
         for module, names in stage.functions.items():
-            oracle = {
-                n.name: n
-                for n in ast.parse((ORACLE / f"{module}.py").read_text()).body
-                if isinstance(n, ast.FunctionDef)
-            }
+            oracle = functions_in((ORACLE / f"{module}.py").read_text())
             for name in names:
                 assert ast.dump(found[name].args) == ast.dump(oracle[name].args)
                 docstring = ast.get_docstring(found[name]) or ""
@@ -121,11 +122,10 @@ def test_who_writes_what_the_oracle_writes_passes_and_a_stub_is_not_judged(mine:
 
 def _solution(stage: Stage, code: str) -> str:
     """Write a stage as the oracle does, but for the functions that some code defines."""
-    names = {node.name for node in ast.parse(code).body if isinstance(node, ast.FunctionDef)}
-    text = oracles_text(stage.name)
+    names, text = functions_in(code), oracles_text(stage.name)
     lines = text.splitlines(keepends=True)
-    for node in reversed(ast.parse(text).body):
-        if isinstance(node, ast.FunctionDef) and node.name in names:
+    for name, node in reversed(functions_in(text).items()):
+        if name in names:
             del lines[node.lineno - 1 : node.end_lineno]
     future = "from __future__ import annotations\n"
     return "".join(lines).replace(future, f"{future}import math\nimport numpy as np\n", 1) + code
@@ -134,9 +134,8 @@ def _solution(stage: Stage, code: str) -> str:
 def _mistaken(stage: Stage, name: str, old: str, new: str) -> str:
     """Write a stage as the oracle does, but for one piece of one function's body."""
     text = oracles_text(stage.name)
-    node = next(each for each in ast.parse(text).body if isinstance(each, ast.FunctionDef) and each.name == name)
-    lines = text.splitlines(keepends=True)
-    body = "".join(lines[node.body[1].lineno - 1 : node.end_lineno])
+    node = functions_in(text)[name]
+    body = "".join(text.splitlines(keepends=True)[node.body[1].lineno - 1 : node.end_lineno])
     assert body.count(old) == 1, (name, old)
     return text.replace(body, body.replace(old, new))
 

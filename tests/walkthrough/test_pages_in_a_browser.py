@@ -518,9 +518,6 @@ def test_a_browser_that_does_not_answer_leaves_no_pipe_open(tmp_path: Path, monk
     # it ends at once
     monkeypatch.setattr(browser, "find_chromium", lambda: shutil.which("true"))
     before = set(os.listdir("/proc/self/fd"))
-    with (
-        pytest.raises((AssertionError, BrokenPipeError), match=r"ended|Broken pipe"),
-        browser.browser(tmp_path),
-    ):
+    with pytest.raises((AssertionError, BrokenPipeError), match=r"ended|Broken pipe"), browser.browser(tmp_path):
         pass
     assert set(os.listdir("/proc/self/fd")) == before

@@ -18,9 +18,7 @@ import numpy as np
 import pytest
 
 from pop_ref import alpha, camera, covariance, dominance, footprint, harmonics, losses, pixel, projection
-from pop_ref.camera import covars_cam_from_covars, means_cam_from_means
 from pop_ref.constants import PAPER
-from pop_ref.covariance import covars_from_quats_scales
 from pop_ref.density import (
     DensityConfig,
     Rows,
@@ -30,13 +28,10 @@ from pop_ref.density import (
     rows_from_params,
     zero_statistics,
 )
-from pop_ref.footprint import compensations, conics_from_covars2d, low_pass, radii_from_covars2d
-from pop_ref.harmonics import colors_from_sh, sh_basis
 from pop_ref.learn import splat
 from pop_ref.optimizer import adam_step
 from pop_ref.pixel import SplatRows, composite_pixel, composite_pixel_vjp, zero_gradients
 from pop_ref.polarization import pop_loss_vjp
-from pop_ref.projection import project_covars, project_means, projection_jacobians
 from pop_ref.records import Camera
 from pop_ref.render import render, render_vjp
 from pop_ref.training import gaussians_from_params, params_vjp
@@ -80,6 +75,11 @@ def _agree(name: str, drawn: list[list[Any]], truth: Callable[..., Any], relativ
         assert np.allclose(got, want, rtol=relative, atol=relative * np.max(np.abs(want), initial=1e-300))
 
 
+def _one(function: Callable[..., np.ndarray], *fixed: Any) -> Callable[..., Any]:
+    """Let a function of N rows take one, whose last arguments are these whatever it is given."""
+    return lambda *given: function(*(np.array([each]) for each in given[: len(given) - len(fixed)]), *fixed)[0]
+
+
 def _covars2d(rng: np.random.Generator) -> np.ndarray:
     M = rng.standard_normal((N, 2, 2)) * rng.uniform(0.1, 4, (N, 1, 2))
     covars2d = M @ M.swapaxes(1, 2)
@@ -118,20 +118,12 @@ def test_the_splat_on_the_screen() -> None:
     covars2d = _covars2d(rng).tolist()
     blurred = [[each, float(eps)] for each, eps in zip(covars2d, rng.uniform(0.05, 2, N), strict=True)]
 
-    def one(function: Callable[..., np.ndarray]) -> Callable[..., Any]:
-        return lambda covar2d, *rest: function(np.array([covar2d]), *rest)[0].tolist()
-
-    _agree("low_pass", blurred, one(footprint.low_pass))
-    _agree("compensations", blurred, one(footprint.compensations), 1e-12)
-    _agree("conics_from_covars2d", [[each] for each in covars2d], one(footprint.conics_from_covars2d))
+    _agree("low_pass", blurred, lambda covar2d, eps: footprint.low_pass(np.array([covar2d]), eps)[0])
+    _agree("compensations", blurred, lambda covar2d, eps: footprint.compensations(np.array([covar2d]), eps)[0], 1e-12)
+    _agree("conics_from_covars2d", [[each] for each in covars2d], _one(footprint.conics_from_covars2d))
     opacities = rng.choice([0.0, 1 / 256, PAPER.alpha_floor, 0.02, 0.3, 0.99, 1.0], N)
     told = [[covar2d, float(o)] for covar2d, o in zip(covars2d, opacities, strict=True)]
-    _agree(
-        "radii_from_covars2d",
-        told,
-        lambda covar2d, o: footprint.radii_from_covars2d(np.array([covar2d]), np.array([o]))[0].tolist(),
-        0.0,
-    )
+    _agree("radii_from_covars2d", told, _one(footprint.radii_from_covars2d), 0.0)
 
 
 def _pixels(rng: np.random.Generator) -> list[list[Any]]:
@@ -148,20 +140,16 @@ def _pixels(rng: np.random.Generator) -> list[list[Any]]:
     return drawn
 
 
-def _rows(rows: dict[str, Any]) -> pixel.SplatRows:
-    return pixel.SplatRows(rows["means2d"], rows["conics"], rows["opacities"], rows["colors"])
-
-
 def test_one_pixel_and_the_way_back() -> None:
     rng = np.random.default_rng(2)
     drawn = _pixels(rng)
 
     def forward(ids: list[int], rows: dict[str, Any], px: float, py: float, background: list[float]) -> list[Any]:
-        p = pixel.composite_pixel(ids, _rows(rows), px, py, background)
+        p = pixel.composite_pixel(ids, pixel.SplatRows(**rows), px, py, background)
         return [p.color, p.T_final, p.ids, p.alphas, p.transmittances, p.weights, p.n_traversed]
 
     _agree("composite_pixel", drawn, forward)
-    found = [pixel.composite_pixel(each[0], _rows(each[1]), *each[2:]) for each in drawn]
+    found = [pixel.composite_pixel(each[0], pixel.SplatRows(**each[1]), *each[2:]) for each in drawn]
     assert {len(p.ids) < p.n_traversed for p in found} == {True, False}
     # the light of an opaque wall is what rounding left of 1 - alpha
     assert min(p.T_final for p in found) < 2e-3
@@ -178,7 +166,7 @@ def test_one_pixel_and_the_way_back() -> None:
     def backward(p: dict[str, Any], rows: dict[str, Any], *rest: Any) -> list[Any]:
         kept = pixel.Pixel(*(p[name] for name in pixel.Pixel._fields))
         totals = pixel.zero_gradients(len(rows["opacities"]), 3)
-        pixel.composite_pixel_vjp(kept, _rows(rows), *rest, totals)
+        pixel.composite_pixel_vjp(kept, pixel.SplatRows(**rows), *rest, totals)
         return [totals.v_opacities, totals.v_colors, totals.v_background]
 
     ours = _run("composite_pixel_vjp", back)
@@ -220,21 +208,18 @@ def test_from_the_world_to_the_screen() -> None:
     clamped = np.abs(jacobians[:, 0, 2] + 270 * means_cam[:, 0] / means_cam[:, 2] ** 2) > 1e-6
     assert 0.1 < clamped.mean() < 0.9
 
-    def one(function: Callable[..., np.ndarray], *fixed: Any) -> Callable[..., Any]:
-        return lambda *given: function(*(np.array([each]) for each in given[: len(given) - len(fixed)]), *fixed)[0]
-
     def rows(*columns: np.ndarray, fixed: tuple[Any, ...] = ()) -> list[list[Any]]:
         return [[*(column[i].tolist() for column in columns), *fixed] for i in range(N)]
 
-    _agree("rotmats_from_quats", rows(quats), one(covariance.rotmats_from_quats))
-    _agree("covars_from_quats_scales", rows(quats, scales), one(covariance.covars_from_quats_scales))
+    _agree("rotmats_from_quats", rows(quats), _one(covariance.rotmats_from_quats))
+    _agree("covars_from_quats_scales", rows(quats, scales), _one(covariance.covars_from_quats_scales))
     view = (viewmat.tolist(),)
-    _agree("means_cam_from_means", rows(means_cam, fixed=view), one(camera.means_cam_from_means, viewmat))
-    _agree("covars_cam_from_covars", rows(covars, fixed=view), one(camera.covars_cam_from_covars, viewmat))
+    _agree("means_cam_from_means", rows(means_cam, fixed=view), _one(camera.means_cam_from_means, viewmat))
+    _agree("covars_cam_from_covars", rows(covars, fixed=view), _one(camera.covars_cam_from_covars, viewmat))
     pinhole = (K.tolist(), 320, 240)
-    _agree("project_means", rows(means_cam, fixed=pinhole), one(projection.project_means, K, 320, 240))
-    _agree("projection_jacobians", rows(means_cam, fixed=pinhole), one(projection.projection_jacobians, K, 320, 240))
-    _agree("project_covars", rows(covars, jacobians), one(projection.project_covars), 1e-12)
+    _agree("project_means", rows(means_cam, fixed=pinhole), _one(projection.project_means, K, 320, 240))
+    _agree("projection_jacobians", rows(means_cam, fixed=pinhole), _one(projection.projection_jacobians, K, 320, 240))
+    _agree("project_covars", rows(covars, jacobians), _one(projection.project_covars), 1e-12)
 
 
 def test_harmonics_and_their_colours() -> None:
@@ -248,12 +233,7 @@ def test_harmonics_and_their_colours() -> None:
         assert np.allclose(ours, harmonics.sh_basis(units, degree), rtol=1e-13, atol=1e-15)
     sh = rng.standard_normal((N, 16, 3))
     drawn = [[sh[i].tolist(), dirs[i].tolist(), 3] for i in range(N)]
-    _agree(
-        "colors_from_sh",
-        drawn,
-        lambda c, d, degree: harmonics.colors_from_sh(np.array([c]), np.array([d]), degree)[0],
-        1e-12,
-    )
+    _agree("colors_from_sh", drawn, _one(harmonics.colors_from_sh, 3), 1e-12)
 
 
 def _told(camera: Camera) -> dict[str, Any]:
@@ -425,17 +405,17 @@ def test_a_splat_tells_its_edge_its_extent_and_what_blur_does_to_its_paint(
     page, eps2d = _shown("splat2d", *doings), 0.3
     shown = page["readings"]
     covar2d = _covar2d(long, short, 23)
-    blurred = low_pass(covar2d, eps2d)
+    blurred = footprint.low_pass(covar2d, eps2d)
     k = np.sqrt(2.0 * np.log(255.0 * opacity))
     assert shown["edge (1/255)"] == f"at {k:.2f} deviations"
-    radii = radii_from_covars2d(blurred, np.array([opacity]))[0]
+    radii = footprint.radii_from_covars2d(blurred, np.array([opacity]))[0]
     assert shown["extent"] == f"{2 * radii[0]} × {2 * radii[1]} px"
     # paint is the integral of alpha: 2 pi o sqrt(det), so a splat of 0.1 px has 31 times as much of it after the blur
     paint = np.sqrt(np.linalg.det(blurred[0]) / np.linalg.det(covar2d[0]))
     assert shown["paint after blur, 1/ρ"] == f"× {paint:.2f}"
-    assert shown["ρ, antialiased mode only"] == f"{compensations(covar2d, eps2d)[0]:.3f}"
+    assert shown["ρ, antialiased mode only"] == f"{footprint.compensations(covar2d, eps2d)[0]:.3f}"
     assert (paint > 30.0) == (long == 0.1)
-    conic = conics_from_covars2d(blurred)[0].tolist()
+    conic = footprint.conics_from_covars2d(blurred)[0].tolist()
     sigma = 0.5 * np.array([-5.4, -3.1]) @ np.linalg.inv(blurred[0]) @ [-5.4, -3.1]
     assert shown["its exponent σ"] == f"{sigma:.3f}"
     value, skipped = alpha.alpha_from_sigma(sigma, opacity)
@@ -453,22 +433,17 @@ def _orbit_truth(distance: float, sideways: float) -> tuple[np.ndarray, np.ndarr
     """Project the widget's Gaussian and very many of its points; return the ellipse's half-axes, the points' sides."""
     (ca, sa), (ce, se) = ((np.cos(a), np.sin(a)) for a in (0.6, 0.35))
     viewmat = np.array(
-        [
-            [ca, 0, -sa, sideways * distance],
-            [-sa * se, ce, -ca * se, 0],
-            [sa * ce, se, ca * ce, distance],
-            [0, 0, 0, 1],
-        ]
+        [[ca, 0, -sa, sideways * distance], [-sa * se, ce, -ca * se, 0], [sa * ce, se, ca * ce, distance], [0, 0, 0, 1]]
     )
     K = np.array([[270.0, 0, 160], [0, 270, 120], [0, 0, 1]])
-    covars = covars_from_quats_scales(np.array([[0.85, 0.3, 0.1, 0.45]]), np.array([[0.9, 0.35, 0.2]]))
-    covars_cam = covars_cam_from_covars(covars, viewmat)
-    mean_cam = means_cam_from_means(np.zeros((1, 3)), viewmat)
-    covar2d = project_covars(covars_cam, projection_jacobians(mean_cam, K, 320, 240))[0]
+    covars = covariance.covars_from_quats_scales(np.array([[0.85, 0.3, 0.1, 0.45]]), np.array([[0.9, 0.35, 0.2]]))
+    covars_cam = camera.covars_cam_from_covars(covars, viewmat)
+    mean_cam = camera.means_cam_from_means(np.zeros((1, 3)), viewmat)
+    covar2d = projection.project_covars(covars_cam, projection.projection_jacobians(mean_cam, K, 320, 240))[0]
     points = np.random.default_rng(3).multivariate_normal(mean_cam[0], covars_cam[0], 100_000)
-    cloud = project_means(points[points[:, 2] > PAPER.near_plane], K, 320, 240)
+    cloud = projection.project_means(points[points[:, 2] > PAPER.near_plane], K, 320, 240)
     lambdas, directions = np.linalg.eigh(covar2d)
-    along = (cloud - project_means(mean_cam, K, 320, 240)[0]) @ directions[:, ::-1]
+    along = (cloud - projection.project_means(mean_cam, K, 320, 240)[0]) @ directions[:, ::-1]
     return np.sqrt(lambdas[::-1]), np.quantile(along, [0.16, 0.84], axis=0).T
 
 
@@ -494,12 +469,12 @@ def test_the_globe_shows_what_the_cameras_around_it_see() -> None:
     base = np.zeros((1, 16, 3))
     towards = np.array([[-0.35, 0.45, np.sqrt(1 - 0.35**2 - 0.45**2)]])
     fading = np.repeat([1.1, 0.95, 0.7, 0.4], [1, 3, 5, 7])
-    base[0] = (fading * sh_basis(towards, 3)[0])[:, None] - np.where(np.arange(16) == 0, 0.9, 0.0)[:, None]
+    base[0] = (fading * harmonics.sh_basis(towards, 3)[0])[:, None] - np.where(np.arange(16) == 0, 0.9, 0.0)[:, None]
     base[0, 0] += [-0.5, 0.1, 1.0]
     shown = _shown("harmonics")
     # the camera in front looks along +z
     assert shown["readings"]["direction d, camera to Gaussian"] == "(0.00, 0.00, 1.00)"
-    front = colors_from_sh(base, np.array([[0.0, 0.0, 1.0]]), 3)[0]
+    front = harmonics.colors_from_sh(base, np.array([[0.0, 0.0, 1.0]]), 3)[0]
     assert np.allclose(_numbers(shown["readings"]["colour that it sees, c(d)"]), front, atol=0.006)
     globe = next(each for each in shown["canvases"] if each["width"] == 220)
     pixels = np.reshape(globe["data"], (220, 220, 4)) / 255.0
@@ -507,7 +482,7 @@ def test_the_globe_shows_what_the_cameras_around_it_see() -> None:
         # a camera to the right of the Gaussian looks to the left
         inwards = np.array([[-right, -down, np.sqrt(1 - right**2 - down**2)]])
         at = pixels[round(110 + 107 * down - 0.5), round(110 + 107 * right - 0.5), :3]
-        assert np.allclose(at, np.minimum(colors_from_sh(base, inwards, 3)[0], 1.0), atol=0.03), (right, down)
+        assert np.allclose(at, np.minimum(harmonics.colors_from_sh(base, inwards, 3)[0], 1.0), atol=0.03), (right, down)
     turned = _shown(
         "harmonics",
         ("key", "globe of the cameras around a Gaussian; drag or use the arrow keys to turn it", "ArrowRight"),
@@ -523,7 +498,7 @@ def test_even_harmonics_are_the_same_from_opposite_sides() -> None:
     at /= np.linalg.norm(at, axis=1, keepdims=True)
     sign = np.repeat([1.0, -1.0, 1.0, -1.0], [1, 3, 5, 7])
     assert "(even)" in WIDGETS["harmonics"].prompt
-    assert np.allclose(sh_basis(-at, 3), sign * sh_basis(at, 3))
+    assert np.allclose(harmonics.sh_basis(-at, 3), sign * harmonics.sh_basis(at, 3))
 
 
 @pytest.mark.parametrize("shifts", [0, 1, 2])

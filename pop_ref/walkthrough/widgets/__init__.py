@@ -96,9 +96,7 @@ def html(name: str) -> str:
 
 def mathematics(*files: str) -> str:
     """Read the pure functions of files in `math/`, with the constants that they use in front."""
-    constants = {
-        key: value for key, value in asdict(PAPER).items() if isinstance(value, float)
-    }
+    constants = {key: value for key, value in asdict(PAPER).items() if isinstance(value, float)}
     return "\n".join(
         [
             f"const PAPER = {json.dumps(constants)};",
@@ -112,9 +110,7 @@ def _script(name: str, widget: Widget) -> str:
     text = mathematics(*widget.worker) if widget.worker else ""
     file = f"{name}_worker.js"
     worker = (
-        f"const WORKER = {json.dumps(text + _text(file))};"
-        if (FOLDER / file).exists()
-        else ""
+        f"const WORKER = {json.dumps(text + _text(file))};" if (FOLDER / file).exists() else ""
     )
     if name == "python":
         splat = (FOLDER.parents[1] / "learn" / "splat.py").read_text(encoding="utf-8")
@@ -127,13 +123,7 @@ def _script(name: str, widget: Widget) -> str:
         f"for (const root of document.querySelectorAll('.pop-widget[data-widget=\"{name}\"][hidden]')) "
         f"{{ root.hidden = false; {name}(root); }}"
     )
-    parts = (
-        mathematics(*widget.needs),
-        _text("kit.js"),
-        worker,
-        _text(f"{name}.js"),
-        start,
-    )
+    parts = (mathematics(*widget.needs), _text("kit.js"), worker, _text(f"{name}.js"), start)
     return "(() => {\n" + "\n".join(part for part in parts if part) + "\n})();"
 
 
