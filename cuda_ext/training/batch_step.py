@@ -39,18 +39,18 @@ from cuda_ext.arrays import (
 from cuda_ext.render.lists import Capacity, Size
 from cuda_ext.training.step_buffers import (
     FrameBuffers,
+    KernelStatistics,
     ResidentViews,
     RowBuffers,
     Rows,
     Shared,
     SplatBuffers,
-    rows_of,
 )
 from cuda_ext.training.step_program import DrawProgram, gaussians, pop_term, regularizers, schedule, update, view_of
-from pop_fast.train.steps import Collected, Phase, StepSettings
 
 if TYPE_CHECKING:
     from pop_fast.train.ranks import Ranks
+    from pop_fast.train.steps import Phase, StepSettings
 
 # rows that a stretch is made of: a warp's, whose pieces of 16 bytes lie alike wherever it begins
 STRETCH: Final = 32
@@ -156,10 +156,10 @@ class BatchTrainer:
         own = slice(self._first, last)
         with torch.cuda.device_of(params["means"]):
             waits = params["shN"].shape[1] if self.settings.updates.sh_rest_every > 1 else None
-            self.statistics = Collected.zeros(n, self.device, waits)
+            self.statistics = KernelStatistics.zeros(n, self.device, waits)
             self._whole = [dict(group) for group in (params, m, v)]
             own_params, own_m, own_v = ({key: tensor[own] for key, tensor in group.items()} for group in self._whole)
-            own_rows = RowBuffers.make(own_params, own_m, own_v, rows_of(self.statistics, own))
+            own_rows = RowBuffers.make(own_params, own_m, own_v, self.statistics.rows(own))
             self._of_place = [self._seen_by_a_view(own_rows) for _ in range(self.n_views)]
             self._counts = torch.zeros(len(own_rows), dtype=torch.int32, device=self.device)
             self._gradients = {key: torch.zeros_like(tensor) for key, tensor in own_params.items()}

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -17,16 +17,42 @@ from torch import Tensor
 from cuda_ext import load
 from cuda_ext.arrays import STEP, VIEW, Settings, empty, fill, new_state, stream_of
 from cuda_ext.render.lists import LOWER, Size, TileBuffers, list_tile, splat_struct
-from pop_fast.train.steps import Collected, StepSettings
+
+if TYPE_CHECKING:
+    from pop_fast.train.steps import StepSettings
 
 Rows = Mapping[str, Tensor]
 MARGIN = 5  # px, half of SSIM's window
 FEWER = "the photographs' size or number"
 
 
-def rows_of(statistics: Collected, own: slice) -> Collected:
-    """Return some rows, in the same memory."""
-    return Collected(**{name: of[own] for name, of in vars(statistics).items() if of is not None})
+@dataclass
+class KernelStatistics:
+    """What the kernels collect, one entry a Gaussian, until new rows come.
+
+    `sh_rest_sum` is Adam's, of the same life: gradients that wait for their update; None where none do. [N, n_rest, 3]
+    """
+
+    grad_sum: Tensor
+    n_visible: Tensor
+    dominant_sum: Tensor
+    blurred: Tensor
+    sh_rest_sum: Tensor | None = None
+
+    @classmethod
+    def zeros(cls, n: int, device: torch.device, n_rest: int | None = None) -> KernelStatistics:
+        """Start from nothing; `n_rest` bands' gradients wait, None for none."""
+        visible, dominant = (torch.zeros(n, dtype=torch.int32, device=device) for _ in range(2))
+        flags = torch.zeros(n, dtype=torch.uint8, device=device)
+        waiting = None if n_rest is None else torch.zeros((n, n_rest, 3), device=device)
+        return cls(torch.zeros(n, device=device), visible, dominant, flags, waiting)
+
+    def rows(self, own: slice) -> KernelStatistics:
+        """Return some rows, in the same memory."""
+        waiting = None if self.sh_rest_sum is None else self.sh_rest_sum[own]
+        return KernelStatistics(
+            self.grad_sum[own], self.n_visible[own], self.dominant_sum[own], self.blurred[own], waiting
+        )
 
 
 @dataclass(frozen=True)
@@ -141,13 +167,13 @@ class RowBuffers:
     params: Rows
     m: Rows
     v: Rows
-    statistics: Collected
+    statistics: KernelStatistics
     drawn: SplatBuffers
     pop_sides: Tensor
     pop_sums: Tensor
 
     @classmethod
-    def make(cls, params: Rows, m: Rows, v: Rows, statistics: Collected) -> RowBuffers:
+    def make(cls, params: Rows, m: Rows, v: Rows, statistics: KernelStatistics) -> RowBuffers:
         """Allocate what belongs to the rows but for the statistics."""
         kernels, n, device = load(), len(params["means"]), params["means"].device
         return cls(
@@ -267,9 +293,7 @@ class ResidentViews:
             what, lower = "the photographs' blurred values", f"{FEWER}, or use cache_moments=False"
             self._moments = [empty(what, lower, (6, h, w), device) for w, h in self.sizes]
             self._tables["moments"] = self._table(self._moments)
-            # kernels run on the current device, which need not be the photographs'
-            with torch.cuda.device_of(self.viewmats):
-                self._fill_moments()
+            self._fill_moments()
 
     def fetch(self, view: int) -> None:
         """Have a photograph on the device when what is asked of its current stream from now on runs.
@@ -332,6 +356,11 @@ class ResidentViews:
         return torch.tensor([tensor.data_ptr() for tensor in tensors], dtype=torch.int64, device=self.device)
 
     def _fill_moments(self) -> None:
+        # kernels run on the current device, which need not be the photographs'
+        with torch.cuda.device_of(self.viewmats):
+            self._launch_moments()
+
+    def _launch_moments(self) -> None:
         kernels, state = load(), new_state(self.device)
         settings = fill(kernels.LossSettings(), margin=self._margin)
         for k, (width, height) in enumerate(self.sizes):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
@@ -10,8 +10,10 @@ from cuda_ext import load
 from cuda_ext.arrays import SideStream, fill, pointer, stream_of
 from cuda_ext.render.lists import Size, count_instances
 from cuda_ext.training.step_buffers import MARGIN, FrameBuffers, RowBuffers, Rows, Shared, SplatBuffers
-from pop_fast.train.steps import Phase, StepSettings
 from pop_ref.settings import PARAMETERS
+
+if TYPE_CHECKING:
+    from pop_fast.train.steps import Phase, StepSettings
 
 
 class DrawProgram:

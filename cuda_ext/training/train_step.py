@@ -13,15 +13,18 @@ import gc
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from cuda_ext.arrays import BAD_ROW, N_INSTANCES, NOT_BAD, OVERFLOW, STEP, VIEW
 from cuda_ext.render.lists import Capacity, Size, TileBuffers
-from cuda_ext.training.step_buffers import FrameBuffers, ResidentViews, RowBuffers, Shared
+from cuda_ext.training.step_buffers import FrameBuffers, KernelStatistics, ResidentViews, RowBuffers, Shared
 from cuda_ext.training.step_program import StepProgram
-from pop_fast.train.steps import Collected, Phase, StepSettings
+
+if TYPE_CHECKING:
+    from pop_fast.train.steps import Phase, StepSettings
 
 LATE = 2  # steps between an overflow and its notice
 
@@ -77,7 +80,7 @@ class FusedTrainer:
         self._capacity.settle(len(params["means"]))
         with torch.cuda.device_of(params["means"]):
             waits = params["shN"].shape[1] if self.settings.updates.sh_rest_every > 1 else None
-            self._rows = RowBuffers.make(params, m, v, Collected.zeros(len(params["means"]), self.device, waits))
+            self._rows = RowBuffers.make(params, m, v, KernelStatistics.zeros(len(params["means"]), self.device, waits))
 
     def run(self, until: int, phase: Phase) -> None:
         """Take steps until the counter stands at `until`, all of one phase.
@@ -86,22 +89,25 @@ class FusedTrainer:
             ValueError: a Gaussian is no longer finite; the message names its row and step.
             CudaMemoryError: no room to grow.
         """
-        watch = self._watch
         with torch.cuda.device_of(self._shared.state):
-            while self.step < until or watch:
-                if self.step < until:
-                    view = self._order[self.step]
-                    self.views.fetch(view)
-                    self._take(self.views.sizes[view], phase)
-                    watch.post()
-                    self.step += 1
-                    if len(watch) <= LATE and self.step < until:
-                        continue
-                values = watch.take()
-                if values[BAD_ROW] == NOT_BAD and values[OVERFLOW] == 0:
-                    self._capacity.note(values[VIEW], values[N_INSTANCES])
-                else:
-                    self.step = self._recover()
+            self._run(until, phase)
+
+    def _run(self, until: int, phase: Phase) -> None:
+        watch = self._watch
+        while self.step < until or watch:
+            if self.step < until:
+                view = self._order[self.step]
+                self.views.fetch(view)
+                self._take(self.views.sizes[view], phase)
+                watch.post()
+                self.step += 1
+                if len(watch) <= LATE and self.step < until:
+                    continue
+            values = watch.take()
+            if values[BAD_ROW] == NOT_BAD and values[OVERFLOW] == 0:
+                self._capacity.note(values[VIEW], values[N_INSTANCES])
+            else:
+                self.step = self._recover()
 
     def step_stats(self, first: int, last: int) -> list[list[float]]:
         """Return the measurements of the steps from `first` to before `last`, which `run` must have taken here.
@@ -128,7 +134,7 @@ class FusedTrainer:
         return self._population.params
 
     @property
-    def statistics(self) -> Collected:
+    def statistics(self) -> KernelStatistics:
         """What density control reads; zeros after `rebind`."""
         return self._population.statistics
 
@@ -147,6 +153,11 @@ class FusedTrainer:
         """What the last step drew, by the kernels' names."""
         return self._population.drawn.splats
 
+    @property
+    def radii(self) -> Tensor:
+        """Extents of the last step's splats, px, 0 where culled. [N, 2] int32"""
+        return self.splats["radii"]
+
     def lists(self) -> dict[Size, TileBuffers]:
         """Return the tile lists of the last step at every image size that was drawn since `rebind`."""
         return {size: frame.lists for size, frame in self._frames.items()}
@@ -157,6 +168,11 @@ class FusedTrainer:
         How many splats it blended and visited is among it where `settings.counts` asked for that.
         """
         return {size: frame.render_stats for size, frame in self._frames.items()}
+
+    @property
+    def capacities(self) -> dict[Size, int]:
+        """How many list entries have room, by the image sizes that were drawn since `rebind`."""
+        return {size: frame.lists.capacity for size, frame in self._frames.items()}
 
     @property
     def _population(self) -> RowBuffers:
@@ -181,11 +197,14 @@ class FusedTrainer:
 
     def _take(self, size: Size, phase: Phase) -> None:
         kind = self._kinds.get((size, phase))
-        if kind is None or not self.settings.replay:
-            if kind is None:
-                # the first step of a kind is launched as it is, which loads its kernels
-                program = StepProgram(self._shared, self._population, self._frame(size), phase)
-                kind = self._kinds[size, phase] = _Kind(program)
+        if kind is None:
+            # the first step of a kind is launched as it is, which loads its kernels
+            kind = self._kinds[size, phase] = _Kind(
+                StepProgram(self._shared, self._population, self._frame(size), phase)
+            )
+            kind.program.launch()
+            return
+        if not self.settings.replay:
             kind.program.launch()
             return
         # with many sizes most kinds come once between two densification steps, and a capture takes longer than a step
