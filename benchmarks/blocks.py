@@ -19,12 +19,14 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from benchmarks.record import machine, markdown, read_json, write_json
 from pop_fast.children import module_command
+from pop_fast.view.report.source import read_last_stats
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results" / "blocks.json"
@@ -39,7 +41,7 @@ def run(words: Sequence[str], folder: Path, note: Path) -> dict[str, float]:
         folder: of results.
         note: where the seconds of earlier calls stand.
     """
-    spent = json.loads(note.read_text()) if note.exists() else {"clock": 0.0, "processor": 0.0}
+    spent = read_json(note) or {"clock": 0.0, "processor": 0.0}
     if spent.get("done"):
         return spent
     again = ["--resume"] if (folder / "cfg.json").is_file() else []
@@ -77,13 +79,7 @@ def train_on(whole: Path, steps: int, folder: Path) -> dict[str, Any]:
         capture, config = open_capture(splat, CaptureOptions())
         after = replace(refining(config, steps), result_dir=str(folder), seed=config.seed + 1)
         TrainingRun(after, capture, initial=splat.params, overwrite=True).run()
-    return stats_of(folder)
-
-
-def stats_of(folder: Path) -> dict[str, Any]:
-    """Read the statistics of a run's last step."""
-    last = max((folder / "stats").glob("val_step*.json"), key=lambda path: (len(path.name), path.name))
-    return json.loads(last.read_text(encoding="utf-8"))
+    return read_last_stats(folder)
 
 
 def numbers(stats: dict[str, Any]) -> dict[str, Any]:
@@ -114,8 +110,8 @@ def main(words: list[str], say: Callable[[str], None] = print) -> int:
         "merged": run([*in_blocks, "0"], blocks, work / "blocks.json"),
         "rounds": run([*in_blocks, args.rounds], blocks, work / "rounds.json"),
     }
-    rounds = stats_of(blocks)["rounds"][1:]
-    more = len(rounds) * json.loads((blocks / "blocks" / "job.json").read_text(encoding="utf-8"))["round_steps"]
+    rounds = read_last_stats(blocks)["rounds"][1:]
+    more = len(rounds) * read_json(blocks / "blocks" / "job.json")["round_steps"]
     write(args, whole, blocks, spent, train_on(whole, more, work / "longer"))
     say(table(args.out))
     return 0
@@ -125,10 +121,7 @@ def write(
     args: argparse.Namespace, whole: Path, blocks: Path, spent: dict[str, dict[str, float]], longer: dict[str, Any]
 ) -> None:
     """Write what the runs came to."""
-    sys.path.insert(0, str(HERE))
-    from record import machine, write_json
-
-    merged, one = stats_of(blocks), stats_of(whole)
+    merged, one = read_last_stats(blocks), read_last_stats(whole)
     parts = [
         {
             **{key: part[key] for key in ("name", "training_views", "held_out_views", "points", "background_points")},
@@ -138,7 +131,7 @@ def write(
         }
         for part in merged["blocks"]
     ]
-    found, job = merged["rounds"], json.loads((blocks / "blocks" / "job.json").read_text(encoding="utf-8"))
+    found, job = merged["rounds"], read_json(blocks / "blocks" / "job.json")
     times = {name: {key: value for key, value in each.items() if key != "done"} for name, each in spent.items()}
     result = {
         "machine": machine(),
@@ -170,7 +163,7 @@ def write(
 
 def table(path: Path = RESULTS) -> str:
     """Make the table of docs/using.md."""
-    found = json.loads(path.read_text(encoding="utf-8"))
+    found = read_json(path)
     whole, merged = found["whole"], found["merged"]
     views = f"{found['held_out_views']} of the whole"
     rows = [["the whole", "all", f"{whole['gaussians']:,}", "", *_measured(whole, views)]]
@@ -184,17 +177,12 @@ def table(path: Path = RESULTS) -> str:
     for number, each in enumerate(found["rounds"], start=1):
         rows.append([f"**after round {number}**", "", f"{each['gaussians']:,}", "", *_measured(each, views)])
     head = ["", "training views", "Gaussians", "kept", "held-out views", "PSNR", "SSIM", "peak memory"]
-    return _table(head, ["---", "---:", "---:", "---:", "---", "---:", "---:", "---:"], rows)
+    return markdown(head, rows, ["---", "---:", "---:", "---:", "---", "---:", "---:", "---:"])
 
 
 def _measured(row: dict[str, Any], views: str) -> list[str]:
-    if row["psnr"] is None:
-        return [views, "", "", f"{row['peak_gib'] * 2**30 / 1e9:.2f} GB"]
-    return [views, f"{row['psnr']:.2f} dB", f"{row['ssim']:.4f}", f"{row['peak_gib'] * 2**30 / 1e9:.2f} GB"]
-
-
-def _table(head: Sequence[str], rule: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, rule, *rows))
+    quality = ["", ""] if row["psnr"] is None else [f"{row['psnr']:.2f} dB", f"{row['ssim']:.4f}"]
+    return [views, *quality, f"{row['peak_gib'] * GIB / 1e9:.2f} GB"]
 
 
 if __name__ == "__main__":

@@ -14,6 +14,8 @@ from torch import Tensor
 
 from pop_fast.data.capture import Capture, View
 
+VIEWS = 6  # of a capture
+
 
 @dataclass(frozen=True)
 class Case:
@@ -39,24 +41,18 @@ RASTER_CASES = (
     Case("270x480-40k", 40_000, 270, 480),
     Case("640x480-100k", 100_000, 640, 480),
 )
-
-
 MEMORY_CASE = Case("1600x1000-300k", 300_000, 1600, 1000)
-
-
 STEP_CASES = (*RASTER_CASES, MEMORY_CASE)
-
-
 GATE_CASE = Case("gate", 40, 37, 29, 6.0)
 
 
-def gaussians_of(case: Case, dtype: torch.dtype = torch.float32, seed: int = 0) -> dict[str, Tensor]:
+def gaussians_of(case: Case, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
     """Draw a scene: centres fill the frustum, sizes are log-normal and shrink as the scene gets denser.
 
     Returns:
         The arguments of `rasterization`, third-degree harmonics as colours.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     focal = 0.9 * max(case.width, case.height)
     z = rng.uniform(2.0, 6.0, case.n)
     x = rng.uniform(-0.6, 0.6, case.n) * case.width / focal * z
@@ -75,13 +71,13 @@ def gaussians_of(case: Case, dtype: torch.dtype = torch.float32, seed: int = 0) 
     return {name: torch.tensor(value, dtype=dtype) for name, value in given.items()}
 
 
-def capture_of(case: Case, views: int = 6, seed: int = 0) -> Capture:
+def capture_of(case: Case) -> Capture:
     """Make a capture whose sparse points start training with `case.n` Gaussians; its photographs are smooth noise."""
-    rng = np.random.default_rng(seed)
-    scene = gaussians_of(case, torch.float64, seed)
+    rng = np.random.default_rng(0)
+    scene = gaussians_of(case, torch.float64)
     K = scene["Ks"][0].numpy()
     made: list[View] = []
-    for i in range(views):
+    for i in range(VIEWS):
         coarse = torch.tensor(rng.uniform(0.0, 255.0, (1, 3, case.height // 16 + 2, case.width // 16 + 2)))
         smooth = torch.nn.functional.interpolate(coarse, (case.height, case.width), mode="bicubic").clamp(0.0, 255.0)
         viewmat = np.eye(4)
@@ -114,13 +110,13 @@ def turns(runs: Mapping[str, Callable[[], Any]], repeats: int, warm_up: int = 3)
     return taken
 
 
-def turns_ms(runs: Mapping[str, Callable[[], Any]], repeats: int, warm_up: int = 3) -> dict[str, float]:
+def turns_ms(runs: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
     """Time calls in turns as `turns` does; the first is what the others are compared with.
 
     Returns:
         The median of each, ms, and as "b / a" the median of the ratios within a turn.
     """
-    names, taken = list(runs), turns(runs, repeats, warm_up)
+    names, taken = list(runs), turns(runs, repeats)
     found = {name: 1e3 * statistics.median(times) for name, times in taken.items()}
     for name in names[1:]:
         found[f"{name} / {names[0]}"] = median_ratio(taken[name], taken[names[0]])

@@ -23,10 +23,7 @@ from tempfile import TemporaryDirectory
 from types import SimpleNamespace
 from typing import Any, Final
 
-if __package__ in (None, ""):
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from benchmarks.record import machine, read_json, write_json
+from benchmarks.record import machine, markdown, read_json, write_json
 from pop_fast.children import module_command
 from pop_fast.cli import train
 from pop_fast.train import automatic
@@ -88,18 +85,16 @@ def train_by_processor_time(words: list[str]) -> int:
 
 def table_of(known: Mapping[str, Any]) -> str:
     """Lay the rows of a JSON file out: what was foretold, what came, and the ratio of the times."""
-    lines = [
-        "| capture, `--minutes` | px, steps | time: predicted, taken | ratio | Gaussians | GB of memory |",
-        "| --- | --- | --- | ---: | --- | --- |",
-    ]
+    rows = []
     for name, row in known.items():
         if name == "machine":
             continue
         said, came = row["foretold"], row["came"]
-        times = f"{said['seconds']:.0f} s, {came['seconds']:.0f} s | {came['seconds'] / said['seconds']:.2f}"
-        counts = f"{said['gaussians']:,}, {came['gaussians']:,} | {said['memory']:.1f}, {came['memory']:.1f}"
-        lines.append(f"| {name} | {row['size']}, {row['steps']:,} | {times} | {counts} |")
-    return "\n".join(lines)
+        times = [f"{said['seconds']:.0f} s, {came['seconds']:.0f} s", f"{came['seconds'] / said['seconds']:.2f}"]
+        counts = [f"{said['gaussians']:,}, {came['gaussians']:,}", f"{said['memory']:.1f}, {came['memory']:.1f}"]
+        rows.append([name, f"{row['size']}, {row['steps']:,}", *times, *counts])
+    head = ["capture, `--minutes`", "px, steps", "time: predicted, taken", "ratio", "Gaussians", "GB of memory"]
+    return markdown(head, rows, ["---", "---", "---", "---:", "---", "---"])
 
 
 def main(words: list[str] | None = None) -> int:

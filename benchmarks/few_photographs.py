@@ -51,15 +51,14 @@ FEWEST_SEEN: Final = 2
 COLUMNS: Final = ("psnr", "cc_psnr", "ssim", "gaussians", "seconds")
 
 
-def left_of(capture: Capture, count: int | None, test_every: int = 8) -> Capture:
+def left_of(capture: Capture, count: int | None) -> Capture:
     """Leave so many of the training photographs, and the points that they would have given.
 
     Args:
-        capture: any.
+        capture: any; the same views stay held out.
         count: of photographs; None leaves every other one.
-        test_every: as `Capture.test_views`; the same ones stay held out.
     """
-    held_out, given = capture.test_views(test_every), capture.train_views(test_every)
+    held_out, given = capture.test_views(), capture.train_views()
     chosen = np.linspace(0, len(given) - 1, min(count or len(given) // 2, len(given))).round().astype(int)
     kept = [given[i] for i in chosen]
     seen = [view.seen for view in kept if view.seen is not None]
@@ -98,11 +97,10 @@ def disturbed(capture: Capture, gains: float, turned: float) -> Capture:
 
 def config_of(setting: str, steps: int, seed: int, data: Path, folder: str) -> TrainConfig:
     """Read the options of a setting, over preset quick of so many steps."""
-    words = [] if setting == "plain" else shlex.split(setting)
-    method = "pop"
+    words, method = [] if setting == "plain" else shlex.split(setting), "pop"
     if "--method" in words:
         at = words.index("--method")
-        method = words[at + 1]
+        _, method = words[at : at + 2]
         del words[at : at + 2]
     said = TrainConfig.from_options(words, method=method, preset="quick").given
     settings = {} if said is None else said.settings

@@ -21,11 +21,12 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import torch
-from gpu_predictions import Card, Loads, floors, measured_card
+from gpu_predictions import Card, Loads, elapsed_ms, floors, measured_card
 from gpu_scenes import CASES, FULL_SIZE, TINY, GpuCase, scenes
 from gpu_visits import count_tried, count_visits
 from torch import Tensor
@@ -87,12 +88,7 @@ def whole_step(scene: dict[str, Tensor], photograph: Tensor, steps: int, **setti
     found: dict[str, float] = {}
     for k, (name, phase) in enumerate({"step_with_pop_ms": POP, "step_ms": PLAIN}.items()):
         trainer.run((2 * k + 1) * steps, phase)
-        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-        start.record()
-        trainer.run((2 * k + 2) * steps, phase)
-        end.record()
-        end.synchronize()
-        found[name] = start.elapsed_time(end) / steps
+        found[name] = elapsed_ms(partial(trainer.run, (2 * k + 2) * steps, phase)) / steps
     return found
 
 
@@ -111,14 +107,14 @@ def step_loads(trainer: FusedTrainer) -> Loads:
     longest = tiles.view(tiles.shape[0], 8, -1, 16).amax((1, 3))
     return Loads(
         trainer.n,
-        int((trainer.radii > 0).all(1).sum()),
+        int((trainer.splats["radii"] > 0).all(1).sum()),
         trainer.n_instances,
         int(longest.long().sum()) * 16 * 8,
         int(stats["n_blended"].long().sum()),
         width * height,
         int(longest.max()),
         *count_visits(trainer.lists()[size], trainer.splats, stats["n_traversed"]),
-        count_tried(trainer.splats["means2d"], trainer.radii, width, height),
+        count_tried(trainer.splats["means2d"], trainer.splats["radii"], width, height),
     )
 
 
@@ -223,15 +219,7 @@ def timed(run: Callable[[], Any]) -> float:
     """Return the median time of a run in ms."""
     for _ in range(WARM_UP):
         run()
-    times: list[float] = []
-    for _ in range(REPEATS):
-        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-        start.record()
-        run()
-        end.record()
-        end.synchronize()
-        times.append(start.elapsed_time(end))
-    return statistics.median(times)
+    return statistics.median(elapsed_ms(run) for _ in range(REPEATS))
 
 
 def draw(function: Callable[..., Any], scene: dict[str, Any], case: GpuCase, **options: Any) -> Any:

@@ -23,10 +23,10 @@ whose warp issues one instruction a cycle when the others are done.
 
 from __future__ import annotations
 
-import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -87,7 +87,7 @@ PARAMETERS = 59  # floats of a Gaussian
 GEOMETRY = 11  # of these, what a culled Gaussian is read for
 HALF_RATE = ("compare", "integer")  # classes of instructions, by the tables of arithmetic throughput for sm_90
 WARP, SCHEDULERS = 32, 4
-SASS = json.loads((Path(__file__).resolve().parent / "results" / "sass.json").read_text(encoding="utf-8"))
+SASS = read_json(NOTES.parent / "results" / "sass.json")
 # what a POP step launches
 FORWARD, BACKWARD = "blend_forward_kernel<3, 1, false>", "columns_kernel<3, false, false, false>"
 COUNT, EMIT = "count_kernel", "emit_kernel<unsigned short>"
@@ -103,17 +103,13 @@ def an_iteration(kernel: dict[str, Any]) -> str:
     found: list[str] = []
     # an update has a loop over slots too, and much besides
     units = ("visit", "step", "8 visits", "16 slots", "32 slots", "32 records")
-    told = () if kernel["kernel"].startswith("update") else units
-    for unit in told:
+    for unit in () if kernel["kernel"].startswith("update") else units:
         # what is unrolled has several loops of one unit
-        spans = [[loop[name] / loop["iterations"] for name in ("always", "all")] for loop in kernel["loops"]]
-        spans = [span for span, loop in zip(spans, kernel["loops"], strict=True) if loop["per"] == unit]
-        if spans:
-            least, most = min(span[0] for span in spans), max(span[1] for span in spans)
+        if loops := [loop for loop in kernel["loops"] if loop["per"] == unit]:
+            least = min(loop["always"] / loop["iterations"] for loop in loops)
+            most = max(loop["all"] / loop["iterations"] for loop in loops)
             found.append(f"{most:.0f} per {unit}" if most - least < 1.5 else f"{least:.0f} to {most:.0f} per {unit}")
-    if found:
-        return ", ".join(found)
-    return f"{kernel['instructions']} in all, per {kernel['per']}"
+    return ", ".join(found) or f"{kernel['instructions']} in all, per {kernel['per']}"
 
 
 def machine_code(sass: dict[str, Any]) -> str:
@@ -210,11 +206,15 @@ def exchanged() -> str:
     return "\n".join(lines)
 
 
+def tables() -> dict[str, str]:
+    """Make the tables, by their marks in NOTES.md."""
+    of_kernels = {"machine code": machine_code(SASS), "predictions": predictions(), "beside gsplat": beside_gsplat()}
+    return {**of_kernels, "counters": counters(), "ranks": exchanged()}
+
+
 def with_tables(text: str) -> str:
     """Put the tables between their marks."""
-    tables = {"machine code": machine_code(SASS), "predictions": predictions(), "ranks": exchanged()}
-    tables |= {"beside gsplat": beside_gsplat(), "counters": counters()}
-    for name, table in tables.items():
+    for name, table in tables().items():
         text = with_table(text, name, table)
     return text
 
@@ -264,20 +264,23 @@ class Card:
 H200 = Card(4.2e12, 132 * 128 * 1.755e9, 1.755e9)
 
 
-def measured_card(device: torch.device, copied: int = 1 << 30) -> Card:
-    """Measure the bandwidth of a copy of so many bytes, and ask for processors and their clock."""
-    source = torch.zeros(copied, dtype=torch.uint8, device=device)
+def elapsed_ms(run: Callable[[], Any]) -> float:
+    """Time a run on the GPU, from what was asked before it to its own end."""
+    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    start.record()
+    run()
+    end.record()
+    end.synchronize()
+    return start.elapsed_time(end)
+
+
+def measured_card(device: torch.device) -> Card:
+    """Measure the bandwidth of a copy, and ask for processors and their clock."""
+    source = torch.zeros(1 << 30, dtype=torch.uint8, device=device)
     target = torch.empty_like(source)
-    best = float("inf")
-    for _ in range(5):
-        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-        start.record()
-        target.copy_(source)
-        end.record()
-        end.synchronize()
-        best = min(best, start.elapsed_time(end))
+    best = min(elapsed_ms(lambda: target.copy_(source)) for _ in range(5))
     lanes, clock = torch.cuda.get_device_properties(device).multi_processor_count * LANES_PER_SM, _clock_hz()
-    return Card(2e3 * copied / best, lanes * clock, clock)
+    return Card(2e3 * source.numel() / best, lanes * clock, clock)
 
 
 def _clock_hz() -> float:
@@ -290,9 +293,9 @@ def _clock_hz() -> float:
     return 1e6 * float(printed[0]) if printed else 1e9
 
 
-def issued_per(kernel: str, unit: str, arch: str = "sm_90") -> tuple[float, float]:
+def issued_per(kernel: str, unit: str) -> tuple[float, float]:
     """Return what a warp issues for a unit of a kernel's loop, without the loops in it, and how much at half rate."""
-    (entry,) = (entry for entry in SASS["kernels"] if (entry["kernel"], entry["arch"]) == (kernel, arch))
+    (entry,) = (entry for entry in SASS["kernels"] if (entry["kernel"], entry["arch"]) == (kernel, "sm_90"))
     (loop,) = (loop for loop in entry["loops"] if loop["per"] == unit)
     half = sum(loop["always_by_class"].get(name, 0) for name in HALF_RATE)
     return loop["all"] / loop["iterations"], half / loop["iterations"]
@@ -368,7 +371,7 @@ def main(words: list[str]) -> int:
             print("NOTES.md: the CUDA tables are not what the counts give; run gpu_predictions.py --write")
             return 1
     else:
-        print(machine_code(SASS), predictions(), beside_gsplat(), counters(), exchanged(), sep="\n\n")
+        print(*tables().values(), sep="\n\n")
     return 0
 
 

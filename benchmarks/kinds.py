@@ -14,6 +14,7 @@ replaced.
 from __future__ import annotations
 
 import argparse
+import itertools
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -24,9 +25,6 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
-
-if __package__ in (None, ""):
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.estimates import BY_PROCESSOR
 from benchmarks.record import machine, read_json, write_json
@@ -156,8 +154,8 @@ _OBJECT: Final = (
 )
 
 
-def _ring(count: int, height: float, radius: float, first: float = 0.0, turn: float = 360.0) -> list[np.ndarray]:
-    angles = np.radians(first + turn * np.arange(count) / count)
+def _ring(count: int, height: float, radius: float, first: float = 0.0) -> list[np.ndarray]:
+    angles = np.radians(first + 360.0 * np.arange(count) / count)
     return [look_at((radius * np.cos(a), radius * np.sin(a), height), (0.0, 0.0, 0.4)) for a in angles]
 
 
@@ -198,17 +196,14 @@ def _room() -> list[Photograph]:
 
 
 def _facade() -> list[Photograph]:
-    windows = [Box((x, 0.1, z), (0.7, 0.3, 0.9), 5 + (i % 9)) for i, (x, z) in enumerate(_windows())]
+    places = itertools.product((1.2, 3.0), (-5.4, -4.0, -2.5, -1.1, 0.4, 1.8, 3.2, 4.7))
+    windows = [Box((x, 0.1, z), (0.7, 0.3, 0.9), 5 + (i % 9)) for i, (z, x) in enumerate(places)]
     boxes = (Box((0, 0.5, 2.5), (14, 1, 5), 1), Box((0, -5, -0.1), (24, 14, 0.2), 0), *windows)
     return [
         Photograph(look_at((x, -4.0 - 0.4 * row, 1.5 + 0.9 * row), (x + 0.3, 0.0, 1.7 + 0.4 * row)), boxes)
         for row in range(2)
         for x in np.linspace(-4.2, 4.2, 18) + 0.2 * row
     ]
-
-
-def _windows() -> list[tuple[float, float]]:
-    return [(x, z) for z in (1.2, 3.0) for x in (-5.4, -4.0, -2.5, -1.1, 0.4, 1.8, 3.2, 4.7)]
 
 
 def _walk() -> list[Photograph]:

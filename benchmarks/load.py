@@ -23,7 +23,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ import cv2
 import numpy as np
 import torch
 
+from benchmarks.record import machine, peak_bytes, write_json
 from pop_fast import rasterization
 from pop_fast.api.backend import get_backend
 from pop_fast.children import module_command
@@ -66,8 +67,8 @@ class Case:
     def scaled(self, scale: float) -> Case:
         """Return the same with fewer photographs, or Gaussians where there are none."""
         if self.photographs:
-            return Case(max(round(self.photographs * scale), 3), self.gaussians, self.width, self.height)
-        return Case(0, round(self.gaussians * scale), self.width, self.height)
+            return replace(self, photographs=max(round(self.photographs * scale), 3))
+        return replace(self, gaussians=round(self.gaussians * scale))
 
     @property
     def bound(self) -> float:
@@ -165,21 +166,17 @@ def measured(name: str, case: Case) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         make(case, Path(folder))
         start = time.perf_counter()
-        words = [case.photographs, case.gaussians, case.width, case.height]
-        command = module_command("benchmarks.load", "--child", folder, *map(str, words))
+        command = module_command("benchmarks.load", "--child", folder, *map(str, asdict(case).values()))
         done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=HERE.parent)
     if done.returncode != 0:
         raise SystemExit(f"{name}: ended with {done.returncode}: {done.stderr[-3000:]}")
-    size = dict(zip(("photographs", "gaussians", "width", "height"), words, strict=True))
-    found = json.loads(done.stdout)
-    return {**size, **found, "bound_gib": case.bound, "seconds": time.perf_counter() - start}
+    seconds = time.perf_counter() - start
+    return {**asdict(case), **json.loads(done.stdout), "bound_gib": case.bound, "seconds": seconds}
 
 
 def _child(folder: Path, case: Case) -> None:
     found = do(case, folder)
-    lines = Path("/proc/self/status").read_text().splitlines()
-    peak = next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
-    print(json.dumps({**found, "peak_gib": peak / 2**20}))
+    print(json.dumps({**found, "peak_gib": peak_bytes() / 2**30}))
 
 
 def main(words: list[str], say: Callable[[str], None] = print) -> int:
@@ -192,9 +189,6 @@ def main(words: list[str], say: Callable[[str], None] = print) -> int:
     parser.add_argument("--scale", type=float, default=1.0)
     parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args(words)
-    sys.path.insert(0, str(HERE))
-    from record import machine, write_json
-
     cases = {name: measured(name, CASES[name].scaled(args.scale)) for name in args.only or CASES}
     write_json(args.out, {"machine": machine(), "cases": cases})
     for name, found in cases.items():

@@ -148,8 +148,7 @@ def floors(row: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 def _of_gaussian(kernel: str) -> int:
     """Return the arithmetic instructions that a kernel spends on a Gaussian, in machine code for sm_90."""
-    found = [k for k in read_json(SASS)["kernels"] if k["kernel"] == kernel and k["arch"] == "sm_90"]
-    classes = found[0]["by_class"]
+    classes = next(k["by_class"] for k in read_json(SASS)["kernels"] if (k["kernel"], k["arch"]) == (kernel, "sm_90"))
     return int(classes["float"] + classes.get("special", 0))
 
 
@@ -174,13 +173,8 @@ def _bandwidth(bits: int, threads: int) -> float:
     library, size = _library(), (1 << bits) // 4 // threads
     rounds = max(1, MOVED // (8 * size * threads))
     shares = [np.zeros(size, np.float32) for _ in range(threads)]
-    return (
-        threads
-        * 8
-        * size
-        * rounds
-        / _best([lambda share=share: library.passes(share.ctypes.data, size, rounds) for share in shares])
-    )
+    seconds = _best([lambda share=share: library.passes(share.ctypes.data, size, rounds) for share in shares])
+    return threads * 8 * size * rounds / seconds
 
 
 @cache

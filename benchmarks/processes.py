@@ -16,6 +16,7 @@ from typing import Any
 
 import torch
 from cases import MEMORY_CASE, Case, gaussians_of, turns
+from record import peak_bytes
 from steps import SCENE, Maker, engines, run_of_case, take_turn
 
 from pop_fast.api.backend import get_backend
@@ -23,10 +24,10 @@ from pop_fast.children import python_command
 from pop_fast.train.environment import keep_freed_memory, reproducible
 
 HERE = Path(__file__).resolve().parent
-GIB = 2**20  # kB, in which the system counts
-ROOT = Path(__file__).resolve().parents[1]
+GIB = 2**30
 # what the installed script `pop` runs
 POP = python_command("-c", "import sys; from pop_fast.cli import main; sys.exit(main())")
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(HERE.parent)}
 REPEATS = 5
 LONGEST = 120.0  # s, after which a first step is given up
 COMMANDS = {
@@ -88,15 +89,10 @@ def _watched(call: Callable[[], dict[str, Any]]) -> None:
     """Run a call and print how much memory was there before and at its peak, GiB."""
     # the peak so far is that of setting up; Linux forgets it when asked
     Path("/proc/self/clear_refs").write_text("5")
-    before, start = _memory("VmRSS"), time.perf_counter()
+    before, start = peak_bytes("VmRSS") / GIB, time.perf_counter()
     found = call()
     seconds = time.perf_counter() - start
-    print(json.dumps({"peak_gib": _memory("VmHWM"), "before_gib": before, "seconds": seconds, **found}))
-
-
-def _memory(field: str) -> float:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) for line in lines if line.startswith(f"{field}:")) / GIB
+    print(json.dumps({"peak_gib": peak_bytes() / GIB, "before_gib": before, "seconds": seconds, **found}))
 
 
 def time_startup(capture: str | None, factor: int) -> dict[str, Any]:
@@ -113,14 +109,10 @@ def _best(taken: list[dict[str, float]]) -> dict[str, float]:
     return {name: min(run[name] for run in taken) for name in taken[0]}
 
 
-def _environment() -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": str(ROOT)}
-
-
 def _run(words: tuple[str, ...]) -> dict[str, float]:
     """Run a command to its end: wall and processor seconds."""
     before, start = _processor_seconds(), time.perf_counter()
-    subprocess.run([*POP, *words], env=_environment(), capture_output=True, check=False)
+    subprocess.run([*POP, *words], env=ENVIRONMENT, capture_output=True, check=False)
     wall = time.perf_counter() - start
     return {"wall_s": wall, "cpu_s": _processor_seconds() - before}
 
@@ -134,7 +126,7 @@ def _first_step(capture: str, factor: int) -> dict[str, float]:
         start = time.perf_counter()
         with (
             said.open("wb") as to,
-            subprocess.Popen([*POP, *words, "--out", str(out)], env=_environment(), stdout=to, stderr=to) as running,
+            subprocess.Popen([*POP, *words, "--out", str(out)], env=ENVIRONMENT, stdout=to, stderr=to) as running,
         ):
             try:
                 record = _wait_for_record(out / "metrics.jsonl", running, start + LONGEST)

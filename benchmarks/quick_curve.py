@@ -22,9 +22,6 @@ from typing import Any, Final
 
 import numpy as np
 
-if __package__ in (None, ""):
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from benchmarks.record import commit, machine, read_json, with_table, write_json
 from pop_fast.data import Capture, load_capture
 from pop_fast.train import TrainConfig, TrainingRun

@@ -6,22 +6,19 @@ import json
 import os
 import platform
 import subprocess
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from pop_fast.machine import machine_name
+
 
 def machine() -> dict[str, Any]:
     """Describe what times were taken on."""
-    model = platform.processor()
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        model = next(
-            (line.split(":")[1].strip() for line in info.read_text().splitlines() if "model name" in line), model
-        )
     return {
-        "cpu": model,
+        "cpu": machine_name(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),
         "load_before": os.getloadavg()[0],
@@ -55,6 +52,17 @@ def text_of(result: dict[str, Any]) -> str:
     """Write results as JSON with one line for each entry, so that a difference shows which entry has changed."""
     lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(value)}" for name, value in result.items())
     return f"{{\n{lines}\n}}\n"
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]], rule: Sequence[str] = ()) -> str:
+    """Make a Markdown table; `rule` says how columns are aligned."""
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, rule or ["---"] * len(head), *rows))
+
+
+def peak_bytes(field: str = "VmHWM") -> int:
+    """Return how much memory this process has had at most, or a field of /proc/self/status in its place."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(f"{field}:"))
 
 
 def with_table(text: str, name: str, table: str) -> str:

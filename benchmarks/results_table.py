@@ -17,16 +17,14 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-if __package__ in (None, ""):
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from benchmarks.record import with_table
+from benchmarks.record import markdown, read_json, with_table
 from paper_repro.paper import paper
-from pop_fast.view.report.source import COLUMNS, markdown, row
+from pop_fast.view.report.source import COLUMNS, row
+from pop_fast.view.report.source import markdown as table_of_runs
 
 RESULTS = Path(__file__).resolve().parent / "results"
 RUNS = RESULTS / "training.jsonl"
@@ -45,52 +43,47 @@ ENGINES = {"fast": "`fast`", "compiled": "`compiled`, autograd", "native": "`com
 
 def table(runs: Path = RUNS) -> str:
     """Make the table of all runs, by capture, POP before others."""
-    return markdown([_row(runs) for runs in _groups(runs)])
+    return table_of_runs([_row(runs) for runs in _groups(runs)])
 
 
 def summary(runs: Path = RUNS) -> str:
     """Make the short table: POP at the paper's weight of its term, and the two baselines, a capture a line."""
+    chosen = _by_capture(runs)
+    rows = [[capture, *(_short(of.get(name)) for name in ("pop", "gsplat", "3dgs"))] for capture, of in chosen.items()]
+    return markdown(["capture", "POP", "gsplat's default strategy", "3DGS"], rows)
+
+
+def _by_capture(runs: Path) -> dict[str, dict[str, Stats]]:
+    """Return means over seeds by capture and method."""
     chosen: dict[str, dict[str, Stats]] = {}
     for stats in map(_mean, _groups(runs)):
         # of several weights of the POP term the smallest, which is the paper's
         chosen.setdefault(stats["capture"], {}).setdefault(stats["method"], stats)
-    lines = ["| capture | POP | gsplat's default strategy | 3DGS |", "| --- | --- | --- | --- |"]
-    for capture, methods in chosen.items():
-        cells = [_short(methods.get(name)) for name in ("pop", "gsplat", "3dgs")]
-        lines.append(f"| {capture} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+    return chosen
 
 
 def _short(stats: Stats | None) -> str:
     return "not run" if stats is None else f"{stats['psnr']:.2f} dB, {stats['num_GS']:,}"
 
 
-def differences(runs: Path = RUNS) -> str:
+def differences() -> str:
     """Make the table of what POP is less gsplat's strategy: of these runs, and of the paper's main tables."""
-    lines = ["| scene | schedule | PSNR | SSIM | Gaussians |", "| --- | --- | ---: | ---: | ---: |"]
-    means: dict[tuple[str, str], Stats] = {}
-    for stats in map(_mean, _groups(runs)):
-        # of several weights of the POP term the smallest, which is the paper's
-        means.setdefault((stats["capture"], stats["method"]), stats)
-    for capture in sorted({capture for capture, _ in means}):
-        pop, control = means.get((capture, "pop")), means.get((capture, "gsplat"))
-        if pop and control:
-            share = pop["num_GS"] / control["num_GS"]
-            steps = f"{pop['step'] + 1:,} steps, measured here"
-            lines.append(
-                _difference(capture, steps, pop["psnr"] - control["psnr"], pop["ssim"] - control["ssim"], share)
-            )
+    rows = []
+    for capture, of in sorted(_by_capture(RUNS).items()):
+        if "pop" in of and "gsplat" in of:
+            steps = f"{of['pop']['step'] + 1:,} steps, measured here"
+            rows.append([capture, steps, *_differences(of["pop"], of["gsplat"], "num_GS")])
     published = paper()
     for dataset, number in (("Mip-NeRF 360", 1), ("Tanks & Temples", 2), ("Deep Blending", 1)):
         ours, base = (published.table(number).row(row).values[dataset] for row in ("pop", "gsplat"))
-        share = ours["num_gaussians_k"] / base["num_gaussians_k"]
-        found = (ours["psnr"] - base["psnr"], ours["ssim"] - base["ssim"], share)
-        lines.append(_difference(dataset, "30,000 steps, the paper's", *found))
-    return "\n".join(lines)
+        rows.append([dataset, "30,000 steps, the paper's", *_differences(ours, base, "num_gaussians_k")])
+    head = ["scene", "schedule", "PSNR", "SSIM", "Gaussians"]
+    return markdown(head, rows, ["---", "---", "---:", "---:", "---:"])
 
 
-def _difference(scene: str, schedule: str, psnr: float, ssim: float, share: float) -> str:
-    return f"| {scene} | {schedule} | {psnr:+.2f} dB | {ssim:+.3f} | {share:.1%} |"
+def _differences(ours: Mapping[str, Any], base: Mapping[str, Any], count: str) -> list[str]:
+    psnr, ssim = (ours[name] - base[name] for name in ("psnr", "ssim"))
+    return [f"{psnr:+.2f} dB", f"{ssim:+.3f}", f"{ours[count] / base[count]:.1%}"]
 
 
 def _groups(path: Path) -> list[list[Stats]]:
@@ -136,11 +129,11 @@ def add(statistics: Path, name: str, runs: Path = RUNS) -> None:
 
 def fuzzed() -> str:
     """Make the table of damaged files: what came of them, by reader."""
-    found = _read("faults.json")["fuzz"]["readers"]
+    found = read_json(RESULTS / "faults.json")["fuzz"]["readers"]
     total = {kind: sum(row[kind] for row in found.values()) for kind in _KINDS}
     rows = [[name, *_outcomes(row)] for name, row in found.items()] + [["**all**", *_outcomes(total)]]
     head = ["reader", "inputs", "read", "refused in one line", "system", "failures", "crash", "hang"]
-    return _table(head, rows, ["---", *["---:"] * 7])
+    return markdown(head, rows, ["---", *["---:"] * 7])
 
 
 def _outcomes(row: dict[str, int]) -> list[str]:
@@ -151,7 +144,7 @@ def _outcomes(row: dict[str, int]) -> list[str]:
 
 def disturbed() -> str:
     """Make the table of runs that were killed or refused their writes, of flipped bits and of sanitizers."""
-    found = _read("faults.json")
+    found = read_json(RESULTS / "faults.json")
     rows = []
     for kind, kills in found["kills"].items():
         what = f"SIGKILL at random moments of `pop train`, then `--resume`: {kind}"
@@ -165,18 +158,18 @@ def disturbed() -> str:
     for flips in found["flips"].values():
         came = f"{flips['refused']:,} refused, {flips['the same']:,} read as before"
         rows.append(["a flipped bit of a checkpoint", f"{flips['flips']:,}", came, _failed(flips)])
-    return _table(["event", "tried", "outcome", "failures"], rows, ["---", "---", "---", "---:"])
+    return markdown(["event", "tried", "outcome", "failures"], rows, ["---", "---", "---", "---:"])
 
 
 def sanitized() -> str:
     """Make the table of sanitizers: what was run under which, and of every unit how many of its lines ran."""
-    found = _read("faults.json")["sanitizers"]
+    found = read_json(RESULTS / "faults.json")["sanitizers"]
     rows = [
         [name, of["about"], ", ".join(of.get("told", [])) or f"not tried: {of['skipped']}", _failed(of)]
         for name, of in found["checks"].items()
     ]
     rows += [[f"`{unit}`", "", f"{run} of {of} lines ran", ""] for unit, (run, of) in found["lines"].items()]
-    return _table(["code", "sanitizer", "tried", "failures"], rows, ["---", "---", "---", "---:"])
+    return markdown(["code", "sanitizer", "tried", "failures"], rows, ["---", "---", "---", "---:"])
 
 
 def _failed(result: dict[str, Any]) -> str:
@@ -186,10 +179,10 @@ def _failed(result: dict[str, Any]) -> str:
 def loads() -> str:
     """Make the table of large captures and splats: the memory that they took, and the bound that was stated."""
     rows = []
-    for name, found in _read("load.json")["cases"].items():
+    for name, found in read_json(RESULTS / "load.json")["cases"].items():
         size = f"{found['width']} x {found['height']}"
         rows.append([name, size, f"{found['peak_gib']:.2f} GiB", f"{found['bound_gib']:.2f} GiB", found["backend"]])
-    return _table(["load", "photograph or render, px", "peak", "bound", "backend"], rows)
+    return markdown(["load", "photograph or render, px", "peak", "bound", "backend"], rows)
 
 
 def title(case: Mapping[str, Any]) -> str:
@@ -207,7 +200,7 @@ def steps(timed: Mapping[str, Any]) -> str:
         least = [f"{ms[name]['median']:.0f} ms" for name in ("fast", "compiled")]
         native = f"{ms['native']['median']:.1f} ms ({ms['native']['minimum']:.1f})"
         rows.append([title(case), *least, native, f"{ratios['native / compiled']:.2f}"])
-    return f"{_table(head, rows)}\n\nMedians of turns; of the native step the least turn in brackets."
+    return f"{markdown(head, rows)}\n\nMedians of turns; of the native step the least turn in brackets."
 
 
 def native(timed: Mapping[str, Any]) -> str:
@@ -226,7 +219,7 @@ def native(timed: Mapping[str, Any]) -> str:
                 f"{case['working_mib']:.0f} MiB",
             ]
         )
-    return _table(head, rows)
+    return markdown(head, rows)
 
 
 def parts(timed: Mapping[str, Any]) -> str:
@@ -238,7 +231,7 @@ def parts(timed: Mapping[str, Any]) -> str:
         rows.append([part, *(_cell(one["ms"], one["floor_ms"], BOUNDS[one["bound"]]) for one in found)])
     sums = [[sum(one[key] for one in case["parts"].values()) for key in ("ms", "floor_ms")] for case in cases]
     rows.append(["all", *(_cell(ms, floor, "") for ms, floor in sums)])
-    table = _table(["part", *map(title, cases)], rows)
+    table = markdown(["part", *map(title, cases)], rows)
     rates = f"{peak['vector_ops_per_s'] / 1e9:.1f} G vector operations/s and {peak['bytes_per_s'] / 1e9:.0f} GB/s"
     legend = "ms (floor ms by operations o or bytes b, ratio)"
     return f"{table}\n\n{legend}; {peak['threads']} threads were seen to do {rates} from memory."
@@ -260,7 +253,7 @@ def counts(timed: Mapping[str, Any]) -> str:
         ("transpose, ns a pair", lambda case, did: f"{1e6 * case['parts_ms']['transpose'] / did['pairs']:.2f}"),
     ]
     rows = [[what, *(show(case, case["counts"]) for case in cases)] for what, show in lines]
-    return _table(["", *map(title, cases)], rows)
+    return markdown(["", *map(title, cases)], rows)
 
 
 def cores(timed: Mapping[str, Any]) -> str:
@@ -276,7 +269,7 @@ def cores(timed: Mapping[str, Any]) -> str:
             name = f"{case['width']}x{case['height']}, {case['num_gaussians']:,} Gaussians"
             rows.append([name, threads, f"{ms:.2f}", f"{one / ms:.1f}", *(f"{part:.2f}" for part in shares.values())])
     head = ["case", "cores", "ms", "times one core", *timed["cores"][0]["machines"]["1"]]
-    return _table(head, rows)
+    return markdown(head, rows)
 
 
 def _shares(did: Mapping[str, int]) -> str:
@@ -293,23 +286,19 @@ def busy(timed: Mapping[str, Any]) -> str:
     first = timed["busy"][0]
     head = ["case", "engine", "alone", f"among {first['processes']} busy processes", "times the fair share"]
     share = f"({first['processes']} + {first['threads']}) / {first['cores']} = {first['fair_factor']:g}"
-    return f"{_table(head, rows)}\n\nThe fair share is {share} times the time alone; means over all steps."
+    return f"{markdown(head, rows)}\n\nThe fair share is {share} times the time alone; means over all steps."
 
 
 def startup(timed: Mapping[str, Any]) -> str:
     """Make the table of how long commands take until they do something."""
     found = timed["first-step"]
-    rows = [[f"`{name}`", _s(one["wall_s"]), _s(one["cpu_s"])] for name, one in found["commands"].items()]
+    rows = [[f"`{name}`", f"{one['wall_s']:.2f}", f"{one['cpu_s']:.2f}"] for name, one in found["commands"].items()]
     if "first_step" in found:
         first = found["first_step"]
         command = f"`pop train {first['capture']} --factor {first['factor']} --preset quick`, to its first step"
-        rows.append([command, _s(first["wall_s"]), ""])
-    table = _table(["command", "seconds", "processor seconds"], rows)
+        rows.append([command, f"{first['wall_s']:.2f}", ""])
+    table = markdown(["command", "seconds", "processor seconds"], rows)
     return f"{table}\n\nThe least of {found['repeats']}."
-
-
-def _s(seconds: float) -> str:
-    return f"{seconds:.2f}"
 
 
 def memory(timed: Mapping[str, Any]) -> str:
@@ -321,7 +310,7 @@ def memory(timed: Mapping[str, Any]) -> str:
         own = f"{one['working_gib']:.2f} GiB" if "working_gib" in one else ""
         size = f"{what[one['what']]}, {one['width']}x{one['height']}, {one['n']:,} Gaussians"
         rows.append([size, ENGINES[one["by"]], f"{one['before_gib']:.2f} GiB", f"{one['peak_gib']:.2f} GiB", own])
-    return _table(head, rows)
+    return markdown(head, rows)
 
 
 # the part of the results that each table is made of, by its marks in NOTES.md
@@ -343,20 +332,16 @@ def with_tables(text: str, timed: Mapping[str, Any]) -> str:
     return text
 
 
-def _read(name: str) -> dict[str, Any]:
-    return dict(json.loads((RESULTS / name).read_text(encoding="utf-8")))
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]], rule: Sequence[str] | None = None) -> str:
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, rule or ["---"] * len(head), *rows))
-
-
 def main(words: list[str]) -> int:
     """Run the script."""
     if words[:1] == ["--add"]:
         add(Path(words[1]), words[2])
         return 0
-    tables, timed, notes = (table(), differences(), summary()), _read("cpu.json"), NOTES.read_text(encoding="utf-8")
+    tables, timed, notes = (
+        (table(), differences(), summary()),
+        read_json(RESULTS / "cpu.json"),
+        NOTES.read_text(encoding="utf-8"),
+    )
     if words == ["--write"]:
         NOTES.write_text(with_tables(notes, timed), encoding="utf-8")
         return 0

@@ -36,7 +36,6 @@ from steps import (
     gate,
     run_of,
     run_of_case,
-    stepping,
     time_capture,
     time_case,
     time_raster,
@@ -55,16 +54,10 @@ __all__ = [
     "machine",
     "reproducible",
     "run_of",
-    "stepping",
     "write_json",
 ]
 
 RESULTS = Path(__file__).resolve().parent / "results" / "cpu.json"
-
-
-def raster(given: argparse.Namespace) -> Any:
-    """Time renders, and the blend alone."""
-    return [time_raster(case, given.repeats) for case in RASTER_CASES]
 
 
 def steps(given: argparse.Namespace) -> Any:
@@ -78,11 +71,6 @@ def steps(given: argparse.Namespace) -> Any:
     threads = torch.get_num_threads()
     rates = {"vector_ops_per_s": vector_ops_per_s(threads), "bytes_per_s": bytes_per_s(LARGEST, threads)}
     return {"peak": {"threads": threads, **rates}, "cases": rows}
-
-
-def cores(given: argparse.Namespace) -> Any:
-    """Simulate training steps on machines of more cores."""
-    return [simulate(case) for case in STEP_CASES if case.name in given.cases]
 
 
 def memory(_: argparse.Namespace) -> Any:
@@ -100,17 +88,15 @@ def busy(given: argparse.Namespace) -> Any:
     return rows
 
 
-def first_step(given: argparse.Namespace) -> Any:
-    """Time `pop` from its command on."""
-    return time_startup(given.capture, given.factor)
-
-
 PARTS: dict[str, Callable[[argparse.Namespace], Any]] = {
-    "raster": raster,
+    # renders, and the blend alone
+    "raster": lambda given: [time_raster(case, given.repeats) for case in RASTER_CASES],
     "steps": steps,
-    "cores": cores,
+    # steps on machines of more cores, simulated
+    "cores": lambda given: [simulate(case) for case in STEP_CASES if case.name in given.cases],
     "memory": memory,
-    "first-step": first_step,
+    # `pop` from its command on
+    "first-step": lambda given: time_startup(given.capture, given.factor),
     "busy": busy,
 }
 

@@ -38,9 +38,6 @@ from pop_fast.train.compact import TRIAL, Tuner
 from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
 from pop_fast.train.views import ViewTensors, evenly
 
-if __package__ in (None, ""):
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 PLY_BYTES: Final = 248
 # of all blending weights, what --final-prune takes away
 SHARES: Final = (0.0, 0.002, 0.003)
@@ -94,10 +91,6 @@ def rows(result: Path, shares: tuple[float, ...] = SHARES) -> Iterator[dict[str,
 def in_whole(result: Path, whole: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """Measure a result in every format and with every share pruned, and give what is known of it."""
     yield {"gaussians": whole["num_GS"], "psnr": whole["psnr"], "rows": list(rows(result))}
-
-
-if __package__ in (None, ""):
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 
 def rows_of_budgets(result: Path, names: list[str], steps: int) -> Iterator[dict[str, Any]]:

@@ -21,12 +21,11 @@ import torch
 from cases import GATE_CASE, Case, capture_of, gaussians_of, median_ratio, turns, turns_ms
 from torch import Tensor
 
-import pop_fast.train
 from pop_fast.api.backend import backend_names, get_backend
 from pop_fast.data import Capture, load_capture
 from pop_fast.stages.compositing import Composite, composite
 from pop_fast.stages.tiles import TileLists, tile_lists
-from pop_fast.train import TrainConfig
+from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.environment import reproducible
 from pop_fast.train.views import Rendered, ViewTensors, render_view
 from pop_ref.records import Camera, Gaussians
@@ -38,13 +37,7 @@ DEGREE = 3  # of synthetic cases: all bands, as in most of a run
 STEPS, FEW_STEPS = 5, 1  # of a turn; few where a step takes long
 LONG = 100_000  # Gaussians from which on it does
 # ms on two cores, that the native step was built for
-TARGETS = {
-    "270x480-12k": 12.0,
-    "270x480-40k": 20.0,
-    "640x480-100k": 45.0,
-    "1600x1000-300k": 250.0,
-    "fox": 11.0,
-}
+TARGETS = {"270x480-12k": 12.0, "270x480-40k": 20.0, "640x480-100k": 45.0, "1600x1000-300k": 250.0, "fox": 11.0}
 LONE = "native, 1 thread"
 # the largest relative difference from the oracle that the gate lets pass
 GATE = {torch.float64: 1e-10, torch.float32: 5e-5}
@@ -53,7 +46,7 @@ SCENE = ("means", "quats", "scales", "opacities", "colors")
 
 def engines() -> tuple[str, ...]:
     """Return what takes steps on a CPU here, slowest first: torch, autograd over compiled stages, the native step."""
-    return ("fast", "compiled", "native") if get_backend("compiled").available() else ("fast",)
+    return (*backends(), "native") if "compiled" in backends() else backends()
 
 
 def run_of_case(case: Case, folder: str, engine: str) -> Any:
@@ -64,12 +57,6 @@ def run_of_case(case: Case, folder: str, engine: str) -> Any:
 def run_of(case: Case, folder: str, backend: str = "fast") -> Any:
     """Return a training run whose Gaussians are a case's, by what a checkout trains with for a backend's name."""
     return _with_gaussians(case, _run(capture_of(case), folder, DEGREE, backend=backend))
-
-
-def stepping(training: Any) -> Callable[[], Any]:
-    """Return what takes one step of a run."""
-    # `ab_benchmark` calls this of checkouts too in which a run was called a trainer
-    return getattr(training, "train_step", None) or (lambda: training.take_steps(training.step + 1))
 
 
 def first_view(training: Any, capture: Capture) -> Rendered:
@@ -96,17 +83,15 @@ def _engine(name: str) -> Any:
 
     if name == "native":
         return whole_engine()
-    return torch_engine("compiled" if name == "compiled" else "fast")
+    return torch_engine(name)
 
 
-def _run(capture: Capture, folder: str, degree: int, **by: Any) -> Any:
+def _run(capture: Capture, folder: str, degree: int, engine: Any = None, **settings: Any) -> Any:
     # bands are activated one a step, or never
     interval = 1 if degree > 0 else 10**9
-    backend = {"backend": by.pop("backend")} if "backend" in by else {}
-    config = TrainConfig(result_dir=folder, sh_interval=interval, log_every=10**9, progress=False, **backend)
+    config = TrainConfig(result_dir=folder, sh_interval=interval, log_every=10**9, progress=False, **settings)
     frozen = replace(config.strategy, refine_start_iter=config.strategy.refine_stop_iter)
-    kind: Any = getattr(pop_fast.train, "TrainingRun", None) or vars(pop_fast.train)["Trainer"]
-    return kind(replace(config, strategy=frozen), capture, **by)
+    return TrainingRun(replace(config, strategy=frozen), capture, engine=engine)
 
 
 def _with_gaussians(case: Case, training: Any) -> Any:
@@ -293,7 +278,7 @@ def gate() -> dict[str, float]:
         size = {"width": GATE_CASE.width, "height": GATE_CASE.height, "sh_degree": 3}
         fast, _, _ = get_backend(backend).rasterization(**{**given, **leaves}, **size)
         (fast[0] * torch.tensor(v_image, dtype=dtype)).sum().backward()
-        found = [fast[0].detach(), *(_gradient(leaf) for leaf in leaves.values())]
+        found = [fast[0].detach(), *(leaf.grad for leaf in leaves.values())]
         error = max(
             float(np.abs(a.double().numpy() - b).max() / np.abs(b).max()) for a, b in zip(found, expected, strict=True)
         )
@@ -304,8 +289,3 @@ def gate() -> dict[str, float]:
                 f"nothing was timed"
             )
     return worst
-
-
-def _gradient(leaf: Tensor) -> Tensor:
-    assert leaf.grad is not None
-    return leaf.grad

@@ -17,16 +17,9 @@ OLDEST = 75
 
 def _candidates() -> list[Path]:
     """List where nvcc may be: CUDACXX, CUDA_HOME, the PATH, the usual place, the wheels of pip."""
-    found: list[Path] = []
-    if os.environ.get("CUDACXX"):
-        found.append(Path(os.environ["CUDACXX"]))
-    for name in ("CUDA_HOME", "CUDA_PATH"):
-        if os.environ.get(name):
-            found.append(Path(os.environ[name]) / "bin" / "nvcc")
-    on_path = shutil.which("nvcc")
-    if on_path:
-        found.append(Path(on_path))
-    found.append(Path("/usr/local/cuda/bin/nvcc"))
+    homes = (os.environ.get(name) for name in ("CUDA_HOME", "CUDA_PATH"))
+    named = (os.environ.get("CUDACXX"), *(f"{home}/bin/nvcc" for home in homes if home), shutil.which("nvcc"))
+    found = [Path(path) for path in (*named, "/usr/local/cuda/bin/nvcc") if path]
     packages = Path(sysconfig.get_paths()["purelib"]) / "nvidia"
     # nvidia-cuda-nvcc (13 and newer) shares one folder, nvidia-cuda-nvcc-cu12 has its own
     return [*found, *sorted(packages.glob("cu*/bin/nvcc")), packages / "cuda_nvcc" / "bin" / "nvcc"]
@@ -34,10 +27,7 @@ def _candidates() -> list[Path]:
 
 def find_nvcc() -> str | None:
     """Return the path of nvcc, or None."""
-    for candidate in _candidates():
-        if candidate.is_file() and os.access(candidate, os.X_OK):
-            return str(candidate)
-    return None
+    return next((str(one) for one in _candidates() if one.is_file() and os.access(one, os.X_OK)), None)
 
 
 def nvcc_version(nvcc: str) -> tuple[int, int]:

@@ -53,13 +53,8 @@ PRINTED = ".printed"
 LONGEST = 30  # lines of an output
 WIDEST = 900  # px of a picture
 # WebGL without a GPU, and inside a container
-HEADLESS = (
-    "--headless=new",
-    "--no-sandbox",
-    "--enable-unsafe-swiftshader",
-    "--disable-dev-shm-usage",
-    "--hide-scrollbars",
-)
+HEADLESS = ("--headless=new", "--no-sandbox", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage")
+HEADLESS += ("--hide-scrollbars",)
 Picture = Callable[[Path, Path], None]
 
 
@@ -207,7 +202,8 @@ def sentence(summary: str) -> str:
 
 def ran(run: Run, folder: Path) -> str:
     """Run a command line in the folder and return what it printed, errors too."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "110", "PATH": _path()}
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": "110", "PATH": path}
     process = subprocess.Popen(
         run.words, shell=True, cwd=folder, env=environment, text=True, stdin=subprocess.DEVNULL,
         stdout=(folder / PRINTED).open("w"), stderr=subprocess.STDOUT, start_new_session=True,
@@ -218,10 +214,6 @@ def ran(run: Run, folder: Path) -> str:
         os.killpg(process.pid, signal.SIGTERM)
     process.wait()
     return (folder / PRINTED).read_text()
-
-
-def _path() -> str:
-    return f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
 
 
 def drawn(run: Run, folder: Path) -> Path | None:
@@ -240,13 +232,8 @@ def drawn(run: Run, folder: Path) -> Path | None:
 
 def shown(text: str, folder: Path) -> str:
     """Return an output as the page has it: no path of this machine, no more than a screen."""
-    for path, name in (
-        (folder, "."),
-        (folder.resolve(), "."),
-        (Path(sys.prefix), ".venv"),
-        (ROOT, "pop-splatting"),
-        (Path.home(), "~"),
-    ):
+    names = {folder: ".", folder.resolve(): ".", Path(sys.prefix): ".venv", ROOT: "pop-splatting", Path.home(): "~"}
+    for path, name in names.items():
         text = text.replace(str(path), name)
     # the viewer's word is another one each time
     text = re.sub(r"(viewer: http://[^/]+/)[\w-]+/", r"\1WORD/", text)

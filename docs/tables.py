@@ -8,15 +8,20 @@ python docs/tables.py --check    exit with 1 when a page holds something else
 from __future__ import annotations
 
 import ast
-import json
 import re
-import runpy
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks import blocks as run_in_blocks
+from benchmarks import estimates as predictions
+from benchmarks import few_photographs as with_few
+from benchmarks import kinds as kinds_of_captures
+from benchmarks import results_table
+from benchmarks.record import markdown as table
+from benchmarks.record import read_json
 from paper_repro.methods import load_pinned
 from paper_repro.status import everything, status_table
 from paper_repro.status import outcome as outcome_of
@@ -38,11 +43,6 @@ PAGES = (README, *sorted(path for path in (ROOT / "docs").glob("*.md") if path.n
 RESULTS = ROOT / "benchmarks" / "results"
 CPU_TIMES = RESULTS / "cpu.json"
 MUTANT_LIST = ROOT / "docs" / "MUTANTS.md"
-CARDS = RESULTS / "scorecards"
-TEETH = RESULTS / "teeth.json"
-LAW_COVERAGE = RESULTS / "law_coverage.json"
-KILLS = RESULTS / "kills.json"
-VECTOR_KILLS = RESULTS / "vector_kills.json"
 # the judged, in the order of their columns, and the card that each stands on
 JUDGED = {
     "pop_fast float64": ("pop_fast.json", "fast64"),
@@ -52,7 +52,6 @@ JUDGED = {
     "gsplat torch float64": ("gsplat.json", "gsplat-torch64"),
     "gsplat torch float32": ("gsplat.json", "gsplat-torch32"),
 }
-
 OURS = {title: judged for title, judged in JUDGED.items() if not title.startswith("gsplat")}
 
 MUTANT_HEAD = """# Mutants
@@ -114,10 +113,7 @@ STAGES = (
     Stage("dominant Gaussians", "eq. 5", ("dominance",), ("stages/compositing.py",)),
     Stage("a whole view", "eq. 1", ("render", "splatting", "depth"), ("api/rasterize.py", "compiled/compositing.py")),
     Stage(
-        "L1, L2, SSIM and both objectives",
-        "eqs. 2, 4, 9",
-        ("losses", "ssim", "magnitudes"),
-        ("compiled/losses.py",),
+        "L1, L2, SSIM and both objectives", "eqs. 2, 4, 9", ("losses", "ssim", "magnitudes"), ("compiled/losses.py",)
     ),
     Stage("importance mask and POP loss", "eqs. 7, 8", ("polarization",), ("stages/regularizers.py",)),
     Stage("terms for few photographs: sparse depth, mean opacity, mean scale", "–", ("regularizers",)),
@@ -134,19 +130,9 @@ STAGES = (
         _SCORES,
     ),
     Stage(
-        "Speedy-Splat's score",
-        "4.2",
-        ("sensitivity",),
-        ("stages/contributions.py", "compiled/compositing.py"),
-        _SCORES,
+        "Speedy-Splat's score", "4.2", ("sensitivity",), ("stages/contributions.py", "compiled/compositing.py"), _SCORES
     ),
-    Stage(
-        "PUP 3D-GS's score",
-        "4.2",
-        ("fisher",),
-        ("stages/contributions.py", "compiled/compositing.py"),
-        _SCORES,
-    ),
+    Stage("PUP 3D-GS's score", "4.2", ("fisher",), ("stages/contributions.py", "compiled/compositing.py"), _SCORES),
     Stage(
         "Mini-Splatting's points and importance",
         "4.2",
@@ -209,11 +195,6 @@ def laws(stage: Stage) -> Iterator[Path]:
         folder, named = ROOT / "pop_ref" / "conformance" / "laws", STANDS_IN.get(module, module)
         yield from sorted(folder.glob(f"test_{named}.py"))
         yield from sorted(folder.glob(f"test_{named}_*.py"))
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Make a Markdown table."""
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, ["---"] * len(head), *rows))
 
 
 def rosetta() -> str:
@@ -292,44 +273,32 @@ def outcome() -> str:
     return outcome_of(everything())
 
 
-def _of_runs(name: str) -> Callable[[], str]:
-    """Make a table of training runs, of damaged input or of large loads, as benchmarks/results_table.py does."""
-    return lambda: str(runpy.run_path(str(ROOT / "benchmarks" / "results_table.py"))[name]())
-
-
 def few_photographs() -> str:
     """Make the table of captures with few photographs left, as benchmarks/few_photographs.py does."""
-    script = runpy.run_path(str(ROOT / "benchmarks" / "few_photographs.py"))
-    known = json.loads((RESULTS / "few_photographs.json").read_text(encoding="utf-8"))
-    return str(script["table_of"](known, ("--depth-lambda 0.1", "--depth-lambda 0.01", "--method gsplat")))
+    settings = ("--depth-lambda 0.1", "--depth-lambda 0.01", "--method gsplat")
+    return with_few.table_of(read_json(RESULTS / "few_photographs.json"), settings)
 
 
 def kinds() -> str:
     """Make the table of what reports say of captures whose faults are known, as benchmarks/kinds.py does."""
-    known = json.loads((RESULTS / "kinds.json").read_text(encoding="utf-8"))
-    made = str(runpy.run_path(str(ROOT / "benchmarks" / "kinds.py"))["table_of"](known))
-    return f"{made}\n\n{known['machine']['cpu']}, one thread, commit {known['machine']['commit']}."
+    return _with_machine("kinds.json", kinds_of_captures.table_of)
 
 
 def estimates() -> str:
     """Make the table of what runs without a preset foretold and took, as benchmarks/estimates.py does."""
-    known = json.loads((RESULTS / "estimates.json").read_text(encoding="utf-8"))
+    return _with_machine("estimates.json", predictions.table_of)
+
+
+def _with_machine(name: str, table_of: Callable[[dict[str, Any]], str]) -> str:
+    known = read_json(RESULTS / name)
     machine = known["machine"]
-    made = str(runpy.run_path(str(ROOT / "benchmarks" / "estimates.py"))["table_of"](known))
-    return f"{made}\n\n{machine['cpu']}, one thread, commit {machine['commit']}."
-
-
-def blocks() -> str:
-    """Make the table of a capture whole and in blocks, as benchmarks/blocks.py does."""
-    return str(runpy.run_path(str(ROOT / "benchmarks" / "blocks.py"))["table"]())
+    return f"{table_of(known)}\n\n{machine['cpu']}, one thread, commit {machine['commit']}."
 
 
 def speed() -> str:
     """Make the tables of CPU times, those of a row taken in turns in one process: training steps, renders, blends."""
-    timed = json.loads(CPU_TIMES.read_text(encoding="utf-8"))
-    machine = timed["machine"]
-    make = runpy.run_path(str(ROOT / "benchmarks" / "results_table.py"))["steps"]
-    made, rows = [str(make(timed))], []
+    timed = read_json(CPU_TIMES)
+    machine, made, rows = timed["machine"], [results_table.steps(timed)], []
     for case in timed["raster"]:
         rows.append(_speed_row(f"render, {_size(case)}", case["forward_ms"]))
         rows.append(_speed_row(f"render and backward, {_size(case)}", case["forward_backward_ms"]))
@@ -379,7 +348,7 @@ def _counts(count: dict[str, int]) -> str:
 
 def card(file: str) -> dict[str, Any]:
     """Read a scorecard."""
-    return dict(json.loads((CARDS / file).read_text(encoding="utf-8")))
+    return read_json(RESULTS / "scorecards" / file)
 
 
 def broken_laws() -> str:
@@ -408,7 +377,7 @@ def surfaces() -> str:
 
 def power() -> str:
     """Make the table of what the kit kills, and of sound backends that it refuses."""
-    of_laws, vectors = (json.loads(path.read_text(encoding="utf-8")) for path in (KILLS, VECTOR_KILLS))
+    of_laws, vectors = (read_json(RESULTS / f"{name}.json") for name in ("kills", "vector_kills"))
     rows = []
     for family in FAMILIES:
         count = len(of_laws[family])
@@ -427,7 +396,7 @@ def power() -> str:
 
 def reached() -> str:
     """Make the tables of what laws reach: ranges of arguments, and lines of the oracle that none runs."""
-    logged = json.loads(LAW_COVERAGE.read_text(encoding="utf-8"))
+    logged = read_json(RESULTS / "law_coverage.json")
     ranges = [[name, f"{low:.3g}", f"{high:.3g}", LIMITS[name]] for name, (low, high) in logged["ranges"].items()]
     choices = [[name, ", ".join(f"`{value}`" for value in values)] for name, values in logged["choices"].items()]
     lines, refusals, others = 0, 0, dict[tuple[str, str], int]()
@@ -452,7 +421,7 @@ def reached() -> str:
 
 def teeth() -> str:
     """Make the table of the smallest errors that the kit notices, and of what sound backends need of its tolerances."""
-    kept = json.loads(TEETH.read_text(encoding="utf-8"))
+    kept = read_json(RESULTS / "teeth.json")
     single, double = kept["float32"], kept["float64"]
 
     def needed(of: dict[str, dict[str, float]], name: str) -> str:
@@ -486,14 +455,9 @@ def mutants() -> str:
     ]
     head = MUTANT_HEAD.format(n=len(MUTANTS), programs=len(PROGRAM))
     boxes = [[b.name.replace("_", " "), b.story, b.law.partition(":")[2].replace("_", " ")] for b in BLACK_BOXES]
-    return "".join(
-        (
-            head,
-            table(["mutant", "what happened", "file", "stage", "killed by"], rows),
-            BOX_HEAD.format(n=len(BLACK_BOXES)),
-            table(["black box", "what it does", "killed by"], boxes),
-        )
-    )
+    of_mutants = table(["mutant", "what happened", "file", "stage", "killed by"], rows)
+    of_boxes = table(["black box", "what it does", "killed by"], boxes)
+    return f"{head}{of_mutants}{BOX_HEAD.format(n=len(BLACK_BOXES))}{of_boxes}"
 
 
 TABLES: dict[str, Callable[[], str]] = {
@@ -501,14 +465,14 @@ TABLES: dict[str, Callable[[], str]] = {
     "conventions": conventions,
     "profiles": profiles,
     "speed": speed,
-    "summary": _of_runs("summary"),
-    "results": _of_runs("table"),
-    "differences": _of_runs("differences"),
+    "summary": results_table.summary,
+    "results": results_table.table,
+    "differences": results_table.differences,
     "few_photographs": few_photographs,
     "estimates": estimates,
     "kinds": kinds,
-    **{name: _of_runs(name) for name in ("fuzzed", "disturbed", "sanitized", "loads")},
-    "blocks": blocks,
+    **{name: getattr(results_table, name) for name in ("fuzzed", "disturbed", "sanitized", "loads")},
+    "blocks": run_in_blocks.table,
     "recipes": recipes,
     "methods": methods,
     "reproduction": reproduction,
@@ -555,18 +519,18 @@ def _links(paths: Iterable[Path]) -> str:
 
 def main(words: list[str]) -> int:
     """Run the script."""
-    if "--write" not in words and "--check" not in words:
-        print("\n\n".join(make() for make in TABLES.values()))
-        return 0
     if "--write" in words:
         for page in PAGES:
             page.write_text(with_tables(page), encoding="utf-8")
         MUTANT_LIST.write_text(f"{mutants()}\n", encoding="utf-8")
         return 0
-    stale = [page.name for page in PAGES if with_tables(page) != page.read_text(encoding="utf-8")]
-    stale += [MUTANT_LIST.name] if MUTANT_LIST.read_text(encoding="utf-8") != f"{mutants()}\n" else []
-    for name in stale:
-        print(f"{name}: a table is not what sources and runs say; run 'python docs/tables.py --write'")
+    if "--check" not in words:
+        print("\n\n".join(make() for make in TABLES.values()))
+        return 0
+    stale = [page for page in PAGES if with_tables(page) != page.read_text(encoding="utf-8")]
+    stale += [MUTANT_LIST] if MUTANT_LIST.read_text(encoding="utf-8") != f"{mutants()}\n" else []
+    for page in stale:
+        print(f"{page.name}: a table is not what sources and runs say; run 'python docs/tables.py --write'")
     return 1 if stale else 0
 
 

@@ -29,15 +29,13 @@ from paper_repro.evidence import (
     paper_ratios,
     with_error,
 )
-from paper_repro.judging import Question, judge
+from paper_repro.judging import SWEEP, Ask, Question, judge
 from paper_repro.paper import Metric, Paper, paper
 from paper_repro.results import Result
 from paper_repro.tables import setting
 
 # the claims that the paper's summary rests on, in the order in which the outcome is told
 HEADLINES: Final = ("fast", "fewest", "above", "comparable", "reset")
-# the rows of the comparison of L1 and L2
-SWEEP: Final = tuple(f"l1_div_{n}" for n in (1, 2, 5, 10, 20, 50, 100))
 # the methods of the main tables besides POP
 METHODS: Final = (
     *("3dgs", "gsplat", "pup", "pup_star", "mini_splatting", "mini_splatting_star"),
@@ -46,10 +44,9 @@ METHODS: Final = (
 # the schedules of the blur rule, the shortest first, with the step at which the window closes
 WINDOWS: Final = {"blur_3k_4k": 4_000, "pop": 7_000, "blur_3k_11k": 11_000, "blur_3k_15k": 15_000}
 # steps between two changes of the Gaussians in the paper
-_REFINE_EVERY: Final = 100
+REFINE_EVERY: Final = 100
 
 Groups = Mapping[str, Group]
-Asked = Sequence[Comparison | str | None]
 
 
 def claims(scale: str, results: Iterable[Result]) -> tuple[Claim, ...]:
@@ -83,9 +80,6 @@ def questions(published: Paper) -> tuple[Question, ...]:
 
 
 def _fastest(published: Paper) -> Question:
-    def ask(rows: Groups, noise: Noise) -> Asked:
-        return [_share(rows, noise, SECONDS, "pop", other, "at most", 0.0) for other in METHODS]
-
     saved = [
         f"{_printed(published, 'pop', d, 'time_s'):.0f} s, the next {_next(published, d, 'time_s')}" for d in DATASETS
     ]
@@ -95,7 +89,7 @@ def _fastest(published: Paper) -> Question:
         _by_dataset(saved),
         "the time of POP is below that of each method; runs on one machine alone are compared",
         ("pop", *METHODS),
-        ask,
+        [_share(SECONDS, "pop", other, "at most", 0.0) for other in METHODS],
         of_times=True,
     )
 
@@ -104,9 +98,6 @@ def _fewest(published: Paper) -> Question:
     datasets = ("Mip-NeRF 360", "Deep Blending")
     # the starred methods were given POP's number of Gaussians
     others = tuple(row for row in METHODS if not row.endswith("_star"))
-
-    def ask(rows: Groups, noise: Noise) -> Asked:
-        return [_share(rows, noise, COUNT, "pop", other, "at most", 0.0) for other in others]
 
     counts = [
         f"{_printed(published, 'pop', d, 'num_gaussians_k'):.0f}k, the next {_next(published, d, 'num_gaussians_k')}"
@@ -118,46 +109,36 @@ def _fewest(published: Paper) -> Question:
         _by_dataset(counts, datasets) + "; not claimed for Tanks & Temples",
         "N(pop) is below that of each method of table 1",
         ("pop", *others),
-        ask,
+        [_share(COUNT, "pop", other, "at most", 0.0) for other in others],
         datasets=datasets,
     )
 
 
 def _above(published: Paper) -> Question:
     others = ("pup", "speedy_splat")
-
-    def ask(rows: Groups, noise: Noise) -> Asked:
-        return [_difference(rows, noise, PSNR, "pop", other, "at least", 0.0) for other in others]
-
-    changes = [_change(published, "pop", other, "Mip-NeRF 360", "psnr") for other in others]
+    changes = [_change(published, other, "Mip-NeRF 360", "psnr") for other in others]
     return Question(
         "above",
         "POP has a higher PSNR than PUP-3DGS and Speedy-Splat",
-        f"{_signed(changes)} dB against PUP-3DGS and Speedy-Splat on Mip-NeRF 360, the only data set of this claim",
+        f"{_each(changes, '+.2f')} dB against PUP-3DGS and Speedy-Splat on Mip-NeRF 360, the only data set of this "
+        "claim",
         "PSNR(pop) is above PSNR(pup) and PSNR(speedy_splat)",
         ("pop", *others),
-        ask,
+        [_difference(PSNR, "pop", other, "at least", 0.0) for other in others],
         datasets=("Mip-NeRF 360",),
     )
 
 
 def _comparable(published: Paper) -> Question:
-    psnr, ssim = ([_change(published, "pop", "3dgs", d, metric) for d in DATASETS] for metric in ("psnr", "ssim"))
-
-    def ask(rows: Groups, noise: Noise) -> Asked:
-        return [
-            _difference(rows, noise, PSNR, "pop", "3dgs", "at least", min(psnr)),
-            _difference(rows, noise, SSIM, "pop", "3dgs", "at least", min(ssim)),
-        ]
-
+    psnr, ssim = ([_change(published, "3dgs", d, metric) for d in DATASETS] for metric in ("psnr", "ssim"))
     return Question(
         "comparable",
         "the quality of POP is comparable to that of 3DGS",
-        f"{_signed(psnr)} dB and {_signed(ssim, 3)} of SSIM against 3DGS ({', '.join(DATASETS)})",
+        f"{_each(psnr, '+.2f')} dB and {_each(ssim, '+.3f')} of SSIM against 3DGS ({', '.join(DATASETS)})",
         f"comparable is read as the paper's own tables have it: no more below 3DGS than their largest differences, "
         f"{min(psnr):+.2f} dB and {min(ssim):+.3f} of SSIM",
         ("pop", "3dgs"),
-        ask,
+        [_difference(quantity, "pop", "3dgs", "at least", min(of)) for quantity, of in ((PSNR, psnr), (SSIM, ssim))],
     )
 
 
@@ -166,77 +147,54 @@ def _compact(published: Paper) -> Question:
         _printed(published, "pop", d, "num_gaussians_k") / _printed(published, "gsplat", d, "num_gaussians_k")
         for d in DATASETS
     ]
-    changes = [_change(published, "pop", "gsplat", d, "psnr") for d in DATASETS]
-
-    def ask(rows: Groups, noise: Noise) -> Asked:
-        return [
-            _share(rows, noise, COUNT, "pop", "gsplat", "at most", log(max(shares))),
-            _difference(rows, noise, PSNR, "pop", "gsplat"),
-        ]
-
+    changes = [_change(published, "gsplat", d, "psnr") for d in DATASETS]
     return Question(
         "compact",
         "POP has 4 to 15 % of gsplat's Gaussians",
-        f"{_percents(shares)} at {_signed(changes)} dB",
+        f"{_each(shares, '.1%')} at {_each(changes, '+.2f')} dB",
         f"N(pop) / N(gsplat) is at most the paper's largest, {max(shares):.1%}",
         ("pop", "gsplat"),
-        ask,
+        [_share(COUNT, "pop", "gsplat", "at most", log(max(shares))), _difference(PSNR, "pop", "gsplat")],
     )
 
 
 def _half(published: Paper) -> Question:
-    def ask(rows: Groups, noise: Noise) -> Asked:
-        return [
-            _share(rows, noise, COUNT, "pop", "l2_blur", "at most", log(0.5)),
-            _difference(rows, noise, PSNR, "pop", "l2_blur"),
-        ]
-
     return Question(
         "half",
         "POP cuts the number of Gaussians by half or more against L2 with the blur rule",
-        f"{_percents(paper_ratios(published, 'pop', 'l2_blur'))} of L2+Blur's Gaussians ({', '.join(DATASETS)})",
+        f"{_each(paper_ratios(published, 'pop', 'l2_blur'), '.1%')} of L2+Blur's Gaussians ({', '.join(DATASETS)})",
         "N(pop) / N(l2_blur) is at most 50 %",
         ("pop", "l2_blur"),
-        ask,
+        [_share(COUNT, "pop", "l2_blur", "at most", log(0.5)), _difference(PSNR, "pop", "l2_blur")],
         of_duration=True,
     )
 
 
 def _blur(published: Paper) -> Question:
     without, with_pop = paper_ratios(published, "l2_blur", "l2"), paper_ratios(published, "pop", "l2_pop")
-
-    def ask(rows: Groups, noise: Noise) -> Asked:
-        return [
-            _share(rows, noise, COUNT, "l2_blur", "l2", "at least", log(min(without)), "factor"),
-            _share(rows, noise, COUNT, "pop", "l2_pop", "at least", log(min(with_pop)), "factor"),
-        ]
-
     return Question(
         "blur",
         "the blur rule multiplies the number of Gaussians",
-        f"x {_list(without)} without POP, x {_list(with_pop)} with it",
+        f"x {_each(without, '.2f')} without POP, x {_each(with_pop, '.2f')} with it",
         f"at least the paper's least factors, {min(without):.2f} without POP and {min(with_pop):.2f} with it",
         ("l2_blur", "l2", "pop", "l2_pop"),
-        ask,
+        [
+            _share(COUNT, "l2_blur", "l2", "at least", log(min(without)), "factor"),
+            _share(COUNT, "pop", "l2_pop", "at least", log(min(with_pop)), "factor"),
+        ],
         of_duration=True,
     )
 
 
 def _reset(published: Paper) -> Question:
-    def ask(rows: Groups, noise: Noise) -> Asked:
-        return [
-            _difference(rows, noise, PSNR, "pop", "reset", "at least", 0.0),
-            _share(rows, noise, COUNT, "pop", "reset"),
-        ]
-
     changes = [published.ablation("pop", d, "psnr") - published.ablation("reset", d, "psnr") for d in DATASETS]
     return Question(
         "reset",
         "POP is no worse than opacity reset in PSNR",
-        f"{_signed(changes)} dB with {_percents(paper_ratios(published, 'pop', 'reset'))} of its Gaussians",
+        f"{_each(changes, '+.2f')} dB with {_each(paper_ratios(published, 'pop', 'reset'), '.1%')} of its Gaussians",
         "PSNR(pop) is at least PSNR(reset)",
         ("pop", "reset"),
-        ask,
+        [_difference(PSNR, "pop", "reset", "at least", 0.0), _share(COUNT, "pop", "reset")],
         of_duration=True,
         always=("A16 on",),
     )
@@ -246,15 +204,8 @@ def _window(published: Paper) -> Question:
     short, pop, _, longest = WINDOWS
     low = min(paper_ratios(published, longest, pop))
 
-    def ask(rows: Groups, noise: Noise) -> Asked:
-        def psnr(says: str, weights: Mapping[str, float]) -> Comparison | None:
-            return compare(says, rows, noise, PSNR, weights, "at least", 0.0)
-
-        return [
-            psnr("PSNR from 4k to 7k", {pop: 1.0, short: -1.0}),
-            psnr("that gain less the gain from 7k to 15k", {pop: 2.0, short: -1.0, longest: -1.0}),
-            _share(rows, noise, COUNT, longest, pop, "at least", log(low), "factor"),
-        ]
+    def psnr(says: str, weights: Mapping[str, float]) -> Ask:
+        return lambda rows, noise: compare(says, rows, noise, PSNR, weights, "at least", 0.0)
 
     def line(d: str) -> str:
         psnr = [published.ablation(row, d, "psnr") for row in (short, pop, longest)]
@@ -264,10 +215,14 @@ def _window(published: Paper) -> Question:
         "window",
         "the window 3k-7k of the blur rule is the trade-off: 3k-4k grows too little, 3k-15k costs two to three times "
         "the Gaussians for a PSNR that changes little",
-        f"{', '.join(map(line, DATASETS))}; x {_list(paper_ratios(published, longest, pop))} of N at 3k-15k",
+        f"{', '.join(map(line, DATASETS))}; x {_each(paper_ratios(published, longest, pop), '.2f')} of N at 3k-15k",
         f"PSNR gains from 4k to 7k, and more than from 7k to 15k, which takes at least x {low:.2f} of N",
         (short, pop, longest),
-        ask,
+        [
+            psnr("PSNR from 4k to 7k", {pop: 1.0, short: -1.0}),
+            psnr("that gain less the gain from 7k to 15k", {pop: 2.0, short: -1.0, longest: -1.0}),
+            _share(COUNT, longest, pop, "at least", log(low), "factor"),
+        ],
         of_duration=True,
     )
 
@@ -279,12 +234,12 @@ def _growth(published: Paper) -> Question:
         counts = {row: published.ablation(row, d, "num_gaussians_k") for row in names}
         return " / ".join(f"{rate:.1f}k" for rate in _rates(counts, _densifications({})))
 
-    def ask(rows: Groups, noise: Noise) -> Asked:
+    def ask(rows: Groups, noise: Noise) -> Comparison | str | None:
         if any(row not in rows or rows[row].n <= 0.0 for row in names):
-            return [None]
+            return None
         counts, steps = {row: rows[row].n for row in names}, _densifications(rows)
         if min(steps) <= 0.0:
-            return ["the windows that the runs had are not each longer than the one before"]
+            return "the windows that the runs had are not each longer than the one before"
         early, late = (counts["pop"] - counts["blur_3k_4k"]) / steps[0], counts["blur_3k_15k"] - counts["pop"]
         value = late / (steps[1] + steps[2]) - early
         # the slope along each mean of log N is N times that along N
@@ -296,7 +251,7 @@ def _growth(published: Paper) -> Question:
         told = " / ".join(f"{rate:,.0f}" for rate in _rates(counts, steps))
         says = f"{told} Gaussians a densification step from 4k to 7k, to 11k, to 15k; after 7k less before"
         parts = [(COUNT, slope, len(rows[row].runs)) for row, slope in slopes.items()]
-        return [with_error(says, value, parts, noise, "at least", 0.0, "plain")]
+        return with_error(says, value, parts, noise, "at least", 0.0, "plain")
 
     return Question(
         "growth",
@@ -305,32 +260,29 @@ def _growth(published: Paper) -> Question:
         "the growth of N a densification step by which the windows differ is no smaller from 7k to 15k than from 4k "
         "to 7k, as in all three data sets",
         names,
-        ask,
+        [ask],
         of_duration=True,
     )
 
 
 def _pixel() -> Question:
-    def ask(rows: Groups, noise: Noise) -> Asked:
-        return [
-            _share(rows, noise, quantity, "pop", "3dgs", "at most", 0.0, says=f"{what}, pop / 3dgs")
-            for what, quantity in (("blended", BLENDED), ("visited", VISITED))
-        ]
-
     return Question(
         "pixel",
         "POP significantly reduces the Gaussians per pixel against 3DGS",
         "a figure without numbers",
         "fewer are blended and fewer are visited a pixel",
         ("pop", "3dgs"),
-        ask,
+        [
+            _share(quantity, "pop", "3dgs", "at most", 0.0, says=f"{what}, pop / 3dgs")
+            for what, quantity in (("blended", BLENDED), ("visited", VISITED))
+        ],
     )
 
 
 def _l2() -> Question:
-    def ask(rows: Groups, noise: Noise) -> Asked:
+    def ask(rows: Groups, noise: Noise) -> Comparison | str | None:
         sweep = {row: rows[row] for row in SWEEP if row in rows}
-        return [against_sweep(rows["l2"], sweep, noise) if "l2" in rows and len(sweep) > 1 else None]
+        return against_sweep(rows["l2"], sweep, noise) if "l2" in rows and len(sweep) > 1 else None
 
     return Question(
         "l2",
@@ -338,7 +290,7 @@ def _l2() -> Question:
         "a figure without numbers",
         "PSNR(l2) is above the curve of PSNR over log N through the runs of L1 / n, inside that curve",
         ("l2", *SWEEP),
-        ask,
+        [ask],
     )
 
 
@@ -364,8 +316,6 @@ def against_sweep(l2: Group, sweep: Mapping[str, Group], noise: Noise) -> Compar
 
 
 def _share(
-    rows: Groups,
-    noise: Noise,
     quantity: Quantity,
     row: str,
     base: str,
@@ -373,31 +323,28 @@ def _share(
     bound: float = 0.0,
     shown_as: Literal["share", "factor"] = "share",
     says: str = "",
-) -> Comparison | None:
+) -> Ask:
     """Compare a row with another by their ratio."""
     text = says or f"{'N' if quantity is COUNT else quantity.name} {row} / {base}"
-    return compare(text, rows, noise, quantity, {row: 1.0, base: -1.0}, asked, bound, shown_as)
+    return lambda rows, noise: compare(text, rows, noise, quantity, {row: 1.0, base: -1.0}, asked, bound, shown_as)
 
 
 def _difference(
-    rows: Groups,
-    noise: Noise,
     quantity: Quantity,
     row: str,
     base: str,
     asked: Literal["at least", "at most", "nothing"] = "nothing",
     bound: float = 0.0,
-) -> Comparison | None:
+) -> Ask:
     """Compare a row with another by their difference."""
+    text, weights = f"{quantity.name} {row} - {base}", {row: 1.0, base: -1.0}
     shown_as: Literal["dB", "plain"] = "dB" if quantity is PSNR else "plain"
-    return compare(
-        f"{quantity.name} {row} - {base}", rows, noise, quantity, {row: 1.0, base: -1.0}, asked, bound, shown_as
-    )
+    return lambda rows, noise: compare(text, rows, noise, quantity, weights, asked, bound, shown_as)
 
 
 def _densifications(rows: Groups) -> tuple[float, float, float]:
     """Count the changes of the Gaussians by which each window is longer than the one before it."""
-    ends, every = [], _REFINE_EVERY
+    ends, every = [], REFINE_EVERY
     for row, published in WINDOWS.items():
         run = rows[row].runs[0] if row in rows else None
         end = setting(run, "blur_stop_iter") if run is not None else None
@@ -417,8 +364,8 @@ def _printed(published: Paper, row: str, dataset: str, metric: str) -> float:
     return published.table(2 if dataset == "Tanks & Temples" else 1).value(row, dataset, metric)
 
 
-def _change(published: Paper, row: str, base: str, dataset: str, metric: str) -> float:
-    return _printed(published, row, dataset, metric) - _printed(published, base, dataset, metric)
+def _change(published: Paper, base: str, dataset: str, metric: str) -> float:
+    return _printed(published, "pop", dataset, metric) - _printed(published, base, dataset, metric)
 
 
 def _next(published: Paper, dataset: str, metric: str) -> str:
@@ -433,13 +380,5 @@ def _by_dataset(texts: Sequence[str], datasets: Sequence[str] = DATASETS) -> str
     return "; ".join(f"{dataset} {text}" for dataset, text in zip(datasets, texts, strict=True))
 
 
-def _percents(shares: Sequence[float]) -> str:
-    return ", ".join(f"{share:.1%}" for share in shares)
-
-
-def _signed(values: Sequence[float], digits: int = 2) -> str:
-    return ", ".join(f"{value:+.{digits}f}" for value in values)
-
-
-def _list(values: Sequence[float]) -> str:
-    return ", ".join(f"{value:.2f}" for value in values)
+def _each(values: Iterable[float], form: str) -> str:
+    return ", ".join(f"{value:{form}}" for value in values)

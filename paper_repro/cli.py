@@ -10,22 +10,19 @@ import difflib
 import os
 import sys
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Final
 
+from paper_repro.jobs import ROWS, SEED, WORK, Job, job_named, jobs_of
 from paper_repro.results import RESULTS, existing_folder, read_all
 from paper_repro.scenes import MADE, SCALES, SCENES, find_folder, scale_named, scene_named
 from pop_fast.api.backend import backend_names
 from pop_fast.errors import PopError
 
-if TYPE_CHECKING:
-    from paper_repro.jobs import Job
-
 EXIT_INCOMPLETE: Final = 1
 EXIT_BAD_INPUT: Final = 2
 EXIT_INTERRUPTED: Final = 130
-WORK: Final = Path(__file__).resolve().parent / "work"
-_SEED: Final = 42
 _TEXT: Final = """\
 usage: pop-repro COMMAND ...
 
@@ -62,46 +59,38 @@ def _parser_of(command: str, examples: str = "") -> argparse.ArgumentParser:
 
 
 def _add_scale(parser: argparse.ArgumentParser) -> None:
-    """Add --scale."""
     about = "; ".join(f"{scale.name}: {scale.about}" for scale in SCALES.values())
     parser.add_argument("--scale", choices=SCALES, default="small", help=f"{about} (default: %(default)s)")
 
 
 def _add_jobs(parser: argparse.ArgumentParser) -> None:
-    """Add --rows, --scenes and --seeds."""
     parser.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows (default: all)")
     parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="only these scenes (default: the scale's)")
-    parser.add_argument("--seeds", type=int, default=1, metavar="N", help=f"seeds of each: {_SEED}, {_SEED + 1}, ...")
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help=f"seeds of each: {SEED}, {SEED + 1}, ...")
 
 
 def _jobs(args: argparse.Namespace) -> list[Job]:
     """List the trainings that `_add_jobs` read, the cheapest first."""
-    from paper_repro.jobs import ROWS, jobs_of
-
-    return jobs_of(args.scale, args.rows or ROWS, args.scenes, range(_SEED, _SEED + args.seeds))
+    return jobs_of(args.scale, args.rows or ROWS, args.scenes, range(SEED, SEED + args.seeds))
 
 
 def _add_results(parser: argparse.ArgumentParser) -> None:
-    """Add --results."""
     parser.add_argument(
         "--results", type=Path, default=RESULTS, metavar="DIR", help="the folder of results (default: %(default)s)"
     )
 
 
 def _add_data(parser: argparse.ArgumentParser) -> None:
-    """Add --data."""
     root = os.environ.get("POP_DATA", "data")
     note = "the folder that holds the scenes (default: $POP_DATA, else data)"
     parser.add_argument("--data", type=Path, default=Path(root), metavar="DIR", help=note)
 
 
 def _add_work(parser: argparse.ArgumentParser, note: str) -> None:
-    """Add --work."""
     parser.add_argument("--work", type=Path, default=WORK, metavar="DIR", help=note)
 
 
 def _add_backend(parser: argparse.ArgumentParser, note: str) -> None:
-    """Add --backend."""
     parser.add_argument("--backend", choices=("auto", *backend_names()), default="auto", help=note)
 
 
@@ -163,17 +152,18 @@ def run(words: Sequence[str]) -> int:
     parser = _parser_of("run", _RUN)
     parser.add_argument("row", metavar="ROW", help="a file of configs: pop, gsplat, 3dgs, l2_blur, ...")
     parser.add_argument("scene", metavar="SCENE", help="one of the scale's: fox, bonsai_800, garden, ...")
-    parser.add_argument("--seed", type=int, default=_SEED, help="seed of every random number (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=SEED, help="seed of every random number (default: %(default)s)")
     parser.add_argument("--again", action="store_true", help="train a finished row again, and replace its result")
     _add_training(parser)
     args = parser.parse_args(words)
-    from paper_repro.jobs import job_named
     from paper_repro.train_row import Options, finished, train_row
 
     job = job_named(args.row, args.scene, args.scale, args.seed)
     before = None if args.again else finished(job, args.results)
     if before is None:
-        train_row(job, Options(again=args.again, **_options(args)))
+        chosen = {field.name: getattr(args, field.name) for field in fields(Options) if field.name in args}
+        lists = {name: tuple(chosen[name]) for name in ("lpips_vgg", "lpips_alex")}
+        train_row(job, Options(**{**chosen, **lists}))
     else:
         at = "" if before.commit is None else f" at commit {before.commit[:7]}"
         print(
@@ -229,17 +219,6 @@ def _ready(missing: Sequence[Job], args: argparse.Namespace) -> bool:
     return not found
 
 
-def _options(args: argparse.Namespace) -> dict[str, Any]:
-    names = (
-        *("data", "results", "work", "published", "threads", "backend", "checkpoint_every", "log_every"),
-        *("keep_ply", "keep_checkpoints", "untimed"),
-    )
-    return {
-        **{name: getattr(args, name) for name in names},
-        **{name: tuple(getattr(args, name)) for name in ("lpips_vgg", "lpips_alex")},
-    }
-
-
 _SHOWN: Final = 5  # differences
 _VERIFY: Final = """
     pop-repro verify pop fox --data DATA                  all steps; the same command continues after a stop
@@ -252,7 +231,7 @@ def verify(words: Sequence[str]) -> int:
     parser = _parser_of("verify", _VERIFY)
     parser.add_argument("row", metavar="ROW", help="a row with a result")
     parser.add_argument("scene", metavar="SCENE", help="one of the scale's: fox, bonsai_800, garden, ...")
-    parser.add_argument("--seed", type=int, default=_SEED, help="of the result (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=SEED, help="of the result (default: %(default)s)")
     parser.add_argument("--steps", type=_positive, metavar="N", help="only the first steps (default: all)")
     _add_scale(parser)
     _add_data(parser)
@@ -260,7 +239,6 @@ def verify(words: Sequence[str]) -> int:
     _add_work(parser, "the folder that the commit is cloned and trained in (default: %(default)s)")
     _add_backend(parser, "what takes the steps (default: what took those of the result)")
     args = parser.parse_args(words)
-    from paper_repro.jobs import job_named
     from paper_repro.train_row import Options
     from paper_repro.verify import TOLERANCES
     from paper_repro.verify import verify as verified
@@ -334,11 +312,10 @@ def table(words: Sequence[str]) -> int:
     from paper_repro.table_formats import csv_text, latex, markdown
 
     results, absent = read_all(args.scale, existing_folder(args.results)), _absent(args.scale, args.data)
-    made = (
-        tables.beyond(args.scale, results, absent)
-        if args.number == "beyond"
-        else tables.table(int(args.number), args.scale, results, absent)
-    )
+    if args.number == "beyond":
+        made = tables.beyond(args.scale, results, absent)
+    else:
+        made = tables.table(int(args.number), args.scale, results, absent)
     if args.out is None:
         print(markdown(made))
         return 0
@@ -385,7 +362,6 @@ def claims(words: Sequence[str]) -> int:
 
 def _absent(scale: str, data: Path) -> list[str]:
     """List the scenes of a scale that are not under the data root; nothing is known where there is no root."""
-
     if not data.is_dir():
         return []
     absent: list[str] = []

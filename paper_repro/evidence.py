@@ -62,24 +62,12 @@ def _log(value: float | None) -> float | None:
 
 
 PSNR: Final = Quantity("PSNR", lambda r: r.psnr)
-
-
 SSIM: Final = Quantity("SSIM", lambda r: r.ssim)
-
-
 COUNT: Final = Quantity("number of Gaussians", lambda r: _log(r.num_gaussians), is_log=True)
-
-
 # a time by the clock of a CPU that may do other work is no measure of a method
 SECONDS: Final = Quantity("time", lambda r: _log(r.training_seconds) if r.is_timed else None, is_log=True)
-
-
 BLENDED: Final = Quantity("Gaussians blended a pixel", lambda r: _log(r.n_blended), is_log=True)
-
-
 VISITED: Final = Quantity("Gaussians visited a pixel", lambda r: _log(r.n_traversed), is_log=True)
-
-
 QUANTITIES: Final = (PSNR, SSIM, COUNT, SECONDS, BLENDED, VISITED)
 
 
@@ -196,9 +184,7 @@ class Comparison:
 
     def half_width(self, together: int) -> float:
         """Give half of the interval's width where so many comparisons are made together; infinite without noise."""
-        if self.error is None:
-            return inf
-        return _quantile(self.df, together) * self.error
+        return inf if self.error is None else _quantile(self.df, together) * self.error
 
     def holds(self, together: int) -> bool | None:
         """Say whether what is asked is so; None where the interval has the bound inside, or nothing is asked."""
@@ -218,8 +204,7 @@ class Comparison:
 
     def text(self, together: int) -> str:
         """Write the value with its interval."""
-        half = self.half_width(together)
-        return f"{self.says} {self._value(half)}"
+        return f"{self.says} {self._value(self.half_width(together))}"
 
     def _value(self, half: float) -> str:
         told = half < inf
@@ -263,10 +248,9 @@ def compare(
     values = [group.values(quantity) for group in used]
     if len(used) < len(weights) or any(len(v) < len(g.runs) for v, g in zip(values, used, strict=True)):
         return None
-    coefficients = list(weights.values())
-    value = sum(c * fmean(v) for c, v in zip(coefficients, values, strict=True))
-    return with_error(says, value, [(quantity, c, len(v)) for c, v in zip(coefficients, values, strict=True)], noise,
-                      asked, bound, shown_as or ("share" if quantity.is_log else "dB"))  # fmt: skip
+    pairs = list(zip(weights.values(), values, strict=True))
+    value, parts = sum(c * fmean(v) for c, v in pairs), [(quantity, c, len(v)) for c, v in pairs]
+    return with_error(says, value, parts, noise, asked, bound, shown_as or ("share" if quantity.is_log else "dB"))
 
 
 def with_error(
@@ -415,9 +399,8 @@ def verdict_over(verdicts: Iterable[Verdict]) -> Verdict:
 
 def command(scale: str, rows: Iterable[str], scenes: Iterable[str], seeds: int) -> str:
     """Give the command that trains rows on scenes with so many seeds; what is finished of it is not trained again."""
-    words = ["pop-repro queue", f"--scale {scale}", "--data DATA", f"--rows {' '.join(rows)}"]
-    words.append(f"--scenes {' '.join(scenes)}")
-    return " ".join([*words, *([f"--seeds {seeds}"] if seeds > 1 else [])])
+    words = f"pop-repro queue --scale {scale} --data DATA --rows {' '.join(rows)} --scenes {' '.join(scenes)}"
+    return words + (f" --seeds {seeds}" if seeds > 1 else "")
 
 
 def groups(results: Iterable[Result]) -> Groups:

@@ -12,13 +12,13 @@ from __future__ import annotations
 import sys
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from paper_repro import results
-from paper_repro.scenes import DATASETS, SCENES, PaperScene, Scale, scale_named, scene_named
+from paper_repro.scenes import DATASETS, SCENES, PaperScene, Scale, require_fields, scale_named, scene_named
 from pop_fast.errors import PopError
 from pop_ref.registry import Registry
 
@@ -100,13 +100,9 @@ def load_row(name: str, folder: Path = CONFIGS) -> Row:
         found = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise PopError(f"{path}: is not TOML: {error}") from error
-    wanted = [field.name for field in fields(Row) if field.name != "name"]
-    for field in [*wanted, *found]:
-        if field not in wanted:
-            raise PopError(f"{path}: {field} is not a field of a row; the fields are {', '.join(wanted)}")
-        if field not in found and field not in ("scenes", "base"):
-            raise PopError(f"{path}: has no {field}")
-    return _checked(name, path, {"scenes": {}, **found})
+    found = {"scenes": {}, **found}
+    require_fields(path, found, Row, "row")
+    return _checked(name, path, found)
 
 
 def added_rows() -> list[Row]:
@@ -118,9 +114,9 @@ def _file_of(name: str, folder: Path) -> Path:
     return ROWS[name] if name not in _OWN and name in ROWS else folder / f"{name}.toml"
 
 
-def load_rows(folder: Path = CONFIGS) -> list[Row]:
+def load_rows() -> list[Row]:
     """Read every row, in the order of the tables."""
-    return [load_row(name, folder) for name in ROWS]
+    return [load_row(name) for name in ROWS]
 
 
 def header_of(name: str, folder: Path = CONFIGS) -> dict[str, str]:
@@ -167,20 +163,10 @@ def _checked(name: str, path: Path, found: Mapping[str, Any]) -> Row:
         raise fail("cost", "a number above 0")
     if size not in _BYTES:
         raise fail("bytes_per_gaussian", " or ".join(map(str, _BYTES)))
-    return Row(
-        name=name,
-        title=found["title"],
-        method=found["method"],
-        options=tuple(found["options"]),
-        tables=tuple(found["tables"]),
-        figures=tuple(found["figures"]),
-        paper=dict(found["paper"]),
-        description=found["description"].strip(),
-        cost=float(cost),
-        bytes_per_gaussian=size,
-        scenes={key: tuple(value) for key, value in found["scenes"].items()},
-        base=found.get("base"),
-    )
+    made = {field: tuple(found[field]) for field in ("options", "tables", "figures")}
+    made |= {"description": found["description"].strip(), "cost": float(cost)}
+    made["scenes"] = {key: tuple(value) for key, value in found["scenes"].items()}
+    return Row(name=name, **{**found, **made})
 
 
 def _is_texts(value: Any) -> bool:
@@ -207,6 +193,7 @@ class Job:
     seed: int = SEED
 
     def __str__(self) -> str:
+        # the words after `pop-repro run`
         return f"{self.row.name} {self.scene.name} --scale {self.scale.name} --seed {self.seed}"
 
     @property
@@ -260,8 +247,7 @@ class Job:
         from pop_fast.train import TrainConfig
         from pop_ref.constants import GSPLAT_1_5, profile_named
 
-        scaler = self.scale.steps_scaler
-        whole = _whole(self)
+        scaler, whole = self.scale.steps_scaler, _whole(self)
         every = self.scale.reset_every
         resets = {} if every is None or whole.strategy.reset_every == 0 else {"strategy.reset_every": every}
         sizes = {} if every is None or not whole.strategy.prune_too_big else {"strategy.prune_too_big_after": every}

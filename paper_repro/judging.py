@@ -28,6 +28,8 @@ from paper_repro.scenes import scale_named
 
 # what a question gets on one scene: comparisons; None for one that lacks a run; why one cannot be made of its runs
 Asked = Sequence[Comparison | str | None]
+# makes one of these from the groups by row and the noise
+Ask = Callable[[Mapping[str, Group], Noise], Comparison | str | None]
 # seeds of each row where nothing is known of the noise yet
 _FIRST_SEEDS: Final = 3
 
@@ -42,7 +44,7 @@ class Question:
         paper: the paper's own numbers for it.
         holds_if: what is asked of a scene.
         rows: that it needs on a scene.
-        ask: makes its comparisons on one scene from the groups by row and the noise.
+        asks: make its comparisons on one scene.
         of_duration: whether it asks what a length of the schedule does, which no shortened schedule decides.
         of_times: whether it compares times, which only runs on one machine allow.
         datasets: of which the paper says it.
@@ -54,7 +56,7 @@ class Question:
     paper: str
     holds_if: str
     rows: tuple[str, ...]
-    ask: Callable[[Mapping[str, Group], Noise], Asked]
+    asks: Sequence[Ask]
     of_duration: bool = False
     of_times: bool = False
     datasets: tuple[str, ...] = DATASETS
@@ -75,7 +77,8 @@ class Other:
 
 
 _WINDOWS: Final = ("blur_3k_4k", "blur_3k_11k", "blur_3k_15k")
-_SWEEP: Final = tuple(f"l1_div_{n}" for n in (1, 2, 5, 10, 20, 50, 100))
+# the rows of the comparison of L1 and L2
+SWEEP: Final = tuple(f"l1_div_{n}" for n in (1, 2, 5, 10, 20, 50, 100))
 
 
 def _other(name: str, concerned: Iterable[str], trained: Mapping[str, str]) -> Other:
@@ -84,11 +87,9 @@ def _other(name: str, concerned: Iterable[str], trained: Mapping[str, str]) -> O
 
 OTHERS: Final = (
     # no row but Reset has resets, so that pruning by size is off in all of them under the default
-    _other("A16 on", ("pop", "l2", "l2_blur", "l2_pop", *_WINDOWS, *_SWEEP), {"pop": "pop_size_prune"}),
+    _other("A16 on", ("pop", "l2", "l2_blur", "l2_pop", *_WINDOWS, *SWEEP), {"pop": "pop_size_prune"}),
     _other(
-        "A2 any view",
-        ("pop", "l2_blur", "reset", *_WINDOWS),
-        {"pop": "pop_any_view", "l2_blur": "l2_blur_any_view"},
+        "A2 any view", ("pop", "l2_blur", "reset", *_WINDOWS), {"pop": "pop_any_view", "l2_blur": "l2_blur_any_view"}
     ),
     _other("A2 added up", ("pop", "l2_blur", "reset", *_WINDOWS), {"pop": "pop_sum"}),
     _other("A12 visible", ("pop", "l2_pop", *_WINDOWS), {"pop": "pop_visible"}),
@@ -138,7 +139,8 @@ def _under(reading: str, question: Question, found: Groups, noise: Noise, scale:
         # a run that is there and not used, since it was timed elsewhere, is not trained again
         have = max((len(by_row[name].runs) for name in missing if name in by_row), default=0)
         seeds = max(_seeds_at_first(noise), have + 1)
-        at.append(_At(scene, used, question.ask(used, noise) if used else (), missing, seeds))
+        asked = [ask(used, noise) for ask in question.asks] if used else []
+        at.append(_At(scene, used, asked, missing, seeds))
     together = sum(c.asked != "nothing" for one in at for c in one.made)
     names = tuple(rows.values())
     evidence, deciders = [], _Deciders(scale)

@@ -75,10 +75,7 @@ class PaperTable:
         Raises:
             KeyError: the table has no such line.
         """
-        for row in self.rows:
-            if row.row == name:
-                return row
-        raise KeyError(name)
+        return {row.row: row for row in self.rows}[name]
 
     def value(self, row: str, dataset: str, metric: str) -> float:
         """Give one printed number."""
@@ -270,13 +267,7 @@ class Statement:
 
 def checks(paper: Paper) -> tuple[Statement, ...]:
     """Make every check."""
-    return (
-        *_checkpoints(paper),
-        *_across_tables(paper),
-        *_colours(paper),
-        *_text(paper),
-        *_order_of_times(paper),
-    )
+    return (*_checkpoints(paper), *_across_tables(paper), *_colours(paper), *_text(paper), *_order_of_times(paper))
 
 
 def checkpoint_mib(num_gaussians: float, bytes_per_gaussian: int) -> float:

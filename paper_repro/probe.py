@@ -68,7 +68,8 @@ class ProbedRun(TrainingRun):
     def take_steps(self, last: int) -> Segment:
         """See `TrainingRun.take_steps`; a segment ends where a probe is due."""
         if self._points is None:
-            self._points = self._read()
+            # what was probed before the step that the run continues from
+            self._points = {step: of for step, of in read_probe(self._path.parent).items() if step < self.step}
         if self.step % self._every == 0:
             self._points[self.step] = self._probe()
         self._write()
@@ -91,10 +92,6 @@ class ProbedRun(TrainingRun):
         """Return a render, the photograph and its mask where training computes; windows take long on one CPU thread."""
         mask = None if view.mask is None else view.mask.to(self._device)
         return image.to(self._device), view.target().to(self._device), mask
-
-    def _read(self) -> dict[int, Mapping[str, float]]:
-        """Take up what was probed before the step that the run continues from."""
-        return {step: point for step, point in read_probe(self._path.parent).items() if step < self.step}
 
     def _write(self) -> None:
         # nothing is written into a folder that the run itself has not begun

@@ -27,7 +27,7 @@ from paper_repro.paper import paper
 from paper_repro.results import RESULTS
 from paper_repro.scenes import DATASETS, MADE, SCENES, PaperScene
 from paper_repro.status import everything, stale_files
-from paper_repro.train_row import BusyError
+from paper_repro.train_row import BusyError, git
 from pop_fast.children import module_command
 
 # of one Gaussian in training: parameters, gradients and two moments in float32; a checkpoint has no gradients
@@ -101,7 +101,7 @@ def run_queue(jobs: Sequence[Job], results: Path, words: Sequence[str], threads:
                 continue
             print(f"[{number}/{len(missing)}] {job}", flush=True)
             start = time.monotonic()
-            status = child.run(module_command("paper_repro", "run", *_words_of(job), *words), threads)
+            status = child.run(module_command("paper_repro", "run", *str(job).split(), *words), threads)
             kinds = {0: outcome.done, BusyError.status: outcome.busy, NotTrainableError.status: outcome.impossible}
             if child.stop and status != 0:
                 break
@@ -135,16 +135,12 @@ def _stoppable() -> Iterator[_Child]:
             signal.signal(number, handler)
 
 
-def _words_of(job: Job) -> list[str]:
-    return [job.row.name, job.scene.name, "--scale", job.scale.name, "--seed", str(job.seed)]
-
-
 def _commit(job: Job, results: Path) -> None:
     path = job.file(results).resolve()
     paths = [str(each) for each in (path, *(_pages(path.parent) if results.resolve() == RESULTS else []))]
     message = f"Result: {job.row.name} on {job.scene.name}, {job.scale.name} scale, seed {job.seed}"
     for command in (["add"], ["commit", "--quiet", "-m", message]):
-        done = _git(path.parent, *command, "--", *paths)
+        done = git(path.parent, *command, "--", *paths)
         if done.returncode != 0:
             print(f"pop-repro: git {command[0]} {path.name} failed: {done.stderr.strip()}", file=sys.stderr)
             return
@@ -153,14 +149,10 @@ def _commit(job: Job, results: Path) -> None:
 def _pages(folder: Path) -> list[Path]:
     """Write what is made from the package's results, but for pages that somebody edits just now; give what changed."""
     stale = stale_files(everything())
-    unedited = [path for path in stale if not _git(folder, "status", "--porcelain", "--", str(path)).stdout]
+    unedited = [path for path in stale if not git(folder, "status", "--porcelain", "--", str(path)).stdout]
     for path in unedited:
         path.write_text(stale[path], encoding="utf-8")
     return unedited
-
-
-def _git(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(["git", "-C", str(folder), *words], capture_output=True, text=True, check=False)
 
 
 def state(job: Job, results: Path, work: Path) -> str:
@@ -257,9 +249,7 @@ def _data(jobs: Sequence[Job], data: Path) -> list[str]:
 
 def _disk(jobs: Sequence[Job], work: Path) -> list[str]:
     pixels = [job.scene.size[0] * job.scene.size[1] / job.factor**2 for job in jobs]
-    needed = sum(_RENDERS * _OF_PIXEL * count for count in pixels) + max(map(_gaussians, jobs)) * (
-        2 * _CHECKPOINT + _PLY
-    )
+    needed = _RENDERS * _OF_PIXEL * sum(pixels) + max(map(_gaussians, jobs)) * (2 * _CHECKPOINT + _PLY)
     place = next(folder for folder in (work.absolute(), *work.absolute().parents) if folder.is_dir())
     free = shutil.disk_usage(place).free
     if free >= needed:

@@ -262,8 +262,8 @@ class _Fields:
             raise self.fail(field, f"a finite number{between}")
         return float(value)
 
-    def number_or_none(self, field: str, least: float) -> float | None:
-        return None if self.found[field] is None else self.number(field, least)
+    def number_or_none(self, field: str) -> float | None:
+        return None if self.found[field] is None else self.number(field, 0.0)
 
     def mapping(self, field: str) -> dict[str, Any]:
         value = self.found[field]
@@ -303,7 +303,7 @@ def _result(take: _Fields) -> Result:
         raise take.fail("scale", f"one of {', '.join(_SCALES)}")
     name = r"[a-z0-9]+(?:_[a-z0-9]+)*"
     lower = "lower-case letters, digits and _"
-    n = take.whole("num_gaussians", 0)
+    n, files = take.whole("num_gaussians", 0), take.inner("files")
     return Result(
         scale=take.text("scale"),
         row=take.text("row", name, lower),
@@ -327,15 +327,15 @@ def _result(take: _Fields) -> Result:
         ssim=take.number("ssim", -1.0, 1.0),
         lpips=_lpips(take),
         lpips_reason=take.text("lpips_reason", or_none=True),
-        n_blended=take.number_or_none("n_blended", 0.0),
-        n_traversed=take.number_or_none("n_traversed", 0.0),
+        n_blended=take.number_or_none("n_blended"),
+        n_traversed=take.number_or_none("n_traversed"),
         opacity_below_01=take.number("opacity_below_0.1", 0.0, 1.0),
         opacity_above_09=take.number("opacity_above_0.9", 0.0, 1.0),
         opacity_histogram=_histogram(take, n),
         curve=_curve(take),
         per_view=_per_view(take.inner("per_view")),
         ply_hash=take.text("ply_hash", *_HASH, or_none=True),
-        files=_files(take.inner("files")),
+        files={name: files.text(name, *_HASH) for name in files.found},
     )
 
 
@@ -368,10 +368,6 @@ def _agree(result: Result, take: _Fields) -> None:
         raise take.fail("curve", f"one that ends at step {last}, of schedule, with {n} Gaussians")
 
 
-def _files(take: _Fields) -> dict[str, str]:
-    return {name: take.text(name, *_HASH) for name in take.found}
-
-
 def _protocol(take: _Fields) -> dict[str, Any]:
     _known(take.found, [*_PROTOCOL, *([_BASE] if _BASE in take.found else [])], take.where)
     if _BASE in take.found:
@@ -397,7 +393,7 @@ def _seconds(take: _Fields) -> dict[str, float]:
 def _lpips(take: _Fields) -> dict[str, float | None]:
     inner = take.inner("lpips")
     _known(inner.found, LPIPS_VARIANTS, inner.where)
-    values = {variant: inner.number_or_none(variant, 0.0) for variant in LPIPS_VARIANTS}
+    values = {variant: inner.number_or_none(variant) for variant in LPIPS_VARIANTS}
     if None in values.values() and take.found["lpips_reason"] is None:
         raise take.fail("lpips_reason", "a text, since a variant of LPIPS is null")
     return values

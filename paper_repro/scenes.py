@@ -125,12 +125,7 @@ def load_scene(path: Path) -> PaperScene:
         found = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise PopError(f"{path}: is not a scene's TOML file: {error}") from error
-    known = {field.name: field for field in fields(PaperScene) if field.name != "name"}
-    for name in [*known, *found]:
-        if name not in known:
-            raise PopError(f"{path}: {name} is not a field of a scene; the fields are {', '.join(known)}")
-        if name not in found and known[name].default is MISSING:
-            raise PopError(f"{path}: has no {name}")
+    require_fields(path, found, PaperScene, "scene")
 
     def fail(field: str, must: str) -> PopError:
         return PopError(f"{path}: {field} is {found[field]!r}; it must be {must}")
@@ -146,6 +141,20 @@ def load_scene(path: Path) -> PaperScene:
     if found["dataset"] not in DATASETS:
         raise fail("dataset", f"one of {', '.join(DATASETS)}")
     return PaperScene(name=path.stem, **{**found, "size": (size[0], size[1])})
+
+
+def require_fields(path: Path, found: Mapping[str, Any], kind: type[Any], called: str) -> None:
+    """Hold the fields of a TOML file to those of a dataclass, whose `name` is the file's.
+
+    Raises:
+        PopError: one is unknown, or absent and has no default; names it.
+    """
+    known = {field.name: field for field in fields(kind) if field.name != "name"}
+    for name in [*known, *found]:
+        if name not in known:
+            raise PopError(f"{path}: {name} is not a field of a {called}; the fields are {', '.join(known)}")
+        if name not in found and known[name].default is MISSING:
+            raise PopError(f"{path}: has no {name}")
 
 
 def load_scenes(folder: Path = FOLDER) -> dict[str, PaperScene]:
@@ -275,12 +284,7 @@ _ALL: Final = (
         of_methods=_POINTS["full"],
         log_every=25,
     ),
-    Scale(
-        name="paper",
-        about="the published protocol",
-        factors=_factors("paper"),
-        checkpoint_every=1_000,
-    ),
+    Scale(name="paper", about="the published protocol", factors=_factors("paper"), checkpoint_every=1_000),
 )
 
 

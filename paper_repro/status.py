@@ -16,14 +16,14 @@ photographs that are not the paper's this is evidence, not proof.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import expm1
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from paper_repro.claims import HEADLINES, claims, noise_of
+from paper_repro.claims import HEADLINES, REFINE_EVERY, WINDOWS, claims, noise_of
 from paper_repro.evidence import ALPHA, DATASETS, JUDGE, PSNR, QUANTITIES, Claim, Group, Noise, Spread, Told, groups
 from paper_repro.judging import OTHERS
 from paper_repro.paper import Paper, paper
@@ -44,9 +44,6 @@ _PAIRS: Final = (
     *(("pop", "l2_blur"), ("pop", "l2_pop"), ("l2_blur", "l2"), ("l2_pop", "l2")),
     *(("pop", "reset"), ("pop", "gsplat"), ("blur_3k_4k", "pop"), ("blur_3k_11k", "pop"), ("blur_3k_15k", "pop")),
 )
-# the windows of table 4 by their length, with the steps between two densification steps of the paper's schedule
-_WINDOWS: Final = (("blur_3k_4k", 4_000), ("pop", 7_000), ("blur_3k_11k", 11_000), ("blur_3k_15k", 15_000))
-_EVERY: Final = 100
 _N: Final = "N over N"
 _DIFFERENCES: Final = (("PSNR", "psnr"), ("SSIM", "ssim"))
 _GROWTH: Final = "growth a densification step over N of the shorter"
@@ -128,18 +125,11 @@ def _outcome_line(by_scale: Sequence[tuple[str, Claim]]) -> str:
 
 def _one(claim: Claim) -> str:
     parts = [f"### {claim.id}: {claim.says}", f"Condition: {claim.holds_if}. In the paper: {claim.paper}."]
-    rows = [
-        [
-            told.reading or "default",
-            e.scene,
-            e.says,
-            e.verdict + (f": {e.why}" if e.why else ""),
-            e.under,
-            ", ".join(e.runs),
-        ]
-        for told in (claim.told, *claim.others)
-        for e in told.evidence
-    ]
+    rows = []
+    for told in (claim.told, *claim.others):
+        for e in told.evidence:
+            verdict = e.verdict + (f": {e.why}" if e.why else "")
+            rows.append([told.reading or "default", e.scene, e.says, verdict, e.under, ", ".join(e.runs)])
     parts.append(grid(_HEAD, rows) if rows else "Not decided: no scene has runs for it.")
     return "\n\n".join([*parts, *(_deciders(told) for told in (claim.told, *claim.others) if told.deciders)])
 
@@ -257,7 +247,7 @@ def columns(published: Paper) -> tuple[Column, ...]:
         found.append(Column((row, base), _N, counts))
         for name, metric in _DIFFERENCES:
             found.append(Column((row, base), name, tuple(ours[metric] - theirs[metric] for ours, theirs in both)))
-    for (shorter, first), (longer, last) in pairwise(_WINDOWS):
+    for (shorter, first), (longer, last) in pairwise(WINDOWS.items()):
         counts = [tuple(published.ablation(row, d, "num_gaussians_k") for row in (longer, shorter)) for d in DATASETS]
         grown = tuple(_growth(more, less, first, last) for more, less in counts)
         found.append(Column((longer, shorter), _GROWTH, grown))
@@ -273,7 +263,7 @@ def _printed(published: Paper, dataset: str, *rows: str) -> list[Mapping[str, fl
 
 
 def _growth(more: float, less: float, first: int, last: int) -> float:
-    return (more - less) / less / ((last - first) / _EVERY)
+    return (more - less) / less / ((last - first) / REFINE_EVERY)
 
 
 def _found(column: Column, rows: Mapping[str, Group], trained: Mapping[str, str | None]) -> float | None:
@@ -285,9 +275,8 @@ def _found(column: Column, rows: Mapping[str, Group], trained: Mapping[str, str 
     if column.quantity == _N:
         return ours.n / theirs.n
     if column.quantity == _GROWTH:
-        ends = dict(_WINDOWS)
         longer, shorter = column.rows
-        return _growth(ours.n, theirs.n, ends[shorter], ends[longer])
+        return _growth(ours.n, theirs.n, WINDOWS[shorter], WINDOWS[longer])
     metric = dict(_DIFFERENCES)[column.quantity]
     return _mean(ours, metric) - _mean(theirs, metric)
 
@@ -300,18 +289,16 @@ def _answer(reading: Reading, results: Sequence[Result]) -> Answer:
     trained = next(other.rows for other in OTHERS if other.name == reading.other)
     lines: list[tuple[str, ...]] = []
     votes: list[tuple[tuple[str, ...], int]] = []
-    for scale in _telling(results):
-        for scene, rows in groups(r for r in results if r.scale == scale).items():
-            for column in columns(paper()):
-                if not set(column.rows) & trained.keys():
-                    continue
-                default, other = _found(column, rows, {}), _found(column, rows, trained)
-                if default is None or other is None:
-                    continue
-                # over the default's: which is nearer, or both within the range
-                ahead = column.apart(other) - column.apart(default)
-                votes.append((column.rows, (ahead > 0.0) - (ahead < 0.0)))
-                lines.append((scale, scene, *_shown(column, default, other), _NEARER[votes[-1][1]]))
+    concerned = [column for column in columns(paper()) if set(column.rows) & trained.keys()]
+    for scale, scene, rows in _scenes(results):
+        for column in concerned:
+            default, other = _found(column, rows, {}), _found(column, rows, trained)
+            if default is None or other is None:
+                continue
+            # over the default's: which is nearer, or both within the range
+            ahead = column.apart(other) - column.apart(default)
+            votes.append((column.rows, (ahead > 0.0) - (ahead < 0.0)))
+            lines.append((scale, scene, *_shown(column, default, other), _NEARER[votes[-1][1]]))
     return Answer(reading.id, reading.asks, _says(reading, votes), _COLUMNS, tuple(lines))
 
 
@@ -338,26 +325,27 @@ def _says(reading: Reading, votes: Sequence[tuple[tuple[str, ...], int]]) -> str
     return f"The runs favour {'the default' if lead > 0 else reading.other}: {counted}, also without any one pair."
 
 
-def _telling(results: Sequence[Result]) -> list[str]:
-    """List the scales that say something about a method, the paper's first: those of a made-up scene do not."""
-    return [scale for scale in telling() if any(r.scale == scale for r in results)]
+def _scenes(results: Sequence[Result]) -> Iterator[tuple[str, str, Mapping[str, Group]]]:
+    """Give scale, scene and groups by row at the scales that say something about a method, the paper's first."""
+    for scale in telling():
+        for scene, rows in groups(r for r in results if r.scale == scale).items():
+            yield scale, scene, rows
 
 
 def _longer_schedules(results: Sequence[Result]) -> Answer:
     """E2: what POP does to N and PSNR on schedules of several lengths, by its weight."""
     lines: list[tuple[str, ...]] = []
     lengths: dict[tuple[str, float], set[float]] = {}
-    for scale in _telling(results):
-        for scene, rows in groups(r for r in results if r.scale == scale).items():
-            if "pop" not in rows or "l2_blur" not in rows:
-                continue
-            pop, blur = rows["pop"], rows["l2_blur"]
-            steps, weight = setting(pop.runs[0], "max_steps"), setting(pop.runs[0], "lambda_pop")
-            if steps is None or weight is None:
-                continue
-            lengths.setdefault((scene, weight), set()).add(steps)
-            shown = f"{steps:,.0f}", f"{weight:g}", f"{pop.n / blur.n:.1%}", f"{pop.psnr - blur.psnr:+.2f} dB"
-            lines.append((scale, scene, *shown, ", ".join((*pop.ids, *blur.ids))))
+    for scale, scene, rows in _scenes(results):
+        if "pop" not in rows or "l2_blur" not in rows:
+            continue
+        pop, blur = rows["pop"], rows["l2_blur"]
+        steps, weight = (setting(pop.runs[0], name) for name in ("max_steps", "lambda_pop"))
+        if steps is None or weight is None:
+            continue
+        lengths.setdefault((scene, weight), set()).add(steps)
+        shown = f"{steps:,.0f}", f"{weight:g}", f"{pop.n / blur.n:.1%}", f"{pop.psnr - blur.psnr:+.2f} dB"
+        lines.append((scale, scene, *shown, ", ".join((*pop.ids, *blur.ids))))
     head = ("scale", "scene", "steps", "weight", "N(pop) / N(l2_blur)", "PSNR", "runs")
     several = sorted({scene for (scene, _), steps in lengths.items() if len(steps) > 1})
     if not several:
@@ -375,13 +363,12 @@ def _longer_schedules(results: Sequence[Result]) -> Answer:
 def _pruned_harder(results: Sequence[Result]) -> Answer:
     """E4: what pruning harder at the paper's weight does."""
     lines: list[tuple[str, ...]] = []
-    for scale in _telling(results):
-        for scene, rows in groups(r for r in results if r.scale == scale).items():
-            for row in (row for row in _PRUNED if row in rows and "pop" in rows):
-                pop, pruned, base = rows["pop"], rows[row], rows.get("gsplat")
-                shown = f"{pruned.n / pop.n:.1%}", f"{pruned.psnr - pop.psnr:+.2f} dB"
-                share = f"{pruned.n / base.n:.1%}" if base is not None else "gsplat not run"
-                lines.append((scale, scene, row, *shown, share, ", ".join((*pruned.ids, *pop.ids))))
+    for scale, scene, rows in _scenes(results):
+        for row in (row for row in _PRUNED if row in rows and "pop" in rows):
+            pop, pruned, base = rows["pop"], rows[row], rows.get("gsplat")
+            shown = f"{pruned.n / pop.n:.1%}", f"{pruned.psnr - pop.psnr:+.2f} dB"
+            share = f"{pruned.n / base.n:.1%}" if base is not None else "gsplat not run"
+            lines.append((scale, scene, row, *shown, share, ", ".join((*pruned.ids, *pop.ids))))
     head = ("scale", "scene", "row", "N of POP's", "PSNR less POP's", "N of gsplat's", "runs")
     says = (
         "Pruning harder at the paper's weight, below." if lines else "Not decided: no scene has POP and a harder prune."
@@ -398,24 +385,16 @@ def status_table(results: Iterable[Result]) -> str:
     rows = [_claim_row(by_scale, found) for by_scale in zip(*(claims(s, found) for s in telling()), strict=True)]
     for table in paper().tables:
         lines = [line.row for line in table.rows]
-        what = f"table {table.number}: {table.title}"
-        cells = f"{len(lines)} rows, {', '.join(table.datasets)}"
-        used = [r for r in found if r.row in lines]
-        rows.append(
-            [
-                what,
-                cells,
-                _progress(lines, table.datasets, used),
-                f"`pop-repro table {table.number} --scale small`",
-                _commits(used),
-            ]
-        )
-    used = [r for r in found if r.row in beyond_rows() and r.row != "pop"]
-    progress = _progress([row for row in beyond_rows() if row != "pop"], DATASETS, used)
-    rows.append(
-        ["beyond the paper", "not in the paper", progress, "`pop-repro table beyond --scale small`", _commits(used)]
-    )
+        what, cells = f"table {table.number}: {table.title}", f"{len(lines)} rows, {', '.join(table.datasets)}"
+        rows.append([what, cells, *_table_row(str(table.number), lines, table.datasets, found)])
+    beyond = [row for row in beyond_rows() if row != "pop"]
+    rows.append(["beyond the paper", "not in the paper", *_table_row("beyond", beyond, DATASETS, found)])
     return grid(["claim or table", "paper", "ours", "command", "commits"], rows)
+
+
+def _table_row(table: str, rows: Sequence[str], datasets: Sequence[str], found: Iterable[Result]) -> list[str]:
+    used = [r for r in found if r.row in rows]
+    return [_progress(rows, datasets, used), f"`pop-repro table {table} --scale small`", _commits(used)]
 
 
 def files(results: Iterable[Result], folder: Path = HERE) -> dict[Path, str]:

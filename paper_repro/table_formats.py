@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from paper_repro.paper import Metric
-from paper_repro.tables import Block, Cell, Line, Table
+from paper_repro.tables import Block, Line, Table
 
 # so many run ids fit into a line; more are listed below the block
 _IDS = 3
@@ -85,9 +85,8 @@ def _block(table: Table, block: Block) -> list[str]:
         rows.append([line.name, "here", *(_marked(cell.ours, cell.place) for cell in cells), _runs(line)])
         if beside:
             rows.append([line.name, "paper", *(_marked(cell.paper, cell.paper_place) for cell in cells), "the paper"])
-            rows.append(
-                [line.name, "difference", *(_noted(cell.difference, notes) for cell in cells), "here less the paper"]
-            )
+            differences = [_noted(cell.difference, notes) for cell in cells]
+            rows.append([line.name, "difference", *differences, "here less the paper"])
     parts = [f"### {block.title}", grid(head, rows)]
     if notes.texts:
         parts.append("\n".join(f"{i}. not comparable: {text}" for i, text in enumerate(notes.texts, start=1)))
@@ -178,14 +177,13 @@ def _tabular(table: Table, block: Block) -> str:
     for line in block.lines:
         cells = [line.cells[metric.id] for metric in table.metrics]
         shade = r"\rowcolor[gray]{0.95} " if line.row == "pop" else ""
-        lines.append(_row([shade + _plain(line.name), "here", *map(_ours, cells), _plain(_latex_runs(line))]))
+        ours = [_coloured(cell.ours, cell.place) for cell in cells]
+        lines.append(_row([shade + _plain(line.name), "here", *ours, _plain(_latex_runs(line))]))
         if beside:
-            lines.append(_row(["", "paper", *map(_paper, cells), "the paper"]))
-            lines.append(
-                _row(
-                    ["", "difference", *(_latex_noted(cell.difference, notes) for cell in cells), "here less the paper"]
-                )
-            )
+            printed = [_coloured(cell.paper, cell.paper_place) for cell in cells]
+            differences = [_latex_noted(cell.difference, notes) for cell in cells]
+            lines.append(_row(["", "paper", *printed, "the paper"]))
+            lines.append(_row(["", "difference", *differences, "here less the paper"]))
     lines += [r"\bottomrule", r"\end{tabular}}"]
     below = [rf"\par $^{{{i}}}$ {_plain(text)}" for i, text in enumerate(notes.texts, start=1)]
     return "\n".join([*lines, *below])
@@ -213,14 +211,6 @@ def _latex_noted(text: str, notes: Notes) -> str:
     return _plain(short) + (f"$^{{{number}}}$" if number else "")
 
 
-def _ours(cell: Cell) -> str:
-    return _coloured(cell.ours, cell.place)
-
-
-def _paper(cell: Cell) -> str:
-    return _coloured(cell.paper, cell.paper_place)
-
-
 def _coloured(text: str, place: int) -> str:
     return (rf"\cellcolor{{{_COLOURS[place]}}}" if place else "") + _plain(text)
 
@@ -228,9 +218,8 @@ def _coloured(text: str, place: int) -> str:
 def _latex_runs(line: Line) -> str:
     if not line.runs:
         return "none"
-    return f"n = {line.seeds}: {', '.join(run.split()[-1] for run in line.runs[:3])}" + (
-        f" and {len(line.runs) - 3} more" if len(line.runs) > 3 else ""
-    )
+    more = f" and {len(line.runs) - _IDS} more" if len(line.runs) > _IDS else ""
+    return f"n = {line.seeds}: {', '.join(run.split()[-1] for run in line.runs[:_IDS])}{more}"
 
 
 def _plain(text: str) -> str:

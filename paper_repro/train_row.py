@@ -16,13 +16,14 @@ import re
 import shutil
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from paper_repro import prepared, results
-from paper_repro.jobs import WORK, Job
+from paper_repro.collect import BESIDE, PROBE, collect, first_change, publish, spacing, state_of_data
+from paper_repro.jobs import WORK, Job, load_row, load_rows
 from paper_repro.results import COMMIT, Result
 from paper_repro.scenes import MADE, PaperScene, find_folder
 from pop_fast.errors import PopError
@@ -30,10 +31,6 @@ from pop_fast.errors import PopError
 if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train import TrainConfig
-from collections.abc import Mapping
-
-from paper_repro.collect import BESIDE, PROBE
-from paper_repro.jobs import load_row, load_rows
 
 # of a work folder: what finished rows leave to be published
 PUBLISHED: Final = "published"
@@ -108,8 +105,6 @@ def finished(job: Job, folder: Path) -> Result | None:
     """
     result = job.result(folder)
     if result is not None:
-        from paper_repro.collect import first_change
-
         change = first_change(result, job.config())
         if change is not None:
             raise PopError(
@@ -142,8 +137,6 @@ def train_row(job: Job, options: Options) -> Result:
         result = None if options.again else job.result(options.results)
         if result is None:
             _train(job, options, config)
-            from paper_repro.collect import collect, publish
-
             published = options.published or options.work / PUBLISHED
             result = collect(job, work, publish(job, work, published, config.max_steps - 1))
             results.write(result, options.results)
@@ -183,19 +176,20 @@ def commit() -> str | None:
             raise PopError(f"POP_COMMIT is {told!r}; it must be 7 to 40 hex digits of a git commit, or unset")
         return told
     here = Path(__file__).resolve().parents[1]
-    git = ["git", "-C", str(here)]
     try:
-        asked = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
+        asked = git(here, "rev-parse", "HEAD")
         # results are added while rows are trained, and change nothing
-        changed = subprocess.run(
-            [*git, "status", "--porcelain", "--untracked-files=no", "--", ":!paper_repro/results"],
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-    except (OSError, subprocess.CalledProcessError):
+        changed = git(here, "status", "--porcelain", "--untracked-files=no", "--", ":!paper_repro/results")
+    except OSError:
+        return None
+    if asked.returncode != 0 or changed.returncode != 0:
         return None
     return asked.stdout.strip() + ("-dirty" if changed.stdout.strip() else "")
+
+
+def git(root: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run git in a folder; the caller looks at the status."""
+    return subprocess.run(["git", "-C", str(root), *words], capture_output=True, text=True, check=False)
 
 
 @contextlib.contextmanager
@@ -230,7 +224,6 @@ def _config(job: Job, options: Options, work: Path) -> TrainConfig:
 
 
 def _train(job: Job, options: Options, config: TrainConfig) -> None:
-    from paper_repro.collect import BESIDE, spacing, state_of_data
     from paper_repro.data_check import check_capture
     from pop_fast.cli.train import check_backend
     from pop_fast.train.choose import choose_backend
@@ -270,7 +263,6 @@ def load_capture_of(job: Job, config: TrainConfig) -> tuple[Capture, float]:
 
 def _begin(job: Job, options: Options, config: TrainConfig, capture: Capture) -> str | None:
     """Prepare the result folder of a training, and return the run id of what it begins or began from."""
-    from paper_repro.collect import BESIDE
     from pop_fast.io.read_back import read_json
     from pop_fast.train.checkpoint import list_checkpoints
 

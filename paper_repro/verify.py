@@ -24,7 +24,7 @@ from typing import Final
 from paper_repro.collect import curve_of, digits, file_hash, final_stats, ply_of
 from paper_repro.jobs import Job
 from paper_repro.results import Result
-from paper_repro.train_row import Options
+from paper_repro.train_row import Options, git
 from pop_fast.api.backend import backend_names, get_backend
 from pop_fast.children import python_command
 from pop_fast.errors import PopError
@@ -95,10 +95,10 @@ def verify(job: Job, options: Options, steps: int | None = None) -> Verification
 
 def history(root: Path = _ROOT) -> frozenset[str] | None:
     """Return the commits that the clone's branch consists of; None outside a clone, and in one without its history."""
-    shallow = _git(root, "rev-parse", "--is-shallow-repository")
+    shallow = git(root, "rev-parse", "--is-shallow-repository")
     if shallow.returncode != 0 or shallow.stdout.strip() == "true":
         return None
-    return frozenset(_git(root, "rev-list", "HEAD").stdout.split())
+    return frozenset(git(root, "rev-list", "HEAD").stdout.split())
 
 
 def other_kind(result: Result, backend: str = "auto") -> tuple[str, ...]:
@@ -125,9 +125,9 @@ def _require_commit(result: Result, root: Path) -> None:
     what = f"{result.row} {result.scene} --scale {result.scale} --seed {result.seed}"
     if result.commit is None or result.commit.endswith("-dirty"):
         raise PopError(f"{what}: its commit is {result.commit}, which is no commit; train it again in a clean clone")
-    if _git(root, "rev-parse", "HEAD").returncode != 0:
+    if git(root, "rev-parse", "HEAD").returncode != 0:
         raise PopError(f"{root}: is not a clone of the repository, which has the program of commit {result.commit}")
-    if _git(root, "cat-file", "-e", f"{result.commit}^{{commit}}").returncode != 0:
+    if git(root, "cat-file", "-e", f"{result.commit}^{{commit}}").returncode != 0:
         raise PopError(f"{what}: commit {result.commit} is not in {root}; fetch the whole history, or train it again")
 
 
@@ -141,7 +141,7 @@ def _check_out(commit: str, clone: Path) -> None:
             ("clone", "--quiet", "--shared", "--no-checkout", str(_ROOT), str(partial)),
             ("-C", str(partial), "checkout", "--quiet", "--detach", commit),
         ):
-            done = _git(_ROOT, *words)
+            done = git(_ROOT, *words)
             if done.returncode != 0:
                 raise PopError(f"git {words[0]} of commit {commit} failed: {done.stderr.strip()}")
         # a library's name holds the digest of its source: one that does not fit is not loaded
@@ -169,12 +169,7 @@ def _train(job: Job, result: Result, options: Options, place: Path, steps: int |
     # a session of its own: a terminal's Ctrl-C would reach it as well as what is passed on, and two mean "at once"
     with open(place / "log.txt", "w") as log:
         process = subprocess.Popen(
-            command,
-            cwd=clone,
-            env=_environment(clone, result.threads),
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
+            command, cwd=clone, env=_environment(clone, result.threads), stdout=log, stderr=log, start_new_session=True
         )
         with _ended_with_us(process):
             while process.poll() is None and (wanted == last or _steps_taken(work) <= wanted):
@@ -275,7 +270,3 @@ def _backend_of(result: Result) -> str:
 
 def _environment(clone: Path, threads: int) -> Mapping[str, str]:
     return {**os.environ, "PYTHONPATH": str(clone), "OMP_NUM_THREADS": str(max(threads, 1))}
-
-
-def _git(root: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(["git", "-C", str(root), *words], capture_output=True, text=True, check=False)

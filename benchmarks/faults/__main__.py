@@ -28,11 +28,9 @@ from typing import Any
 import cv2
 import torch
 
+from benchmarks.record import machine, read_json, write_json
+
 from . import disk, fuzz, runs, sanitizers
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from record import machine, read_json, write_json
 
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "faults.json"
 PARTS = ("fuzz", "kills", "crashes", "writes", "flips", "sanitizers")
@@ -61,7 +59,7 @@ def main() -> int:
     # children that are forked must find no thread's locks taken
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    found = {part: result for part in args.only or (QUICK if args.quick else PARTS) for result in [_run(part, args)]}
+    found = {part: _run(part, args) for part in args.only or (QUICK if args.quick else PARTS)}
     earlier = read_json(args.out)
     # kinds of runs, and a reader, that are tried alone replace their own results
     kept = {part: {**earlier.get(part, {}), **found[part]} for part in found if args.kind is not None}

@@ -323,12 +323,9 @@ def _write_records(result: Path, folder: Path) -> None:
     (folder / "renders.json").write_text(json.dumps({"renders": [{"view": "0.png", "file": "0.png"}]}))
     (folder / "cfg_args").write_text("Namespace(eval=True, exported_by='pop export')")
     (folder / "gpu_check_1.json").write_text(json.dumps({"job": 1, "stages": {"build": {"status": 0, "seconds": 1.0}}}))
-    (folder / "laws.jsonl").write_text(
-        json.dumps({"test": "a", "outcome": "passed", "seconds": 0.1, "words": ""})
-        + "\n"
-        + json.dumps({"test": "b", "outcome": "skipped", "seconds": 0.0, "words": "no GPU"})
-        + "\n"
-    )
+    laws = [{"test": "a", "outcome": "passed", "seconds": 0.1, "words": ""}]
+    laws += [{"test": "b", "outcome": "skipped", "seconds": 0.0, "words": "no GPU"}]
+    (folder / "laws.jsonl").write_text("".join(f"{json.dumps(law)}\n" for law in laws))
     torch.save({"lin0.model.1.weight": torch.ones(1, 64, 1, 1)}, folder / "lpips.pt")
     repro = HERE.parents[2] / "paper_repro"
     (folder / "full").mkdir()

@@ -11,6 +11,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,24 +37,21 @@ def crash_points(of: UndisturbedRun, most: int | None) -> dict[str, Any]:
         of: what is trained.
         most: so many points of each job at most, spread evenly; None takes all.
     """
-    return _at_points(of, most, lambda number: lambda: os._exit(CRASHED), short_writes=False)
+    return _at_points(of, most, lambda number: os._exit(CRASHED), short_writes=False)
 
 
 def failing_writes(of: UndisturbedRun, most: int | None) -> dict[str, Any]:
     """Let every change of the disk, and every write of a file in its middle, be refused by the system in turn."""
 
-    def refused(number: int) -> Callable[[], None]:
-        def refuse() -> None:
-            code = _ERRORS[number % len(_ERRORS)]
-            raise OSError(code, os.strerror(code))
+    def refuse(number: int) -> None:
+        code = _ERRORS[number % len(_ERRORS)]
+        raise OSError(code, os.strerror(code))
 
-        return refuse
-
-    return _at_points(of, most, refused, short_writes=True)
+    return _at_points(of, most, refuse, short_writes=True)
 
 
 def _at_points(
-    of: UndisturbedRun, most: int | None, fault: Callable[[int], Callable[[], None]], short_writes: bool
+    of: UndisturbedRun, most: int | None, fault: Callable[[int], None], short_writes: bool
 ) -> dict[str, Any]:
     results: dict[str, Any] = {}
     for job, (work, check) in _jobs(of).items():
@@ -68,7 +66,7 @@ def _at_points(
 
             def disturbed(number: int = number, work: Callable[[], int] = work) -> int:
                 run_parts(in_children=False)
-                with disturbing(number, fault(number), short_writes):
+                with disturbing(number, partial(fault, number), short_writes):
                     return work()
 
             status = ended(*of.together([disturbed, *[work] * (of.kind.ranks - 1)], said))
@@ -85,15 +83,11 @@ def _at_points(
 
 def _jobs(of: UndisturbedRun) -> dict[str, tuple[Callable[[], int], Callable[[], str | None]]]:
     """List what writes, each with what must hold after it was disturbed."""
-
-    def replaced() -> str | None:
-        # whoever looks next finds the old result or the new one, and can train over it
-        return of.finish("over", "--overwrite")
-
     train = (lambda: of.train("run", "--resume"), lambda: of.finish("run"))
     if of.kind is not KINDS["native step"]:
         return {"train": train}
-    overwrite = (lambda: of.train("over", "--overwrite"), replaced)
+    # whoever looks next finds the old result or the new one, and can train over it
+    overwrite = (lambda: of.train("over", "--overwrite"), lambda: of.finish("over", "--overwrite"))
     return {"train": train, "train --overwrite": overwrite, "write a PLY": _writing(of)}
 
 

@@ -79,14 +79,6 @@ def _splat(path: Path) -> dict[str, torch.Tensor]:
     return load_splat_file(path).params
 
 
-def _sog_folder(folder: Path) -> dict[str, torch.Tensor]:
-    return load_splat_file(folder / "meta.json").params
-
-
-def _splat_with_frame(path: Path) -> dict[str, torch.Tensor]:
-    return load_splat(path).params
-
-
 def _photograph(path: Path) -> Any:
     # a header that tells nothing is no error; the decoder judges the file
     read_exif(path)
@@ -123,14 +115,6 @@ def _archive(path: Path) -> Any:
         return unpack(path, Path(folder) / "unpacked")
 
 
-def _checkpoint(folder: Path) -> Any:
-    return ckpt.load_checkpoint(ckpt.checkpoint_path(folder, 3))
-
-
-def _splats_of_checkpoint(folder: Path) -> dict[str, torch.Tensor]:
-    return ckpt.load_splats(ckpt.checkpoint_path(folder, 3))[0]
-
-
 def _resumed(folder: Path) -> Any:
     begun(folder)
     return choose_backend(TrainConfig.of(result_dir=str(folder), backend="auto"), resume=True)
@@ -139,14 +123,6 @@ def _resumed(folder: Path) -> Any:
 def _path(path: Path) -> Any:
     # as `pop render --path FILE` uses it
     return read_path(path).along(5, np.eye(4))
-
-
-def _exported(path: Path) -> bool:
-    return exported_to(path.parent)(Path("cameras.json"))
-
-
-def _listed(path: Path) -> bool:
-    return listed_in(path.parent)(Path("0.png"))
 
 
 def _course(folder: Path) -> Any:
@@ -173,34 +149,40 @@ def _port(folder: Path) -> Any:
     return vector_check.check(folder, folder / "port").failed
 
 
+def _layer(name: str) -> Literal["zip", "text"]:
+    return "zip" if name.endswith(".npz") else "text"
+
+
+_COLLECTED = (
+    *("row.json", "probe.json", "metrics.jsonl", "stats/train_step0003.json", "stats/val_step0003.json"),
+    "report_data/opacity_step3.npz",
+)
+_REPORTED = (
+    *("metrics.jsonl", "commands.json", "stats/val_step0003.json", "report_data/checks_step3.json"),
+    *(f"report_data/{name}.npz" for name in ("opacity_step-1", "val_step3_0000", "depth_step3_0000")),
+)
 _CKPT = "ckpts/ckpt_3_rank0.pt"
 _SPLATS = {
-    "PLY": Reader("splats/splat.ply", "", _splat_with_frame, finite=True),
+    "PLY": Reader("splats/splat.ply", "", lambda path: load_splat(path).params, finite=True),
     "points of a PLY": Reader("splats/splat.ply", "", read_points),
     "compressed PLY": Reader("splats/compressed-ply.compressed.ply", "", _splat, finite=True),
     "SPZ": Reader("splats/spz.spz", "", _splat, "gzip", finite=True),
     "SPZ 4": Reader("splats/spz-4.spz", "", _splat, finite=True),
     "SOG": Reader("splats/sog.sog", "", _splat, "zip", finite=True),
-    "SOG in a folder": Reader("splats/sog", "meta.json", _sog_folder, "text", finite=True),
+    "SOG in a folder": Reader(
+        "splats/sog", "meta.json", lambda folder: _splat(folder / "meta.json"), "text", finite=True
+    ),
     **{f"KSPLAT {k}": Reader(f"splats/level_{k}.ksplat", "", _splat, finite=True) for k in range(3)},
     "splat": Reader("splats/splat.splat", "", _splat, finite=True),
     "glTF": Reader("splats/gltf.glb", "", _splat, "glb", finite=True),
     "glTF of SPZ": Reader("splats/gltf-spz.glb", "", _splat, "glb", finite=True),
 }
+_MODEL = ("cameras", "images", "points3D")
 _CAPTURES = {
-    **{
-        f"COLMAP {name}.bin": Reader("colmap", f"sparse/0/{name}.bin", _capture)
-        for name in ("cameras", "images", "points3D")
-    },
-    **{
-        f"COLMAP {name}.txt": Reader("colmap_text", f"sparse/0/{name}.txt", _capture, "text")
-        for name in ("cameras", "images", "points3D")
-    },
-    **{
-        f"data check: {name}": Reader("tracked", name, lambda folder: look_over(folder))
-        for name in ("sparse/0/cameras.bin", "sparse/0/images.bin", "sparse/0/points3D.bin")
-    },
-    "data check: images/0.png": Reader("tracked", "images/0.png", lambda folder: look_over(folder), refuses=False),
+    **{f"COLMAP {name}.bin": Reader("colmap", f"sparse/0/{name}.bin", _capture) for name in _MODEL},
+    **{f"COLMAP {name}.txt": Reader("colmap_text", f"sparse/0/{name}.txt", _capture, "text") for name in _MODEL},
+    **{f"data check: sparse/0/{name}.bin": Reader("tracked", f"sparse/0/{name}.bin", look_over) for name in _MODEL},
+    "data check: images/0.png": Reader("tracked", "images/0.png", look_over, refuses=False),
     "transforms.json": Reader("transforms", "transforms.json", _capture, "text"),
     "Metashape": Reader("metashape", "cameras.xml", _capture, "text"),
     "RealityCapture": Reader("realitycapture", "cameras.csv", _capture, "text"),
@@ -219,28 +201,23 @@ _PICTURES = {
     **{f"video.{kind}": Reader(f"films/film.{kind}", "", _film) for kind in ("avi", "mp4", "webm")},
 }
 _RUNS = {
-    "checkpoint": Reader("result", _CKPT, _checkpoint, "zip"),
-    "splats of a checkpoint": Reader("result", _CKPT, _splats_of_checkpoint, "zip", finite=True),
+    "checkpoint": Reader("result", _CKPT, lambda folder: ckpt.load_checkpoint(folder / _CKPT), "zip"),
+    "splats of a checkpoint": Reader(
+        "result", _CKPT, lambda folder: ckpt.load_splats(folder / _CKPT)[0], "zip", finite=True
+    ),
     "weights of LPIPS": Reader("records/lpips.pt", "", lambda path: LPIPS("vgg", [path]), "zip"),
     "cfg.json": Reader("result", "cfg.json", read_config, "text"),
     "cfg.json of a run to resume": Reader("result", "cfg.json", _resumed, "text", refuses=False),
     "capture.json": Reader("result", "capture.json", read_record, "text"),
-    **{
-        f"report: {name}": Reader("result", name, read_result, kind)  # type: ignore[arg-type]
-        for name, kind in (
-            ("metrics.jsonl", "text"),
-            ("commands.json", "text"),
-            ("stats/val_step0003.json", "text"),
-            ("report_data/checks_step3.json", "text"),
-            ("report_data/opacity_step-1.npz", "zip"),
-            ("report_data/val_step3_0000.npz", "zip"),
-            ("report_data/depth_step3_0000.npz", "zip"),
-        )
-    },
+    **{f"report: {name}": Reader("result", name, read_result, _layer(name)) for name in _REPORTED},
     "compare": Reader("result", "stats/val_step0003.json", lambda folder: compare.run([str(folder)]), "text"),
     "camera path": Reader("records/path.json", "", _path, "text"),
-    "renders.json": Reader("records/renders.json", "", _listed, "text", refuses=False),
-    "cfg_args": Reader("records/cfg_args", "", _exported, "text", refuses=False),
+    "renders.json": Reader(
+        "records/renders.json", "", lambda path: listed_in(path.parent)(Path("0.png")), "text", refuses=False
+    ),
+    "cfg_args": Reader(
+        "records/cfg_args", "", lambda path: exported_to(path.parent)(Path("cameras.json")), "text", refuses=False
+    ),
 }
 _BLOCKS = {
     "block.json": Reader("blocked", "blocks/0_0/block.json", _block, "text"),
@@ -252,14 +229,6 @@ _BLOCKS = {
     ),
     "start.json": Reader("blocked", "blocks/round_1/0_0/start.json", lambda folder: own_of(folder, "0_0", 1), "text"),
 }
-_COLLECTED = (
-    ("row.json", "text"),
-    ("probe.json", "text"),
-    ("metrics.jsonl", "text"),
-    ("stats/train_step0003.json", "text"),
-    ("stats/val_step0003.json", "text"),
-    ("report_data/opacity_step3.npz", "zip"),
-)
 _PAPER = {
     "results of a row": Reader(
         "records/full", "pop_size_prune.jsonl", lambda full: results.read_all("full", full.parent), "text"
@@ -268,10 +237,7 @@ _PAPER = {
     "scene of the paper": Reader("records/fox.toml", "", scenes.load_scene, "text"),
     "paper.toml": Reader("records/paper.toml", "", paper.load, "text"),
     "prepared capture": Reader("prepared/prepared_1.npz", "", lambda path: prepared.read(path, TrainConfig()), "zip"),
-    **{
-        f"collected: {name}": Reader("result", name, _collected, kind)  # type: ignore[arg-type]
-        for name, kind in _COLLECTED
-    },
+    **{f"collected: {name}": Reader("result", name, _collected, _layer(name)) for name in _COLLECTED},
 }
 _KIT = {
     "vectors: index.json": Reader("vectors", "index.json", _port, "text"),

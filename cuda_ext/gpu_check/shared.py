@@ -229,11 +229,7 @@ class StageContext:
         return python_command(*rehearse, *words)
 
     def run(
-        self,
-        words: list[str],
-        limit: float,
-        over: Mapping[str, str] = NOTHING,
-        stop: signal.Signals = signal.SIGTERM,
+        self, words: list[str], limit: float, over: Mapping[str, str] = NOTHING, stop: signal.Signals = signal.SIGTERM
     ) -> dict[str, Any]:
         """Run a command that finds the repository and the packed wheels, with `over` put over its environment."""
         path = python_path(ROOT, self.site)

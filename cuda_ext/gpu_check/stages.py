@@ -12,7 +12,7 @@ import os
 import shutil
 import signal
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -111,11 +111,6 @@ def build_stage(check: StageContext) -> dict[str, Any]:
     if found["status"] == 0 and (check.site / "gsplat").is_dir():
         _start_gsplat(check)
     return found
-
-
-def bench_stage(check: StageContext) -> dict[str, Any]:
-    """Time every kernel and the whole step."""
-    return _benchmark(check, "gpu_kernels.py", check.seconds)
 
 
 def counters_stage(check: StageContext) -> dict[str, Any]:
@@ -238,16 +233,30 @@ def train_stage(check: StageContext) -> dict[str, Any]:
 
 def train_one(check: StageContext, path: Path, limit: float, backend: str = "cuda") -> dict[str, Any]:
     """Train on one capture, or continue with the training of an earlier call at the same commit."""
-    folder = check.work / f"{path.name}_{backend}_{check.steps_scaler:g}_{check.commit[:12]}"
-    words = ["train", str(path), "--out", str(folder), "--backend", backend]
-    words += ["--steps-scaler", str(check.steps_scaler), "--no-progress", "--max-renders", "1"]
-    words += ["--skip-sizes", "--skip-checks"]
+    folder = _folder(check, path, backend)
+    words = ["--backend", backend, "--steps-scaler", str(check.steps_scaler)]
     words += ["--resume"] if (folder / "cfg.json").exists() else []
-    found = check.run(check.python("-c", TRAIN, *words), limit)
-    told = last_stats(folder)
+    found = _train(check, path, folder, limit, words)
     if found["status"] == 130:
         found |= {"status": 124, "note": "the time was up; where the folder survives, the next call continues"}
-    elif found["status"] == 0 and told is None:
+    return found
+
+
+def _folder(check: StageContext, path: Path, name: str) -> Path:
+    return check.work / f"{path.name}_{name}_{check.steps_scaler:g}_{check.commit[:12]}"
+
+
+def _train(
+    check: StageContext, path: Path, folder: Path, limit: float, more: Sequence[str], size: int = 1
+) -> dict[str, Any]:
+    """Run `pop train` by so many processes, which torchrun starts where they are several."""
+    words = ["train", str(path), "--out", str(folder), "--no-progress", "--max-renders", "1"]
+    command = check.python("-c", TRAIN, *words, "--skip-sizes", "--skip-checks", *more)
+    if size > 1:
+        launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(size), "--no-python")
+        command = [*python_command(*launcher), *command]
+    found, told = check.run(command, limit), last_stats(folder)
+    if found["status"] == 0 and told is None:
         found["status"] = 1
     return {**(told or {}), **found}
 
@@ -271,7 +280,7 @@ def ranks_stage(check: StageContext) -> dict[str, Any]:
     found: dict[str, Any] = {"status": 0, "seconds": 0.0, "gpus": gpus, "runs": {}}
     for k, size in enumerate(sizes):
         limit = (check.seconds - found["seconds"]) / (len(sizes) - k)
-        one = _train(check, captures[0], f"ranks_{size}", limit, size, "--batch-size", str(gpus))
+        one = _train_anew(check, captures[0], f"ranks_{size}", limit, size, "--batch-size", str(gpus))
         found["runs"][str(size)] = one
         found |= {"status": found["status"] or one["status"], "seconds": round(found["seconds"] + one["seconds"], 1)}
         check.note(found)
@@ -289,48 +298,25 @@ def blocks_stage(check: StageContext) -> dict[str, Any]:
     start = time.monotonic()
     for name, words in (("blocks", ("--blocks", f"{max(gpus // 2, 1)}x2")), ("whole", ())):
         left = check.seconds - (time.monotonic() - start)
-        one = _train(check, captures[0], name, left / (2 if name == "blocks" else 1), 1, *words)
+        one = _train_anew(check, captures[0], name, left / (2 if name == "blocks" else 1), 1, *words)
         found["runs"][name] = one
         found |= {"status": found["status"] or one["status"], "seconds": round(found["seconds"] + one["seconds"], 1)}
         check.note(found)
     return found
 
 
-def _train(check: StageContext, path: Path, name: str, limit: float, size: int, *more: str) -> dict[str, Any]:
-    """Train by so many processes, started by torchrun where they are several."""
-    folder = check.work / f"{path.name}_{name}_{check.steps_scaler:g}_{check.commit[:12]}"
+def _train_anew(check: StageContext, path: Path, name: str, limit: float, size: int, *more: str) -> dict[str, Any]:
+    """Train by so many processes, and give the digest of the Gaussians too."""
+    folder = _folder(check, path, name)
     # blocks are processes of their own, in which nothing stands for a GPU in a rehearsal
     backend = "fast" if check.rehearsal and "--blocks" in more else "cuda"
-    words = ["train", str(path), "--out", str(folder), "--backend", backend, "--overwrite", "--no-progress", *more]
-    words += ["--max-renders", "1", "--skip-sizes", "--skip-checks", "--threads", "1"]
+    words = ["--backend", backend, "--overwrite", "--threads", "1", *more]
     words += ["--max-steps", str(FEW)] if check.rehearsal else ["--steps-scaler", str(check.steps_scaler)]
-    command = check.python("-c", TRAIN, *words)
-    if size > 1:
-        launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(size), "--no-python")
-        command = [*python_command(*launcher), *command]
-    found = check.run(command, limit)
-    told = last_stats(folder)
-    if found["status"] == 0 and told is None:
-        found["status"] = 1
+    found = _train(check, path, folder, limit, words, size)
     plies = sorted((folder / "ply").glob("*.ply"))
     if plies:
         found["sha256"] = hashlib.sha256(plies[-1].read_bytes()).hexdigest()
-    return {**(told or {}), **found}
-
-
-def smoke_stage(check: StageContext) -> dict[str, Any]:
-    """Replay graphs, overflow buffers, compare ten steps with the CPU's and an image with the oracle's."""
-    return _pytest(check, "smoke", SMOKE)
-
-
-def laws_stage(check: StageContext) -> dict[str, Any]:
-    """Hold every law of the kit, gradients and thresholds among them, to the CUDA backend."""
-    return _laws(check, "laws", "pixel_parallel atomics")
-
-
-def laws_of_gaussian_parallel_stage(check: StageContext) -> dict[str, Any]:
-    """Hold the laws to the other backward kernel, which is not the default."""
-    return _laws(check, "laws_of_gaussian_parallel", "gaussian_parallel")
+    return found
 
 
 def steps_stage(check: StageContext) -> dict[str, Any]:
@@ -402,15 +388,19 @@ def _pytest(
 STAGES: dict[str, Callable[[StageContext], dict[str, Any]]] = {
     "wheels": wheels_stage,
     "build": build_stage,
-    "smoke": smoke_stage,
-    "bench": bench_stage,
+    # graphs that are replayed, buffers that overflow, ten steps by the CPU's, and an image by the oracle's
+    "smoke": lambda check: _pytest(check, "smoke", SMOKE),
+    # every kernel and the whole step
+    "bench": lambda check: _benchmark(check, "gpu_kernels.py", check.seconds),
     "counters": counters_stage,
     "gsplat": gsplat_stage,
-    "laws": laws_stage,
+    # every law of the kit, gradients and thresholds among them
+    "laws": lambda check: _laws(check, "laws", "pixel_parallel atomics"),
     "steps": steps_stage,
     "sanitizer": sanitizer_stage,
     "train": train_stage,
-    "laws_of_gaussian_parallel": laws_of_gaussian_parallel_stage,
+    # and by the other backward kernel, which is not the default
+    "laws_of_gaussian_parallel": lambda check: _laws(check, "laws_of_gaussian_parallel", "gaussian_parallel"),
     "reproduce": reproduce_stage,
     "ranks": ranks_stage,
     "blocks": blocks_stage,

@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from cuda_ext.toolkit import NVCC_FLAGS, find_nvcc
@@ -71,9 +71,8 @@ def parse_ptxas(file: str, text: str) -> list[KernelUse]:
             frame = int(stack), int(stores), int(loads)
         elif (match := _USED.search(line)) and name:
             shared = _SHARED.search(line)
-            found.append(
-                KernelUse(file, name, arch, int(match.group(1)), int(shared.group(1)) if shared else 0, *frame)
-            )
+            used = int(match.group(1)), int(shared.group(1)) if shared else 0
+            found.append(KernelUse(file, name, arch, *used, *frame))
             name = ""
     return found
 
@@ -122,7 +121,7 @@ def check(archs: list[str], jobs: int = 1, only: str = "") -> list[KernelUse]:
         uses = [use for found in pool.map(lambda args: compile_and_read(*args), work) for use in found]
     own = [use for use in uses if is_own(use.kernel)]
     names = demangled([use.kernel for use in own])
-    return [KernelUse(**{**asdict(use), "kernel": name}) for use, name in zip(own, names, strict=True)]
+    return [replace(use, kernel=name) for use, name in zip(own, names, strict=True)]
 
 
 def offenders(uses: list[KernelUse]) -> list[KernelUse]:

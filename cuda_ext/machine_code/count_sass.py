@@ -24,7 +24,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,40 +36,25 @@ NO_NVCC = "nvcc was not found; install a CUDA toolkit or set CUDACXX"
 NO_NVDISASM = (
     "nvdisasm was not found; install the extra that brings it, pip install 'pop-splatting[sass]', or a CUDA toolkit"
 )
-# what one warp does in one pass of a kernel's body, and threads a block
-KERNELS = {
-    "add_rows_kernel": ("Gaussian", 256),
-    "begin_step_kernel": ("step", 32),
-    "blend_forward_kernel": ("tile", 128),
-    "buckets_kernel": ("32 tiles", 256),
-    "bucket_counts_kernel": ("32 tiles", 256),
-    "columns_kernel": ("tile", 64),
-    "contributions_kernel": ("tile", 128),
-    "count_important_kernel": ("32 Gaussians", 256),
-    "count_kernel": ("32 Gaussians", 256),
-    "depth_keys_kernel": ("32 Gaussians", 256),
-    "emit_kernel": ("32 Gaussians", 256),
-    "end_step_kernel": ("step", 256),
-    "fill_tail_kernel": ("32 instances", 256),
-    "gather_rows_kernel": ("32 floats", 256),
-    "pack_kernel": ("32 Gaussians", 256),
-    "pixels_kernel": ("128 pixels", 256),
-    "points_kernel": ("tile", 128),
-    "project_backward_kernel": ("32 Gaussians", 128),
-    "project_kernel": ("32 Gaussians", 128),
-    "ranges_kernel": ("32 instances", 256),
-    "reset_opacities_kernel": ("32 Gaussians", 256),
-    "slopes_kernel": ("tile", 128),
-    "splat_gradients_kernel": ("32 Gaussians", 256),
-    "splats_kernel": ("bucket", 128),
-    "split_rows_kernel": ("32 Gaussians", 256),
-    "sum_slots_kernel": ("4 Gaussians", 256),
-    "tile_order_kernel": ("image", 512),
-    "total_kernel": ("step", 1),
-    "update_kernel": ("32 Gaussians", 128),
-    "update_views_kernel": ("32 Gaussians", 128),
-    "windows_kernel": ("128 pixels", 256),
+# what one warp does in one pass of a kernel's body, and threads a block, with the kernels of which this is so
+_PASSES = {
+    ("Gaussian", 256): "add_rows",
+    ("step", 32): "begin_step",
+    ("tile", 128): "blend_forward contributions points slopes",
+    ("32 tiles", 256): "buckets bucket_counts",
+    ("tile", 64): "columns",
+    ("32 Gaussians", 256): "count_important count depth_keys emit pack reset_opacities splat_gradients split_rows",
+    ("step", 256): "end_step",
+    ("32 instances", 256): "fill_tail ranges",
+    ("32 floats", 256): "gather_rows",
+    ("128 pixels", 256): "pixels windows",
+    ("32 Gaussians", 128): "project_backward project update update_views",
+    ("bucket", 128): "splats",
+    ("4 Gaussians", 256): "sum_slots",
+    ("image", 512): "tile_order",
+    ("step", 1): "total",
 }
+KERNELS = {f"{name}_kernel": of for of, names in _PASSES.items() for name in names.split()}
 # a comment at the end of a loop's line says what one iteration of a warp is, and how often it is passed where that is
 # fixed: "// per record", "// per coefficient, 45 times"
 _UNIT = re.compile(r"// per ([\w ]+?)(?:, (\d+) times)?$")
@@ -233,11 +218,8 @@ def count_file(nvcc: str, nvdisasm: str, source: Path, arch: str, folder: Path) 
     codes = [code for code in disassemble(nvdisasm, folder / f"{source.stem}.{arch}.o") if is_own(code.name)]
     sources = {path.name: path.read_text(encoding="utf-8").splitlines() for path in CSRC.iterdir()}
     names = demangled([code.name for code in codes])
-    found = []
-    for code, name in zip(codes, names, strict=True):
-        use = uses[code.name]
-        named = KernelUse(use.file, name, arch, use.registers, use.shared, use.stack, use.spill_stores, use.spill_loads)
-        found.append(kernel_entry(code, named, sources))
+    pairs = zip(codes, names, strict=True)
+    found = [kernel_entry(code, replace(uses[code.name], kernel=name, arch=arch), sources) for code, name in pairs]
     return sorted(found, key=lambda entry: entry["kernel"])
 
 

@@ -19,6 +19,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 from cuda_ext.machine_code.check_ptxas import CSRC, compile_and_read, is_own
 from cuda_ext.machine_code.count_sass import NO_NVCC, NO_NVDISASM, Code, Instruction, disassemble, find_nvdisasm
@@ -28,14 +29,13 @@ SAMPLES, EXECUTED = "# Samples", "Instructions Executed"
 STALL, NOT_ISSUED = "stall_", "(Not Issued)"
 
 
-@dataclass
-class Profiled:
-    """A kernel's instructions as they were profiled: opcode, samples, how often it was executed, samples by reason."""
+class Profiled(NamedTuple):
+    """An instruction as it was profiled: opcode, samples, how often it was executed, samples by reason."""
 
-    opcodes: list[str] = field(default_factory=list)
-    samples: list[int] = field(default_factory=list)
-    executed: list[int] = field(default_factory=list)
-    stalls: list[Counter[str]] = field(default_factory=list)
+    opcode: str
+    samples: int
+    executed: int
+    stalls: Counter[str]
 
 
 @dataclass
@@ -47,30 +47,28 @@ class Line:
     stalls: Counter[str] = field(default_factory=Counter)
 
 
-def read_profile(lines: Iterable[str]) -> dict[str, Profiled]:
-    """Read ncu's page of sources, by the kernels' names.
+def read_profile(lines: Iterable[str]) -> dict[str, list[Profiled]]:
+    """Read the instructions of ncu's page of sources, by the kernels' names.
 
     Raises:
         ValueError: it is no such page.
     """
     csv.field_size_limit(sys.maxsize)
-    found: dict[str, Profiled] = {}
+    found: dict[str, list[Profiled]] = {}
     head: list[str] = []
-    this: Profiled | None = None
+    this: list[Profiled] | None = None
     for row in csv.reader(lines):
         if row[:1] == ["Kernel Name"]:
             # ncu prints some tables twice; of several launches of a kernel the last stands
-            this = found[row[1]] = Profiled()
+            this = found[row[1]] = []
         elif row[:1] == ["Address"]:
             head = row
         elif this is not None and head and len(row) == len(head):
             entry = dict(zip(head, row, strict=True))
-            this.opcodes.append(opcode_of(entry["Source"]))
-            this.samples.append(int(entry[SAMPLES]))
-            this.executed.append(int(entry[EXECUTED]))
             reasons = {name: int(n) for name, n in entry.items() if name.startswith(STALL) and NOT_ISSUED not in name}
-            this.stalls.append(Counter({name.removeprefix(STALL): n for name, n in reasons.items() if n}))
-    if not any(kernel.opcodes for kernel in found.values()):
+            stalls = Counter({name.removeprefix(STALL): n for name, n in reasons.items() if n})
+            this.append(Profiled(opcode_of(entry["Source"]), int(entry[SAMPLES]), int(entry[EXECUTED]), stalls))
+    if not any(found.values()):
         raise ValueError("there is no instruction in it; it must be ncu's --page source --csv")
     return found
 
@@ -81,27 +79,25 @@ def opcode_of(source: str) -> str:
     return words[1] if words and words[0].startswith("@") else words[0] if words else ""
 
 
-def by_line(profiled: Profiled, instructions: list[Instruction]) -> dict[tuple[str, int], Line]:
+def by_line(profiled: list[Profiled], instructions: list[Instruction]) -> dict[tuple[str, int], Line]:
     """Add the samples up by the innermost line of the source.
 
     Raises:
         ValueError: these are not the instructions that were profiled.
     """
-    compiled = [instruction.opcode for instruction in instructions]
-    if compiled != profiled.opcodes:
-        apart = next(
-            (k for k, pair in enumerate(zip(compiled, profiled.opcodes, strict=False)) if pair[0] != pair[1]), 0
-        )
+    differ = [one.opcode != was.opcode for one, was in zip(instructions, profiled, strict=False)]
+    if len(instructions) != len(profiled) or any(differ):
         raise ValueError(
-            f"{len(compiled)} instructions are compiled here, {len(profiled.opcodes)} were profiled, and number "
-            f"{apart} differs; check out the commit that was profiled, and use its nvcc"
+            f"{len(instructions)} instructions are compiled here, {len(profiled)} were profiled, and number "
+            f"{differ.index(True) if any(differ) else 0} differs; check out the commit that was profiled, and use its "
+            "nvcc"
         )
     found: dict[tuple[str, int], Line] = defaultdict(Line)
-    for k, instruction in enumerate(instructions):
+    for instruction, was in zip(instructions, profiled, strict=True):
         line = found[instruction.frames[0] if instruction.frames else ("?", 0)]
-        line.samples += profiled.samples[k]
-        line.executed += profiled.executed[k]
-        line.stalls += profiled.stalls[k]
+        line.samples += was.samples
+        line.executed += was.executed
+        line.stalls += was.stalls
     return dict(found)
 
 
@@ -127,7 +123,7 @@ def table(lines: dict[tuple[str, int], Line], most: int) -> list[str]:
     return told
 
 
-def _laid_on_lines(profile: dict[str, Profiled], part: str, arch: str, most: int) -> list[str]:
+def _laid_on_lines(profile: dict[str, list[Profiled]], part: str, arch: str, most: int) -> list[str]:
     names = [name for name in profile if part in name]
     if len(names) != 1:
         raise ValueError(f"{len(names)} kernels have {part!r} in their names; without --kernel they are listed")
@@ -136,8 +132,9 @@ def _laid_on_lines(profile: dict[str, Profiled], part: str, arch: str, most: int
         raise ValueError(NO_NVCC if nvcc is None else NO_NVDISASM)
     profiled, codes = profile[names[0]], compiled_kernels(nvcc, nvdisasm, arch)
     # instantiations have names of their own there: the instructions say which one it is
-    twins = [code for code in codes if [one.opcode for one in code.instructions] == profiled.opcodes]
-    nearest = min(codes, key=lambda code: abs(len(code.instructions) - len(profiled.opcodes)))
+    opcodes = [one.opcode for one in profiled]
+    twins = [code for code in codes if [one.opcode for one in code.instructions] == opcodes]
+    nearest = min(codes, key=lambda code: abs(len(code.instructions) - len(opcodes)))
     return [names[0], *table(by_line(profiled, (twins or [nearest])[0].instructions), most)]
 
 
@@ -154,7 +151,7 @@ def main(words: list[str] | None = None) -> int:
         with opened(args.profile, "rt", encoding="utf-8") as file:
             profile = read_profile(file)
         if args.kernel is None:
-            told = [f"{sum(kernel.samples):9,} samples  {name}" for name, kernel in profile.items()]
+            told = [f"{sum(one.samples for one in kernel):9,} samples  {name}" for name, kernel in profile.items()]
         else:
             told = _laid_on_lines(profile, args.kernel, args.arch, args.most)
     except (OSError, ValueError, RuntimeError) as error:

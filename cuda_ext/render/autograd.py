@@ -66,26 +66,16 @@ class Project(torch.autograd.Function):
         means, quats, scales, opacities, sh, viewmat, K, radii = ctx.saved_tensors
         kernels, n, device, settings = load(), len(means), means.device, ctx.settings
 
-        def given(v: Tensor | None, like: tuple[int, ...]) -> Tensor:
+        def given(v: Tensor | None, *like: int) -> Tensor:
             return means.new_zeros(like) if v is None else v.contiguous()
 
-        of = {
-            "v_means2d": given(v_means2d, (n, 2)),
-            "v_conics": given(v_conics, (n, 3)),
-            "v_opacities": given(v_opacities, (n,)),
-            "v_colors": given(v_colors, (n, 3)) if ctx.has_sh else None,
-        }
-        depths = given(v_depths, (n,))
-        found = {
-            "v_means": torch.empty_like(means),
-            "v_quats": torch.empty_like(quats),
-            "v_scales": torch.empty_like(scales),
-            "v_opacities": torch.empty_like(opacities),
-            "v_sh": torch.empty_like(sh) if ctx.has_sh else None,
-        }
+        of = {"v_means2d": given(v_means2d, n, 2), "v_conics": given(v_conics, n, 3)}
+        of |= {"v_opacities": given(v_opacities, n), "v_colors": given(v_colors, n, 3) if ctx.has_sh else None}
+        depths = given(v_depths, n)
+        rows = {"v_means": means, "v_quats": quats, "v_scales": scales, "v_opacities": opacities, "v_sh": sh}
+        found = {name: None if like is None else torch.empty_like(like) for name, like in rows.items()}
         blocks = -(-n // kernels.PROJECT_BLOCK)
-        wants_pose = ctx.needs_input_grad[5]
-        partials = means.new_zeros((max(blocks, 1), 12)) if wants_pose else None
+        partials = means.new_zeros((max(blocks, 1), 12)) if ctx.needs_input_grad[5] else None
         gradients = fill(kernels.GaussianGradients(), **found, v_viewmat=partials)
         gradients.sh_stride = 3 * sh.shape[1] if ctx.has_sh else 0
         view = fill(kernels.View(), viewmat=viewmat, K=K, width=settings.width, height=settings.height)
@@ -105,8 +95,7 @@ class Project(torch.autograd.Function):
             v_viewmat = means.new_zeros((4, 4))
             v_viewmat[:3, :3] = upper[:9].reshape(3, 3)
             v_viewmat[:3, 3] = upper[9:]
-        geometry = (found["v_means"], found["v_quats"], found["v_scales"], found["v_opacities"], found["v_sh"])
-        return (*geometry, v_viewmat, None, None, None)
+        return (*found.values(), v_viewmat, None, None, None)
 
 
 @dataclass(frozen=True)
@@ -153,20 +142,16 @@ class BlendBuffers:
 
     def run(self, stats: RenderStats | None) -> None:
         kernels = load()
-        blend = fill(
-            kernels.BlendForward(),
-            channels=self.channels,
-            records=self.records,
-            background=self.background,
-            image=self.image,
-            T_final=self.T_final,
-            last=self.last,
-            checkpoints=self.checkpoints,
-        )
+        blend = fill(kernels.BlendForward(), **self._both())
         if stats is not None:
             fill(blend, **stats.__dict__)
         stream = stream_of(self.image.device)
         kernels.blend_forward(self.buffers.struct, blend, self.settings.kernel_profile(), stream)
+
+    def _both(self) -> dict[str, Any]:
+        """Return what both directions take, by the kernels' names."""
+        names = ("channels", "records", "background", "image", "T_final", "last", "checkpoints")
+        return {name: getattr(self, name) for name in names}
 
     def backward(self, v_image: Tensor, v_T_final: Tensor | None, state: Tensor) -> dict[str, Tensor | None]:
         kernels, device, n = load(), self.image.device, len(self.rows[0])
@@ -177,21 +162,8 @@ class BlendBuffers:
         if slots:
             shape = (self.buffers.capacity * self.buffers.parts, kernels.RECORD)
             rows = empty("gradient slots", LOWER + ", or use deterministic=False", shape, device)
-        blend = fill(
-            kernels.BlendBackward(),
-            channels=self.channels,
-            absolute=self.settings.absgrad,
-            records=self.records,
-            background=self.background,
-            image=self.image,
-            T_final=self.T_final,
-            last=self.last,
-            checkpoints=self.checkpoints,
-            v_image=v_image,
-            v_T_final=v_T_final,
-            rows=rows,
-            sums=sums,
-        )
+        blend = fill(kernels.BlendBackward(), **self._both(), absolute=self.settings.absgrad, v_image=v_image)
+        fill(blend, v_T_final=v_T_final, rows=rows, sums=sums)
         blend.set_backward(self.gaussian_parallel, not slots)
         stream, profile = stream_of(device), self.settings.kernel_profile()
         kernels.blend_backward(self.buffers.struct, blend, profile, state.data_ptr(), stream)
@@ -232,8 +204,6 @@ class Blend(torch.autograd.Function):
         found = blended.backward(v_image, v_T, ctx.state)
         if ctx.sink is not None:
             ctx.sink.add_(found["v_means2d_abs"])
-        v_background = None
-        if ctx.needs_input_grad[4]:
-            v_background = (blended.T_final[..., None] * v_image).sum((0, 1))
+        v_background = (blended.T_final[..., None] * v_image).sum((0, 1)) if ctx.needs_input_grad[4] else None
         of_rows = (found["v_means2d"], found["v_conics"], found["v_opacities"], found["v_colors"])
         return (*of_rows, v_background, None, None, None, None, None)

@@ -126,13 +126,7 @@ def splat_struct(
 ) -> Any:
     """Return the kernels' view of projected Gaussians."""
     return fill(
-        load().Splats(),
-        means2d=means2d,
-        depths=depths,
-        conics=conics,
-        opacities=opacities,
-        radii=radii,
-        colors=colors,
+        load().Splats(), means2d=means2d, depths=depths, conics=conics, opacities=opacities, radii=radii, colors=colors
     )
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from cuda_ext import load
-from cuda_ext.arrays import Settings, check_tensor, empty, fill, kernel_profile, new_state, stream_of
+from cuda_ext.arrays import Settings, check_tensor, empty, fill, new_state, stream_of
 from cuda_ext.render.autograd import BlendBuffers, Project, RenderStats
 from cuda_ext.render.lists import LOWER, list_tile, make_lists, splat_struct
 from pop_ref.constants import Profile
@@ -138,5 +138,4 @@ class ScoredView:
             kernels.pack_records(n, colors.shape[1], splats, floor, records.data_ptr(), stream)
             drawn = {"T_final": self.T_final, "last": self._blended.last}
             scores = fill(kernels.Scores(), records=records, **drawn, **given)
-            profile = kernel_profile(settings.profile, settings.tile_size)
-            kernels.score_view(self._buffers.struct, scores, score, profile, stream)
+            kernels.score_view(self._buffers.struct, scores, score, settings.kernel_profile(), stream)

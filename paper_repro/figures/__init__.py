@@ -27,12 +27,7 @@ FIGURES: Final = {
 
 
 def draw(
-    figure: str,
-    scale: str,
-    results: Path,
-    out: Path,
-    work: Path | None = None,
-    data: Path | None = None,
+    figure: str, scale: str, results: Path, out: Path, work: Path | None = None, data: Path | None = None
 ) -> list[Path]:
     """Draw a figure.
 

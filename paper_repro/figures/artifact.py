@@ -8,19 +8,15 @@ are, and centres move at the rate that the training ended with, so that nothing 
 from __future__ import annotations
 
 import math
+import shutil
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from paper_repro.figures.data import Asked
 from paper_repro.figures.style import GREY, INK, SMALL, TEXT, Drawn, Sheet, foot_of, show
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-import shutil
-from pathlib import Path
-
 from paper_repro.jobs import Job, job_named
 from paper_repro.results import Result
 from paper_repro.scenes import MADE, SCENES, find_folder
@@ -29,6 +25,7 @@ from pop_fast.errors import PopError
 
 if TYPE_CHECKING:
     import torch
+    from matplotlib.axes import Axes
     from torch import Tensor
 
     from pop_fast.data import Capture

@@ -9,13 +9,14 @@ import numpy as np
 
 from paper_repro.figures.data import Asked, Chosen, Curve, choose, choose_one_scene, curve_of, has
 from paper_repro.figures.style import (
+    GREY,
     LOSSES,
     Drawn,
     End,
-    Margins,
     Sheet,
     color_of,
     count,
+    darker,
     foot,
     label_ends,
     log_ticks,
@@ -23,12 +24,10 @@ from paper_repro.figures.style import (
     step_ticks,
 )
 from paper_repro.paper import paper
-from paper_repro.results import Result
+from paper_repro.results import BINS, Result
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-from paper_repro.figures.style import GREY, darker
-from paper_repro.results import BINS
 
 _METHODS: Final = ("3dgs", "gsplat", "pup", "mini_splatting", "taming", "speedy_splat", "pop")
 _LOSSES: Final = ("l1_div_1", "l2_without_ssim", "l2")
@@ -55,7 +54,7 @@ def gradients_of_losses(asked: Asked) -> Drawn:
         "Mean of |∂L/∂C| over pixels and channels of three training views, in units of 1/(3HW), the slope of L1.",
     )
     sheet = Sheet(note, 1.75)
-    axes = sheet.panel(Margins(right=0.82))
+    axes = sheet.panel(right=0.82)
     for key, (steps, values) in found.items():
         axes.plot(steps, values, color=LOSSES[key])
     low, high = (float(f([values for _, values in found.values()])) for f in (np.min, np.max))
@@ -76,8 +75,7 @@ def gaussians_per_pixel(asked: Asked) -> Drawn:
     found = {(row, key): curve_of(runs, chosen.scenes, key, where) for row, runs in chosen.runs.items() for key in keys}
     views = "three training views" if probed else "the held-out views"
     note = foot(
-        *(asked, chosen),
-        f"Means over the pixels of {views}. Visited: entries of the tile's list until the pixel ends.",
+        *(asked, chosen), f"Means over the pixels of {views}. Visited: entries of the tile's list until the pixel ends."
     )
     sheet = Sheet(note, 2.45)
     height = (sheet.height - 0.33 - 0.16 - 0.28) / 2.0
@@ -89,7 +87,7 @@ def gaussians_per_pixel(asked: Asked) -> Drawn:
         axes.set_ylim(0.0, 1.08 * max(float(values.max()) for _, values in curves.values()))
         axes.set_title(title)
         axes.locator_params(axis="y", nbins=4)
-        _finish(axes, chosen, curves, {row: (name_of(row), color_of(row)) for row in curves})
+        _finish(axes, chosen, curves)
         if bottom > 0.33:
             axes.set_xlabel("")
             axes.tick_params(labelbottom=False)
@@ -106,14 +104,14 @@ def count_under_losses(asked: Asked) -> Drawn:
         "SSIM has weight 0.01, L1 or L2 0.99. Growth by gradient alone: no blur rule, no prior, no reset.",
     )
     sheet = Sheet(note, 1.75)
-    axes = sheet.panel(Margins(right=0.72))
+    axes = sheet.panel(right=0.72)
     for row, (steps, values) in found.items():
         axes.plot(steps, values, color=color_of(row), drawstyle="steps-post")
     axes.set_ylim(0.0, 1.06 * max(float(values.max()) for _, values in found.values()))
     axes.yaxis.set_major_formatter(lambda n, _: count(n))
     axes.locator_params(axis="y", nbins=5)
     axes.set_ylabel("Gaussians")
-    _finish(axes, chosen, found, {row: (name_of(row), color_of(row)) for row in found})
+    _finish(axes, chosen, found)
     return Drawn(sheet.figure, *_table(chosen, {(row, "num_gaussians"): curve for row, curve in found.items()}))
 
 
@@ -122,7 +120,7 @@ def count_of_methods(asked: Asked) -> Drawn:
     chosen = choose(asked, _METHODS, asked.scenes(paper().datasets["Mip-NeRF 360"]), _has_counts)
     found = _counts(chosen)
     sheet = Sheet(foot(asked, chosen), 2.3)
-    axes = sheet.panel(Margins(right=0.86))
+    axes = sheet.panel(right=0.86)
     # the method itself lies above the others
     for row in sorted(found, key=lambda row: row == "pop"):
         steps, values = found[row]
@@ -135,19 +133,20 @@ def count_of_methods(asked: Asked) -> Drawn:
     log_ticks(axes.yaxis, low, high)
     axes.grid(axis="y")
     axes.set_ylabel("Gaussians")
-    _finish(axes, chosen, found, {row: (name_of(row), color_of(row)) for row in found})
+    _finish(axes, chosen, found)
     return Drawn(sheet.figure, *_table(chosen, {(row, "num_gaussians"): curve for row, curve in found.items()}))
 
 
-def _finish(axes: Axes, chosen: Chosen, curves: Mapping[str, Curve], names: Mapping[str, tuple[str, str]]) -> None:
-    """Settle the axis of steps, and name the curves where they end."""
+def _finish(
+    axes: Axes, chosen: Chosen, curves: Mapping[str, Curve], names: Mapping[str, tuple[str, str]] | None = None
+) -> None:
+    """Settle the axis of steps, and name the curves where they end: as their rows, or otherwise."""
+    names = names or {row: (name_of(row), color_of(row)) for row in curves}
     axes.set_xlim(0, max(int(result.schedule["max_steps"]) for result in chosen.all))
     step_ticks(axes.xaxis)
     axes.set_xlabel(_BELOW)
-    ends = [
-        End(float(curves[key][0][-1]), float(curves[key][1][-1]), text, color) for key, (text, color) in names.items()
-    ]
-    label_ends(axes, ends)
+    lasts = {key: (float(steps[-1]), float(values[-1])) for key, (steps, values) in curves.items()}
+    label_ends(axes, [End(*lasts[key], text, color) for key, (text, color) in names.items()])
 
 
 def _has_counts(result: Result) -> bool:
@@ -180,7 +179,7 @@ def opacity_histogram(asked: Asked) -> Drawn:
     other = "" if same else f" The paper's figure is of another capture, {_SCENE}."
     note = foot(asked, chosen, f"{count(float(n))} Gaussians in {BINS} bins.{other}")
     sheet = Sheet(note, 1.85)
-    axes = sheet.panel(Margins(right=0.1, top=0.12))
+    axes = sheet.panel(right=0.1, top=0.12)
     edges = np.linspace(0.0, 1.0, BINS + 1)
     colors = [_LOW_COLOR if e < _LOW - 1e-9 else _HIGH_COLOR if e >= _HIGH - 1e-9 else _PLAIN for e in edges[:-1]]
     axes.bar(edges[:-1], 100.0 * shares, width=1.0 / BINS, align="edge", color=colors, edgecolor="white", linewidth=0.3)

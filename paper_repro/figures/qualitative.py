@@ -64,12 +64,7 @@ def renders_and_photographs(asked: Asked) -> Drawn:
     shown = tuple(view.scene for view in views)
     not_run = tuple(scene for scene in scenes if any((row, scene) not in runs for row in _ROWS))
     elsewhere = [scene for scene in scenes if scene not in (*shown, *not_run)]
-    chosen = Chosen(
-        {row: {scene: (runs[row, scene],) for scene in shown} for row in _ROWS},
-        shown,
-        (),
-        not_run,
-    )
+    chosen = Chosen({row: {scene: (runs[row, scene],) for scene in shown} for row in _ROWS}, shown, (), not_run)
     note = foot(
         *(asked, chosen),
         "The first held-out view of each capture, PSNR of this view alone. Box: where the two renders differ most, "

@@ -7,36 +7,29 @@ steps, seeds and scale, and whether that is the protocol of the paper.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
-
-from paper_repro.jobs import ROWS
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.axis import Axis
 import csv
 import io
+import math
 import re
+from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Literal
+from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
+from paper_repro.figures.data import Asked, Chosen
+from paper_repro.jobs import ROWS
+from paper_repro.results import Result
+from paper_repro.scenes import scale_named
 from pop_fast.io.atomic import write_atomically
 
 if TYPE_CHECKING:
     import numpy as np
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
-from collections.abc import Iterable
-
-from paper_repro.figures.data import Asked, Chosen
-from paper_repro.results import Result
-from paper_repro.scenes import scale_named
 
 # widths of a column and of a page's text, inches
 COLUMN: Final = 3.3
@@ -69,6 +62,12 @@ _METHODS: Final = {
 }
 # as in the paper: L1 red, L2 green, SSIM orange
 LOSSES: Final = {"grad_l1": _VERMILION, "grad_l2": _GREEN, "grad_ssim": _ORANGE}
+_SIZES: Final = {"labelsize": 6.4, "major.pad": 2.0, "major.size": 2.4, "minor.size": 1.4}
+_WIDTHS: Final = {"major.width": 0.6, "minor.width": 0.4}
+# of both axes
+_TICKS: Final[dict[Any, Any]] = {
+    f"{axis}tick.{name}": value for axis in "xy" for name, value in {"color": INK, **_SIZES, **_WIDTHS}.items()
+}
 _EDGE: Final = 0.04
 _LINE: Final = SMALL * 1.3 / 72.0
 
@@ -94,20 +93,7 @@ def look() -> AbstractContextManager[None]:
             "axes.spines.right": False,
             "axes.axisbelow": True,
             "text.color": INK,
-            "xtick.color": INK,
-            "ytick.color": INK,
-            "xtick.labelsize": 6.4,
-            "ytick.labelsize": 6.4,
-            "xtick.major.size": 2.4,
-            "ytick.major.size": 2.4,
-            "xtick.minor.size": 1.4,
-            "ytick.minor.size": 1.4,
-            "xtick.major.width": 0.6,
-            "ytick.major.width": 0.6,
-            "xtick.minor.width": 0.4,
-            "ytick.minor.width": 0.4,
-            "xtick.major.pad": 2.0,
-            "ytick.major.pad": 2.0,
+            **_TICKS,
             "grid.linewidth": 0.4,
             "grid.color": "#e4e4e4",
             "lines.linewidth": 1.1,
@@ -274,16 +260,6 @@ class Drawn:
     rows: Sequence[Sequence[Any]]
 
 
-@dataclass(frozen=True)
-class Margins:
-    """Room around the axes for ticks and labels, inches."""
-
-    left: float = 0.44
-    right: float = 0.08
-    top: float = 0.08
-    bottom: float = 0.33
-
-
 class Sheet:
     """A figure of a given width, with panels in inches and a note below them.
 
@@ -316,10 +292,9 @@ class Sheet:
         place = (left / self.width, (bottom + self._below) / whole, width / self.width, height / whole)
         return self.figure.add_axes(place, **more)
 
-    def panel(self, margins: Margins | None = None) -> Axes:
-        """Add axes that fill what is above the note, but for the margins."""
-        m = Margins() if margins is None else margins
-        return self.axes(m.left, m.bottom, self.width - m.left - m.right, self.height - m.bottom - m.top)
+    def panel(self, left: float = 0.44, right: float = 0.08, top: float = 0.08, bottom: float = 0.33) -> Axes:
+        """Add axes that fill what is above the note, but for room around them for ticks and labels, inches."""
+        return self.axes(left, bottom, self.width - left - right, self.height - bottom - top)
 
 
 def show(axes: Axes, picture: np.ndarray, **more: Any) -> AxesImage:
@@ -339,14 +314,10 @@ def save(drawn: Drawn, stem: Path) -> list[Path]:
     Raises:
         PopError: a file cannot be written.
     """
-    formats: tuple[Literal["svg", "png"], ...] = ("svg", "png")
-    paths = [stem.with_name(f"{stem.name}.{suffix}") for suffix in (*formats, "csv")]
-    for suffix, path in zip(formats, paths, strict=False):
-        if suffix == "svg":
-            write_atomically(path, partial(_write_svg, drawn.figure))
-        else:
-            more: dict[str, Any] = {"metadata": {"Software": None}, "pil_kwargs": {"optimize": True}}
-            write_atomically(path, partial(drawn.figure.savefig, format=suffix, **more))
+    paths = [stem.with_name(f"{stem.name}.{suffix}") for suffix in ("svg", "png", "csv")]
+    write_atomically(paths[0], partial(_write_svg, drawn.figure))
+    more: dict[str, Any] = {"metadata": {"Software": None}, "pil_kwargs": {"optimize": True}}
+    write_atomically(paths[1], partial(drawn.figure.savefig, format="png", **more))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(drawn.columns)

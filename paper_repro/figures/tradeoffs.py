@@ -5,18 +5,19 @@ A name stands next to its marker, none over another.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final
 
-from paper_repro.claims import SWEEP, claims
+from paper_repro.claims import METHODS, SWEEP, claims
 from paper_repro.evidence import Evidence, Group, Groups, groups
 from paper_repro.figures.data import Asked, Chosen, choose, mean_of
 from paper_repro.figures.style import (
     COLUMN,
     TEXT,
     Drawn,
-    Margins,
     Sheet,
     color_of,
     count,
@@ -27,16 +28,10 @@ from paper_repro.figures.style import (
     name_of,
 )
 from paper_repro.paper import paper
-from paper_repro.results import Result
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-from itertools import pairwise
 
-_METHODS: Final = (
-    *("3dgs", "gsplat", "pup", "pup_star", "mini_splatting", "mini_splatting_star"),
-    *("taming", "speedy_splat", "pop"),
-)
 _STAR: Final = "l2"
 # height of a panel of figure 6b with its title and its axis, inches
 _PANEL: Final = 1.85
@@ -83,16 +78,14 @@ def psnr_against_time(asked: Asked) -> Drawn:
         asked, chosen, f"Area of a marker: number of Gaussians, written at it. Time on {where}{clock}.", *without
     )
     sheet = Sheet(note, 2.3)
-    axes = sheet.panel(Margins(right=0.1))
+    axes = sheet.panel(right=0.1)
     _plane(axes, points, "training time (s)", 0.16)
     # small markers lie on large ones
     for point in sorted(points, key=lambda point: -point.area):
         hollow = point.row.endswith("_star")
         color = color_of(point.row)
-        look = (
-            {"facecolor": "none", "edgecolor": color, "linewidth": 1.0} if hollow else {"color": color, "linewidth": 0}
-        )
-        axes.scatter(point.x, point.y, s=point.area, alpha=0.85, **look)
+        ring, disc = {"facecolor": "none", "edgecolor": color, "linewidth": 1.0}, {"color": color, "linewidth": 0}
+        axes.scatter(point.x, point.y, s=point.area, alpha=0.85, **(ring if hollow else disc))
         if point.area > _WITH_MIDDLE:
             axes.scatter(point.x, point.y, s=2.0, color=color if hollow else "white", linewidth=0)
     _name(axes, points)
@@ -181,21 +174,17 @@ def _timed(asked: Asked, scenes: Sequence[str]) -> tuple[Chosen, tuple[str, ...]
     Returns:
         The results, and the scenes that were left out for their times.
     """
-    chosen = choose(asked, _METHODS, scenes)
+    chosen = choose(asked, (*METHODS, "pop"), scenes)
     untimed = {r.scene for r in chosen.all if not r.is_timed}
     if not untimed or untimed == set(chosen.scenes):
         return chosen, ()
-    return choose(asked, _METHODS, [scene for scene in scenes if scene not in untimed]), tuple(sorted(untimed))
+    return choose(asked, (*METHODS, "pop"), [scene for scene in scenes if scene not in untimed]), tuple(sorted(untimed))
 
 
 def _means(chosen: Chosen, row: str) -> tuple[float, float, float]:
     """Average seconds of training, PSNR and Gaussians."""
-    get: tuple[Callable[[Result], float], ...] = (
-        lambda r: r.training_seconds,
-        lambda r: r.psnr,
-        lambda r: float(r.num_gaussians),
-    )
-    seconds, psnr, n = (mean_of(chosen.runs[row], chosen.scenes, one) for one in get)
+    names = ("training_seconds", "psnr", "num_gaussians")
+    seconds, psnr, n = (mean_of(chosen.runs[row], chosen.scenes, attrgetter(name)) for name in names)
     return seconds, psnr, n
 
 
@@ -262,11 +251,9 @@ def _name(axes: Axes, points: Sequence[_Point], joined: Sequence[str] = ()) -> N
 
 def _table(chosen: Chosen) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
     rows: list[Sequence[Any]] = []
-    found: Mapping[str, Mapping[str, tuple[Result, ...]]] = chosen.runs
-    for row, by_scene in found.items():
-        for scene in chosen.scenes:
-            for r in by_scene[scene]:
-                rows.append((row, scene, r.seed, r.run, r.training_seconds, r.psnr, r.num_gaussians, r.machine))
+    for row in chosen.runs:
+        for r in chosen.of(row):
+            rows.append((row, r.scene, r.seed, r.run, r.training_seconds, r.psnr, r.num_gaussians, r.machine))
         seconds, psnr, n = _means(chosen, row)
         rows.append((row, "mean", "", "", seconds, psnr, n, ""))
     return ("row", "scene", "seed", "run", "seconds", "psnr", "num_gaussians", "machine"), rows

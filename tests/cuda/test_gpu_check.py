@@ -153,9 +153,9 @@ def test_a_job_that_is_ended_takes_its_commands_along(tmp_path):
     assert gone(child_id)
 
 
-def gone(pid: int, seconds: float = 10.0) -> bool:
-    """Tell whether a process ends in some seconds: an ended one has its number until its new parent hears of it."""
-    until = time.monotonic() + seconds
+def gone(pid: int) -> bool:
+    """Tell whether a process ends in ten seconds: an ended one has its number until its new parent hears of it."""
+    until = time.monotonic() + 10.0
     while time.monotonic() < until:
         try:
             os.kill(pid, 0)

@@ -24,7 +24,6 @@ import os
 from types import SimpleNamespace
 from unittest import mock
 from cuda_ext.host import emulate
-from cuda_ext.host import emulate
 if {read_only}:
     emulate.os = SimpleNamespace(**{{**vars(os), "access": lambda *_: False}})
 # compiling takes long, and which library is loaded is known before
@@ -71,9 +70,8 @@ def test_a_cache_that_is_not_absolute_is_not_taken(
 def test_a_cache_that_is_open_to_others_is_refused(read_only: Path, mode: int) -> None:
     read_only.mkdir(parents=True)
     read_only.chmod(mode)
-    with pytest.raises(
-        RuntimeError, match=rf"pop-splatting: is open to others \(mode {mode:o}\), so nothing is loaded"
-    ):
+    words = rf"pop-splatting: is open to others \(mode {mode:o}\), so nothing is loaded"
+    with pytest.raises(RuntimeError, match=words):
         emulate.library_folder()
 
 
@@ -114,15 +112,9 @@ def plant(folder: Path, tmp_path: Path) -> None:
 
 def load(folder: Path, read_only: bool) -> subprocess.CompletedProcess[str]:
     """Load the emulated kernels in another process that has `folder` for temporary files, with a cache in it."""
-    environment = {
-        **os.environ,
-        "TMPDIR": str(folder),
-        "XDG_CACHE_HOME": str(folder / "cache"),
-        "PYTHONPATH": str(ROOT),
-    }
-    script = LOAD.format(read_only=read_only)
-    command = [sys.executable, "-c", script]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False, cwd=folder)
+    places = {"TMPDIR": str(folder), "XDG_CACHE_HOME": str(folder / "cache"), "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", LOAD.format(read_only=read_only)]
+    return subprocess.run(command, env=os.environ | places, capture_output=True, text=True, check=False, cwd=folder)
 
 
 @needs_compiler

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -18,22 +17,22 @@ from cuda_ext.host import emulate
 from cuda_ext.host.emulate import FLAGS, HERE, translated
 from cuda_ext.render.lists import WARP_TILE, make_lists, splat_struct
 from cuda_ext.training import train_step
-from pop_fast.api.backend import get_backend
 from pop_fast.cuda import rasterization
 from pop_fast.density.passes import Passes
 from pop_fast.train.steps import Phase
 from pop_ref.conformance.mutants.trial import every_law, law_named
-from pop_ref.conformance.torch_short_training import Trainee
 from pop_ref.constants import PAPER
 from tests.cuda.conftest import FOLDER, emulated_engine
 from tests.cuda.gpu.scene import (
     HEIGHT,
     STEPS,
     WIDTH,
+    FusedStep,
     assert_same_bits,
     drawn,
     fused_trainer,
     leaves_of,
+    skip_what_is_refused,
     training_scene,
 )
 from tests.fast.test_passes import raw_params, views
@@ -281,23 +280,14 @@ def test_training_tells_the_same_winners_without_the_counts(gpu):
 LAWS = [path for path, law in every_law().items() if law.needs == ("collected_statistics",)]
 
 
-class FusedStep(Trainee):
-    """Takes the steps of a `Watch` on the emulated GPU, as an adapter that offers nothing else."""
-
-    name, dtype = "the fused step", np.float32
-
-    def stage(self, name: str) -> Any:
-        return getattr(self, name)
+class EmulatedStep(FusedStep):
+    """Takes the steps of a `Watch` on the emulated GPU."""
 
     def _engine(self, config: Any) -> Any:
-        step = get_backend("cuda").whole_step()
-        assert step is not None
-        setting = step.unknown_setting(config)
-        if setting is not None:
-            pytest.skip(f"the fused step has no {setting}; `pop train` refuses it")
+        skip_what_is_refused(config)
         return emulated_engine()
 
 
 @pytest.mark.parametrize("path", LAWS)
 def test_the_fused_step_collects_as_the_laws_say(gpu: Any, path: str) -> None:
-    law_named(path).sentence(FusedStep("pop_fast", "cuda", "float32"))
+    law_named(path).sentence(EmulatedStep("pop_fast", "cuda", "float32"))

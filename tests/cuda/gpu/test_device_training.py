@@ -10,14 +10,12 @@ import pytest
 import torch
 
 from cuda_ext.render import lists
-from pop_fast.api.backend import get_backend
 from pop_fast.cuda import stages
 from pop_fast.density import GsplatStrategy, POPStrategy
 from pop_fast.train import TrainingRun, training_run
 from pop_ref.conformance.mutants.trial import every_law, law_named
-from pop_ref.conformance.torch_short_training import Trainee
 from tests.app.tiny import HEIGHT, WIDTH, last_checkpoint, run_until, tiny_capture, tiny_config
-from tests.cuda.gpu.scene import assert_same_bits
+from tests.cuda.gpu.scene import FusedStep, assert_same_bits, skip_what_is_refused
 from tests.train.test_steps import climb, ladder_agree
 
 COMPARED = ("loss", "pop", "psnr", "d_ssim", "l1", "l2", "lr_means", "num_gaussians")
@@ -159,27 +157,14 @@ def test_a_number_that_is_not_finite_is_found_on_the_device(engine, tmp_path):
 # The golden ladder, and the laws of whole steps of the kit: every step is the oracle's from the same Gaussians.
 
 
-class WholeSteps(Trainee):
-    """Takes steps of a `ShortTraining` on the GPU, as an adapter that offers nothing else."""
-
-    name, dtype = "the fused step", np.float32
-
-    def stage(self, name):
-        return getattr(self, name)
-
-
 @pytest.fixture
 def whole_steps(engine, monkeypatch):
-    step = get_backend("cuda").whole_step()
-
     def engine_of(config, own_strategy):
-        setting = step.unknown_setting(config)
-        if setting is not None:
-            pytest.skip(f"the fused step has no {setting}; `pop train` refuses it")
+        skip_what_is_refused(config)
         return engine
 
     monkeypatch.setattr(training_run, "engine_of", engine_of)
-    return WholeSteps("pop_fast", "fast", "float32")
+    return FusedStep("pop_fast", "fast", "float32")
 
 
 OFFERED = {"taken_steps", "batched_steps", "whole_run"}

@@ -135,16 +135,16 @@ def test_room_shrinks_after_a_phase_of_fat_splats_and_the_steps_stay_the_same(gp
     fat = {**scene.params, "scales": scene.params["scales"] + 1.5}
     (params, m, v), trainer = fused_trainer(replace(scene, params=fat), gpu)
     trainer.run(3, phase)
-    ((size, wide),) = trainer.capacities.items()
+    ((size, lists),) = trainer.lists().items()
     assert trainer.grown > 0
     params["scales"].copy_(scene.params["scales"] - 0.5)
     trainer.rebind(params, m, v)
     trainer.run(6, phase)
-    assert trainer.capacities[size] == wide
+    assert trainer.lists()[size].capacity == lists.capacity
     grown, thin = trainer.grown, trainer.n_instances
     trainer.rebind(params, m, v)
     trainer.run(STEPS, phase)
-    assert thin <= trainer.capacities[size] < 0.5 * wide
+    assert thin <= trainer.lists()[size].capacity < 0.5 * lists.capacity
     assert trainer.grown == grown
 
 
