@@ -12,15 +12,16 @@ law notices changes anything at all is found by reading; the JSON keeps that in 
 from __future__ import annotations
 
 import argparse
-import multiprocessing
+import os
 import random
 import re
+import select
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final
 
@@ -145,23 +146,23 @@ def _read_by(unit: str) -> set[str]:
 
 def noticed_by(engine: Path) -> str:
     """Return the first law that breaks on an engine, "crash" or "hang", or "" where all laws hold."""
-    context = multiprocessing.get_context("fork")
-    here, there = context.Pipe(duplex=False)
-    child = context.Process(target=_judge, args=(engine, there))
-    child.start()
-    there.close()
-    child.join(SECONDS)
-    if child.is_alive():
-        child.kill()
-        child.join()
-        return "hang"
-    try:
-        return str(here.recv()) if here.poll() else "crash"
-    except EOFError:
-        return "crash"
+    here, there = os.pipe()
+    child = os.fork()
+    if child == 0:
+        with os.fdopen(there, "w", encoding="utf-8") as answer:
+            answer.write(_judge(engine))
+        os._exit(0)
+    os.close(there)
+    with os.fdopen(here, encoding="utf-8") as answer:
+        ready, _, _ = select.select([answer], [], [], SECONDS)
+        if not ready:
+            os.kill(child, signal.SIGKILL)
+        said = answer.read()
+    _, status = os.waitpid(child, 0)
+    return "hang" if not ready else said if status == 0 else "crash"
 
 
-def _judge(engine: Path, answer: Connection) -> None:
+def _judge(engine: Path) -> str:
     for module in (build, library):
         module.library_path = lambda: engine  # type: ignore[assignment]
     for name in PRECISIONS:
@@ -169,9 +170,8 @@ def _judge(engine: Path, answer: Connection) -> None:
         for path, law in every_law().items():
             broken = noticed(law, backend, EXAMPLES)
             if broken is not None:
-                answer.send(f"{path} ({name}): {broken[:160]}")
-                return
-    answer.send("")
+                return f"{path} ({name}): {broken[:160]}"
+    return ""
 
 
 def draw(count: int, seed: int, work: Path) -> None:

@@ -33,6 +33,7 @@ REASONS: Final[dict[str, str]] = {
     "taming.py: taming_scores": "sums what laws of single views judge",
     "margins.py: nearest": "read by reports of failures",
     "margins.py: near_threshold": "read by reports of failures",
+    "margins.py: pixel_margins": "an exponent under 0 needs a conic that rounding has made indefinite",
     "margins.py: safe_pixels": "read by reports of failures",
     "selection.py: lowest_share": "of nobody; a test of the oracle asks for it",
     "tight_tiles.py: accutile": "a box without an ellipse",

@@ -82,8 +82,8 @@ _LINES: Final[Lines] = {
     "density/control.py": (
         ("splits_keep_the_opacity",
          "the step forgets that revised opacities were asked for: two children are denser than their parent (A26)",
-         "context.draws.normals(n_splits),\n                self.revised_opacity,\n",
-         "context.draws.normals(n_splits),\n",
+         "context.draws.normals(n_splits), self.revised_opacity)",
+         "context.draws.normals(n_splits))",
          "test_density:a_densification_step_is_the_oracles_under_every_reading"),
         ("square_pixels_of_ndc", "the screen gradient is scaled by the width along both axes",
          '0.5 * info["height"] * cameras', '0.5 * info["width"] * cameras',
