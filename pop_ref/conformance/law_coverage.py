@@ -34,6 +34,8 @@ REASONS: Final[dict[str, str]] = {
     "margins.py: nearest": "read by reports of failures",
     "margins.py: near_threshold": "read by reports of failures",
     "margins.py: pixel_margins": "an exponent under 0 needs a conic that rounding has made indefinite",
+    "margins.py: extent_margins": "of numbers that have overflowed; no law draws a whole scene of them",
+    "margins.py: _reaches": "an opacity of 1 reaches 3.329 standard deviations, the limit is 3.33",
     "margins.py: safe_pixels": "read by reports of failures",
     "selection.py: lowest_share": "of nobody; a test of the oracle asks for it",
     "tight_tiles.py: accutile": "a box without an ellipse",
