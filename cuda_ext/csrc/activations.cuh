@@ -43,13 +43,4 @@ POP_HD Vec4<Real> unit_quat_from_quat(Vec4<Real> q) {
     return {q.w / norm, q.x / norm, q.y / norm, q.z / norm};
 }
 
-template <class Real>
-POP_HD Vec4<Real> unit_quat_from_quat_vjp(Vec4<Real> q, Vec4<Real> v_u) {
-    const Real norm = quat_norm(q);
-    const Vec4<Real> u = unit_quat_from_quat(q);
-    const Real along = u.w * v_u.w + u.x * v_u.x + u.y * v_u.y + u.z * v_u.z;
-    return {(v_u.w - u.w * along) / norm, (v_u.x - u.x * along) / norm, (v_u.y - u.y * along) / norm,
-            (v_u.z - u.z * along) / norm};
-}
-
 }  // namespace pop

@@ -15,22 +15,6 @@ POP_HD Mat3<Real> rotmat_from_quat(Vec4<Real> quat) {
 }
 
 template <class Real>
-POP_HD Vec4<Real> rotmat_from_quat_vjp(Vec4<Real> quat, Mat3<Real> v_rotmat) {
-    const Vec4<Real> u = unit_quat_from_quat(quat);
-    const Real w = u.w, x = u.x, y = u.y, z = u.z, two = Real(2);
-    const Real v00 = v_rotmat.m[0][0], v01 = v_rotmat.m[0][1], v02 = v_rotmat.m[0][2];
-    const Real v10 = v_rotmat.m[1][0], v11 = v_rotmat.m[1][1], v12 = v_rotmat.m[1][2];
-    const Real v20 = v_rotmat.m[2][0], v21 = v_rotmat.m[2][1], v22 = v_rotmat.m[2][2];
-    const Vec4<Real> v_u = {
-        two * (x * (v21 - v12) + y * (v02 - v20) + z * (v10 - v01)),
-        two * (w * (v21 - v12) + y * (v01 + v10) + z * (v02 + v20) - two * x * (v11 + v22)),
-        two * (w * (v02 - v20) + x * (v01 + v10) + z * (v12 + v21) - two * y * (v00 + v22)),
-        two * (w * (v10 - v01) + x * (v02 + v20) + y * (v12 + v21) - two * z * (v00 + v11)),
-    };
-    return unit_quat_from_quat_vjp(quat, v_u);
-}
-
-template <class Real>
 POP_HD Mat3<Real> columns_scaled(Mat3<Real> a, Vec3<Real> s) {
     Mat3<Real> c;
     for (int i = 0; i < 3; ++i) {

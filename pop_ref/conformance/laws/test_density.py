@@ -329,6 +329,10 @@ def _population_and_window(n, seed, scene_scale):
     return Rows(params, tags.m, tags.v), window
 
 
+# sizes on both sides of what is pruned, in a scene that is not of one unit
+_TOO_BIG = DensityConfig(prune_too_big=True, grow_grad2d=0.5, grow_scale3d=0.3, prune_scale3d=0.6, prune_opa=0.005)
+
+
 @law(
     "density",
     "densify_and_prune",
@@ -337,6 +341,7 @@ def _population_and_window(n, seed, scene_scale):
     config=readings,
     step=st.sampled_from([600, 3000, 5000, 7000, 7100]),
     scene_scale=scene_scales,
+    first=[{"n": 8, "seed": 1, "config": _TOO_BIG, "step": 5000, "scene_scale": scale} for scale in (0.125, 4.0)],
 )
 def test_a_densification_step_is_the_oracles_under_every_reading(backend, n, seed, config, step, scene_scale):
     rows, window = _population_and_window(n, seed, scene_scale)

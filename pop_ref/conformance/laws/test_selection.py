@@ -241,6 +241,7 @@ def test_importance_adds_over_views_and_is_none_where_no_pixel_is_dominated(back
     width=st.integers(1, 2000),
     height=st.integers(1, 2000),
     max_points=st.integers(0, 4_000_000),
+    first=[{"n_views": 2, "width": 3, "height": 5, "max_points": 100}],
 )
 def test_views_share_the_points_and_give_no_more_than_their_pixels(backend, n_views, width, height, max_points):
     found = int(backend.stage("samples_per_view")(n_views, width, height, max_points))
