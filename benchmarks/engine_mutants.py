@@ -6,7 +6,8 @@
 A site is an operator, a number or a statement of the engine's C++, and of the arithmetic that it shares with the CUDA
 kernels. Each fault is compiled by itself, with little optimization, and every law that judges the engine is tried with
 four examples: in float32, which trains, then in float64. What does not compile is drawn anew. Whether a fault that no
-law notices changes anything at all is found by reading; the JSON keeps that in words, under "changes nothing".
+law notices changes anything at all is found by reading; the JSON keeps that in words, under "changes nothing", and by
+hand which law of later has noticed it.
 """
 
 from __future__ import annotations
@@ -199,7 +200,10 @@ def told(tried: dict[str, Any]) -> list[str]:
     died = [row["noticed by"] for row in rows.values() if row["noticed by"]]
     errors = sum(said in ("crash", "hang") for said in died)
     same = len(tried) - 1 - len(rows)
-    lives = [f"lives: {name}" for name, row in rows.items() if not row["noticed by"]]
+    lived = {name: row for name, row in rows.items() if not row["noticed by"]}
+    lives = [
+        f"lived: {name}{', until ' + by if (by := row.get('noticed since by')) else ''}" for name, row in lived.items()
+    ]
     return [f"{len(died)} of {len(rows)} die, {errors} of them by a crash; {same} change nothing", *lives]
 
 
