@@ -30,6 +30,7 @@ if __package__ in (None, ""):
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.record import commit, read_json, write_json
+from cuda_ext.toolkit import find_compiler, no_compiler
 from pop_fast.compiled import build, library
 from pop_ref.conformance.backends import shipped
 from pop_ref.conformance.mutants.trial import every_law, noticed
@@ -119,7 +120,7 @@ def compiled(fault: Fault | None, work: Path) -> Path | None:
         return None
     # a name of its own, since a library that is loaded stays loaded
     made = work / f"engine_{time.monotonic_ns()}.so"
-    subprocess.run(["g++", "-shared", "-pthread", "-o", made, *map(str, objects)], check=True)
+    subprocess.run([*_compiler(), "-shared", "-pthread", "-o", str(made), *map(str, objects)], check=True)
     return made
 
 
@@ -129,8 +130,15 @@ def _object(sources: Path, unit: str, fault: Fault | None, work: Path) -> Path |
     to = work / f"{'faulty' if touched else 'sound'}_{unit}.o"
     if not touched and to.exists():
         return to
-    command = ["g++", *_FLAGS, f"-I{sources}", "-c", "-o", str(to), str(sources / "pop_fast/compiled" / unit)]
+    command = [*_compiler(), *_FLAGS, f"-I{sources}", "-c", "-o", str(to), str(sources / "pop_fast/compiled" / unit)]
     return to if subprocess.run(command, capture_output=True, check=False).returncode == 0 else None
+
+
+def _compiler() -> list[str]:
+    found = find_compiler()
+    if found is None:
+        raise SystemExit(no_compiler())
+    return found
 
 
 def _read_by(unit: str) -> set[str]:
@@ -164,8 +172,9 @@ def noticed_by(engine: Path) -> str:
 
 
 def _judge(engine: Path) -> str:
+    # both modules name the function; the child ends with its answer, so that nothing has to be put back
     for module in (build, library):
-        module.library_path = lambda: engine  # type: ignore[assignment]
+        module.__dict__["library_path"] = lambda: engine
     for name in PRECISIONS:
         backend = shipped(name)
         for path, law in every_law().items():

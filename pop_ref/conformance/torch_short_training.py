@@ -230,8 +230,10 @@ class Trainee:
                 said |= {f"lr.{f.name}": getattr(value, f.name) for f in fields(value)}
             else:
                 said[_NAMES.get(name, name)] = value
+        # the native step shares its work out, and has the same bits for any number of threads
+        threads = 2 if self._backend == "compiled" else 1
         said |= {
-            "sh_degree": short.degree, "threads": 1, "progress": False, "backend": self._backend, "test_every": 0,
+            "sh_degree": short.degree, "threads": threads, "progress": False, "backend": self._backend, "test_every": 0,
             "batch_size": short.batch, "background": short.background, "antialiased": short.antialiased,
         }  # fmt: skip
         return self._module("train.config").TrainConfig.of(

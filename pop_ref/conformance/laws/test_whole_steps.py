@@ -67,7 +67,7 @@ def test_every_step_is_the_oracles_under_every_setting(backend):
     window = replace(PRIOR, order=(0, 1), seed=1216, count=9)
     # visible Gaussians dominate no pixel
     hidden = replace(MASKED, order=(0,), seed=40)
-    # several tiles, and more rows than an engine takes at a time
+    # several tiles, and more rows of pixels than the compiled engine takes in one part, which is 16
     large = [replace(short, size=(21, 37), order=(0,), count=9, seed=1078) for short in (PRIOR, MASKED)]
     for short in (PRIOR, window, ENTROPY, MASKED, hidden, *large):
         _assert_steps(backend, short)
@@ -314,7 +314,7 @@ def test_at_rates_of_zero_every_look_at_a_photograph_costs_the_same(backend):
             assert_same_bits(key, record["params"][key], value)
 
 
-# more than any engine takes at a time
+# more than the compiled engine takes in one part, which is 4,096
 CROWD = 4500
 
 
