@@ -368,7 +368,7 @@ def _write_vectors(folder: Path) -> None:
 
 
 def _write_kit(folder: Path) -> None:
-    from pop_ref.conformance.vectors import vector_scenes
+    from pop_ref.conformance.vector_scenes import vector_scenes
     from pop_ref.learn.course import COURSE, stage_named
     from pop_ref.learn.stubs import answer, start
 

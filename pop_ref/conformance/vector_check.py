@@ -460,6 +460,7 @@ def render_kind() -> dict[str, Any]:
             arrays[name] = entry("output", shape, meaning, "int64", [equal(where)])
         else:
             arrays |= output(name, shape, meaning, f"agreement.{name}" if name in IMAGES else "meta.rows", where)
+    arrays |= output("dominant_weights", "[H, W]", "the largest weight, 0 of none", "agreement.weight", "decided")
     shapes = {**{name: shape for name, (shape, _) in INPUTS.items()}, "means2d": "[N, 2]", "means2d_abs": "[N, 2]"}
     for name in GRADIENTS:
         where = WHERE.get(f"v_{name}", "smooth_rows")

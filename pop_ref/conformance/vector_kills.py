@@ -164,6 +164,8 @@ def _image(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
     found |= {name: getattr(view, name) for name in ("means2d", "depths", "conics")}
     if backend.has(capabilities.DOMINANCE):
         found["dominant_ids"] = view.dominant_ids
+    if backend.has(capabilities.DOMINANT_WEIGHTS):
+        found["dominant_weights"] = view.dominant_weights
     if isinstance(backend, OracleAdapter):
         splats = backend.full_render(scene).splats
         found |= {"colors": splats.colors, "effective_opacities": splats.opacities}
@@ -196,16 +198,19 @@ def _call(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
     if "final_T" in called.meta:
         found["T_final"] = called.meta["final_T"].reshape(called.alphas.shape)
     # of a rasterizer whose tiles have a side of their own nothing is expected
-    told = ("n_cameras", "n_batches", *(("tile_size",) if backend.takes("tile_size") else ()))
+    of_tiles = ("tile_size", "tile_width", "tile_height") if backend.takes("tile_size") else ()
+    told = ("n_cameras", "n_batches", "width", "height", *of_tiles)
     entries = call.shape[0]
     found |= {name: np.full(entries, called.meta[name]) for name in told if name in called.meta}
     if "dominant_counts" in called.meta:
         found["dominant_counts"] = called.meta["dominant_counts"].reshape(call.shape)
     if not call.batch:
         found |= _lists(backend, call, called.meta, arrays)
-    for name in ("radii", "means2d", "depths", "conics"):
+    for name in ("radii", "means2d", "depths", "conics", "opacities"):
         rows = unpacked(call, called.meta[name], called.meta) if name in called.meta else None
-        found |= {} if rows is None else {name: rows}
+        found |= {} if rows is None else {name.replace("opacities", "effective_opacities"): rows}
+    screen = {name: value for name, value in called.gradients.items() if name in ("means2d", "means2d_abs")}
+    found |= {f"v_{name}": value for name, value in screen.items()}
     names = {name: name for name in ("means", "quats", "scales", "opacities", "viewmats", "backgrounds")}
     names["colors"] = "colors" if call.sh_degree is None else "sh"
     found |= {f"v_{names[name]}": call.by_entry(v) for name, v in called.gradients.items() if name in names}
@@ -249,7 +254,7 @@ def call_of(arrays: Arrays, options: dict[str, Any]) -> Call:
     frames = tuple(tuple(_frames(each, options, profile, plain, own)) for each in entries)
     more = {name: options[name] for name in FORMS}
     mode, clip = options["render_mode"], options["radius_clip"]
-    return Call(frames, batch, own, mode, radius_clip=clip, planes=planes, dominance=True, **more)
+    return Call(frames, batch, own, mode, radius_clip=clip, planes=planes, dominance=True, absgrad=True, **more)
 
 
 def _frames(arrays: Arrays, options: dict[str, Any], profile: Profile, plain: bool, own: bool) -> Iterator[Frame]:

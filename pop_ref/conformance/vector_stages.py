@@ -1,8 +1,8 @@
 """Portable vectors of single stage functions: calls that laws made, kept because a broken stage answers them wrongly.
 
-`python -m pop_ref.conformance.vector_stages` takes the calls anew from the laws that the mutants of the oracle name,
-and writes `vector_stages.json`. What rounding may cost is measured: inputs are moved by float32's rounding, and the
-answer moves by so much.
+`python -m pop_ref.conformance.vector_stages MUTANT ...` takes calls from the laws that these mutants name, for those of
+them that no call of `vector_stages.json` tells from the oracle, and adds them there. What rounding may cost is
+measured: inputs are moved by float32's rounding, and the answer moves by so much.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import functools
 import inspect
 import json
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,14 +26,26 @@ from pop_ref.conformance.vector_check import entry, equal
 from pop_ref.constants import Profile
 from pop_ref.contributions import Contributions
 from pop_ref.density import Statistics
+from pop_ref.recipes import Recipe
 from pop_ref.records import Camera, Gaussians, Splats
-from pop_ref.settings import DensityConfig, LearningRates
+from pop_ref.settings import DensityConfig, LearningRates, UpdateRules
 
 FILE: Final = Path(__file__).with_suffix(".json")
 # values that a call may hold besides numbers, and what they are made of
 TYPES: Final = {
     each.__name__: each
-    for each in (Camera, Contributions, DensityConfig, Gaussians, LearningRates, Profile, Splats, Statistics)
+    for each in (
+        Camera,
+        Contributions,
+        DensityConfig,
+        Gaussians,
+        LearningRates,
+        Profile,
+        Recipe,
+        Splats,
+        Statistics,
+        UpdateRules,
+    )
 }
 EPS: Final = float(np.finfo(np.float32).eps)
 UNITS: Final = 64
@@ -43,7 +55,7 @@ _EXAMPLES: Final = 12
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON holds it: arrays as type and nested lists, records by name and field.
+    """Return a value as JSON holds it: arrays as type and nested lists, records by name and field, numbers by name.
 
     Raises:
         TypeError: it cannot be written.
@@ -58,6 +70,8 @@ def plain(value: Any) -> Any:
         return {"tuple": [plain(each) for each in value]}
     if isinstance(value, list):
         return [plain(each) for each in value]
+    if isinstance(value, dict):
+        return {"by_name": {name: plain(each) for name, each in value.items()}}
     if value is None or isinstance(value, bool | int | float | str):
         return value
     raise TypeError(f"{type(value).__name__} cannot be written")
@@ -73,6 +87,8 @@ def made(value: Any) -> Any:
         return np.array(value["array"], dtype=value["dtype"]).reshape(value["shape"])
     if "tuple" in value:
         return tuple(made(each) for each in value["tuple"])
+    if "by_name" in value:
+        return {name: made(each) for name, each in value["by_name"].items()}
     return TYPES[value["record"]](**{name: made(each) for name, each in value["of"].items()})
 
 
@@ -89,7 +105,14 @@ def numbers(value: Any, name: str = "") -> dict[str, np.ndarray]:
             f"{name}.items": np.array([item for each in value for item in each], dtype=np.int64),
             f"{name}.ends": ends,
         }
+    if isinstance(value, dict):
+        # one name too many is told by their number
+        named = _joined((f"{name}.{key}", each) for key, each in value.items())
+        return {**named, f"{name}.length": np.array(len(value), dtype=np.int64)}
     if isinstance(value, tuple | list) and not all(isinstance(each, int | float) for each in value):
+        if isinstance(value, list) and all(isinstance(each, tuple) and set(map(type, each)) == {int} for each in value):
+            # places: a list of another length is another array, not fewer of them
+            return {name: np.array(value)}
         return _joined((f"{name}.{k}", each) for k, each in enumerate(value))
     array = np.asarray(value)
     return {name: array.astype({"b": np.bool_, "i": np.int64, "u": np.int64}.get(array.dtype.kind, np.float64))}
@@ -106,10 +129,18 @@ def moved(value: Any, change: Callable[[np.ndarray], np.ndarray]) -> Any:
     """Return a value whose arrays of floats are changed, and nothing else."""
     if isinstance(value, np.ndarray):
         return change(value) if value.dtype.kind == "f" else value
-    if type(value).__name__ in TYPES and not isinstance(value, Profile | DensityConfig | LearningRates):
+    if isinstance(value, Camera):
+        # the last rows are no measurements: others are refused
+        viewmat, K = (np.concatenate((change(m[:-1]), m[-1:])) for m in (value.viewmat, value.K))
+        return Camera(viewmat, K, value.width, value.height)
+    if type(value).__name__ in TYPES and not isinstance(
+        value, Profile | DensityConfig | LearningRates | Recipe | UpdateRules
+    ):
         return type(value)(**{f.name: moved(getattr(value, f.name), change) for f in fields(value)})
     if isinstance(value, tuple):
         return tuple(moved(each, change) for each in value)
+    if isinstance(value, dict):
+        return {name: moved(each, change) for name, each in value.items()}
     return [moved(each, change) for each in value] if isinstance(value, list) else value
 
 
@@ -214,20 +245,21 @@ class _Logging(OracleAdapter):
         return noted
 
 
-def record() -> list[Any]:
-    """Return calls, as JSON holds them, that tell mutants from the oracle, each where a law makes one."""
+def record(names: Collection[str]) -> list[Any]:
+    """Return the calls that are kept, as JSON holds them, and those of laws that tell mutants from the oracle.
+
+    Args:
+        names: of the mutants.
+    """
     from pop_ref.conformance.backends import shipped
-    from pop_ref.conformance.mutants import MUTANTS, PROGRAM, ROUNDS
+    from pop_ref.conformance.mutants import MUTANTS, PROGRAM
     from pop_ref.conformance.mutants.copies import living
     from pop_ref.conformance.mutants.trial import law_named, obeys
 
     sound = shipped("fast64")
-    found: list[Any] = []
-    kept: list[tuple[str, list[Any]]] = []
-    for mutant in (*MUTANTS, *(m for m in PROGRAM if m.name in ROUNDS["trainers"])):
-        if mutant.law.startswith("test_strategies"):
-            # vectors of trainings are about those
-            continue
+    kept = list(recorded())
+    found: list[Any] = [[name, [plain(each) for each in args]] for name, args in kept]
+    for mutant in (m for m in (*MUTANTS, *PROGRAM) if m.name in names):
         with living(mutant) as backend:
             if any(_differs(backend, *call) for call in kept):
                 continue
@@ -263,5 +295,5 @@ def _differs(backend: Any, name: str, args: list[Any]) -> bool:
 
 
 if __name__ == "__main__":
-    FILE.write_text(json.dumps(record()) + "\n", encoding="utf-8")
+    FILE.write_text(json.dumps(record(sys.argv[1:])) + "\n", encoding="utf-8")
     sys.exit(0)

@@ -231,10 +231,12 @@ def density_kind() -> dict[str, Any]:
 
 
 def density_vectors() -> dict[str, Vector]:
-    """Return steps under POP's and gsplat's rules, in and behind the blur window."""
+    """Return steps under POP's and gsplat's rules, in and behind the blur window; of one a row is cloned and split."""
     given = {"pop_in_the_blur_window": (POP, 4000), "pop_after_it": (POP, 8000), "gsplat": (GSPLAT, 2000),
              "revised_opacity": (dataclasses.replace(GSPLAT, revised_opacity=True), 4000)}  # fmt: skip
-    return {f"density_{name}": _density(config, step) for name, (config, step) in given.items()}
+    found = {f"density_{name}": _density(config, step) for name, (config, step) in given.items()}
+    both = dataclasses.replace(POP, blur_rule="split", grow_on_gradient_in_blur_window=True)
+    return found | {"density_cloned_and_split": _density(both, 5000, blurred_every=3)}
 
 
 def density_inputs(arrays: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], Statistics]:
@@ -250,7 +252,7 @@ def density_rows(params: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {f"new_{name}": params[_KEYS.get(name, name)] for name in _RAW}
 
 
-def _density(config: DensityConfig, step: int) -> Vector:
+def _density(config: DensityConfig, step: int, blurred_every: int = 5) -> Vector:
     rng, n = np.random.default_rng(step), 12
     given: dict[str, np.ndarray] = {
         "means": in_precision(rng.uniform(-2.0, 2.0, (n, 3))),
@@ -261,7 +263,7 @@ def _density(config: DensityConfig, step: int) -> Vector:
         "sh0": in_precision(rng.normal(size=(n, 1, 3))),
         "grad_sum": in_precision(np.tile([0.0, 1e-3, 4e-3, 2e-4], 3)),
         "n_visible": np.tile([0, 2, 4, 3], 3),
-        "blurred": np.arange(n) % 5 == 0,
+        "blurred": np.arange(n) % blurred_every == 0,
         "normals": in_precision(rng.normal(size=(2, n, 3))),
     }
     params, statistics = density_inputs(given)

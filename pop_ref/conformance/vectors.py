@@ -11,7 +11,6 @@ What a call is packed as, and in what form covariances come, is told by options:
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -21,17 +20,14 @@ import numpy as np
 
 from pop_ref.conformance import vector_training as training
 from pop_ref.conformance.adapter import Adapter, OracleAdapter
-from pop_ref.conformance.calls import Call, Frame
+from pop_ref.conformance.calls import Call
 from pop_ref.conformance.corpus import GRADIENTS as IN_RUNS
 from pop_ref.conformance.corpus import MAPS, PLANS, answers, corpus_scene, unambiguous_cotangents
 from pop_ref.conformance.error_bounds import PixelErrorBounds, pixel_error_bounds
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.scenes import (
-    Record,
     Scene,
     cotangents,
-    golden_scene,
-    pack,
     rounded_to,
     scene_arrays,
     scene_options,
@@ -50,13 +46,10 @@ from pop_ref.conformance.vector_check import (
     render_kind,
     schema,
 )
+from pop_ref.conformance.vector_scenes import calls, vector_scenes
 from pop_ref.conformance.vector_stages import stage_kinds, stage_vectors
 from pop_ref.conformance.vector_training import training_kind, training_vectors
-from pop_ref.conformance.views import call_for, clear_call
-from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER, Profile
-from pop_ref.depth import RenderMode
 from pop_ref.margins import margins
-from pop_ref.records import Camera
 from pop_ref.splatting import project
 
 # options that change the form of what is given, and no image
@@ -70,62 +63,6 @@ MODES = {
     "RGB+D": "colours, then D",
     "RGB+ED": "colours, then ED",
 }
-
-
-def calls() -> dict[str, Call]:
-    """Return the calls by name."""
-    reader = Adapter()  # float32 and the paper's constants
-
-    def seen(seed: int, count: int, mode: RenderMode = "RGB", **asks: Any) -> Call:
-        return clear_call(reader, 16 * seed, count=count, render_mode=mode, **asks)
-
-    found = {"three_cameras": seen(0, 3), "three_cameras_of_degree_three": seen(1, 3, degree=3)}
-    for k, mode in enumerate(("D", "ED", "RGB+D", "RGB+ED")):
-        found[f"mode_{mode.lower().replace('+', '_and_')}"] = seen(2 + k, 2, mode)
-    return found | {
-        "five_channels": seen(6, 2, channels=5),
-        "one_channel_and_depth": seen(7, 2, "RGB+ED", channels=1),
-        "thirty_three_channels": seen(8, 2, channels=33),
-        "antialiased_cameras": seen(9, 2, antialiased=True),
-        "antialiased_depth_under_a_wide_low_pass": seen(10, 2, "RGB+ED", antialiased=True, eps2d=1.25),
-        "a_near_plane": seen(11, 2, "RGB+D", near_plane=2.0),
-        "a_far_plane": seen(12, 2, far_plane=4.5),
-        "small_splats_left_out": seen(13, 2, "ED", radius_clip=5.5),
-        "first_band_of_three": seen(14, 2, degree=3, sh_degree=1),
-        "harmonics_of_each_camera": seen(15, 3, degree=3, camera_colors=True),
-        "colors_of_each_camera": seen(16, 3, "RGB+D", channels=4, camera_colors=True),
-        "a_camera_that_sees_nothing": seen(17, 2, blind=1),
-        "hundreds_of_tiles": seen(18, 2, size=(35, 33), tile_size=2),
-        "batches": seen(19, 2, "RGB+ED", batch=(2,)),
-        "batches_of_two_dimensions": seen(20, 2, batch=(2, 2), antialiased=True, eps2d=1.25),
-        "packed": seen(21, 3, packed=True),
-        "packed_depth_and_a_blind_camera": seen(22, 3, "RGB+ED", packed=True, blind=0),
-        "packed_antialiased": seen(23, 2, packed=True, antialiased=True, eps2d=1.25),
-        "packed_between_planes": seen(24, 2, packed=True, near_plane=2.0, far_plane=4.5),
-        "packed_small_splats_left_out": seen(25, 2, packed=True, radius_clip=5.5, sh_degree=1, degree=3),
-        "packed_colors_of_each_camera": seen(26, 3, packed=True, channels=4, camera_colors=True),
-        "packed_plain_colors": seen(27, 2, packed=True, channels=3),
-        "packed_batches": seen(28, 2, batch=(2,), packed=True),
-        "packed_batches_of_two_dimensions": seen(29, 2, batch=(2, 2), packed=True),
-        "packed_covariances": seen(30, 2, packed=True, covars=True),
-        "covariances": seen(31, 2, covars=True, antialiased=True),
-        "covariances_of_batches": seen(32, 2, covars=True, batch=(2,)),
-        "covariances_between_planes": seen(33, 2, covars=True, near_plane=2.0, radius_clip=5.5),
-        "small_splats_of_one_axis_stay": seen(34, 2, radius_clip=4.5),
-        "without_backgrounds": seen(35, 2, no_background=True),
-        "plain_batches": seen(36, 2, batch=(2,), channels=3),
-        "small_splats_of_one_camera": seen(37, 1, radius_clip=4.5),
-        "packed_and_the_last_camera_is_blind": seen(38, 3, packed=True, blind=2),
-        "a_tile_for_every_pixel": seen(39, 2, size=(35, 33), tile_size=1),
-        "a_centre_on_the_far_plane": _on_the_far_plane(reader),
-    }
-
-
-def _on_the_far_plane(reader: Adapter) -> Call:
-    """Return a call of a camera that does not turn, with a centre on its far plane and one beyond."""
-    frame = call_for(reader, 600).first
-    placed = {"means": np.array([[0.0, 0.0, 3.0], [0.25, 0.0, 5.0]]), "viewmat": np.eye(4)}
-    return Call(((Frame(frame.scene.rows([0, 1]).with_overrides(**placed)),),), planes={"far_plane": 3.0})
 
 
 def _clear_of_the_far_plane(call: Call) -> Call:
@@ -150,9 +87,15 @@ _OF_ROWS: Final = {
     "means2d": ("[C, N, 2]", "screen centres, px"),
     "depths": ("[C, N]", "camera z"),
     "conics": ("[C, N, 3]", "inverse of the blurred screen covariance: xx, xy, yy, px^-2"),
+    "effective_opacities": ("[C, N]", "opacities that blend, antialiased times the factor; 'opacities' of meta"),
+}
+_BY_CENTRES: Final = {
+    "means2d": "derivative of the same sum to screen centres",
+    "means2d_abs": "sums over pixels of the absolute values of what each adds to v_means2d",
 }
 # what gsplat's meta tells of a call besides
-_TOLD: Final = {"n_cameras": "cameras", "n_batches": "batch entries", "tile_size": "px, as the option"}
+_TOLD: Final = {"n_cameras": "cameras", "n_batches": "batch entries", "tile_size": "px, as the option", "width": "px",
+                "height": "px", "tile_width": "tiles in a row", "tile_height": "tiles in a column"}  # fmt: skip
 _MASKS: Final = {
     "unambiguous": ("[C, H, W]", "every decision of the pixel is clear of rounding"),
     "decided": ("[C, H, W]", "unambiguous, and the dominant Gaussian is clear too"),
@@ -211,6 +154,8 @@ def call_kind(kind: str) -> dict[str, Any]:
         where = "smooth_rows_of_each" if own and name == colors else "smooth_rows"
         meaning = f"derivative of sum(v_images images) + sum(v_alphas alphas) to {name}{whose}"
         arrays |= output(f"v_{name}", given[name][0], meaning, f"agreement.v_{name}", where)
+    for name, meaning in _BY_CENTRES.items():
+        arrays |= output(f"v_{name}", "[C, N, 2]", meaning, f"agreement.v_{name}", "smooth_rows_of_each")
     for name, key in (("viewmats", "viewmat"), ("backgrounds", "background")):
         where = "all_smooth" if name == "viewmats" else None
         arrays |= output(f"v_{name}", given[name][0], f"derivative to {name}", f"agreement.v_{key}", where)
@@ -241,7 +186,9 @@ def _entry(call: Call, b: int, row: list[Expected]) -> dict[str, np.ndarray]:
     arrays["alphas"] = 1.0 - np.stack([e.render.T_final for e in row])
     arrays["error_bound_alphas"] = np.stack([e.error_bounds.T_final + 1.0 for e in row])
     arrays |= {"T_final": 1.0 - arrays["alphas"], "error_bound_T_final": arrays["error_bound_alphas"]}
-    told = (len(row), len(call.frames), call.tile_size)
+    camera, side = call.first.scene.camera, call.tile_size
+    tiles = (-(-camera.width // side), -(-camera.height // side))
+    told = (len(row), len(call.frames), side, camera.width, camera.height, *tiles)
     arrays |= {name: np.array(value) for name, value in zip(_TOLD, told, strict=True)}
     for name in ("dominant_ids", "n_blended"):
         arrays[name] = np.stack([getattr(e.render, name) for e in row])
@@ -287,8 +234,9 @@ def _splats(row: list[Expected]) -> dict[str, np.ndarray]:
     found = {"radii": np.stack([e.render.splats.radii for e in row]), "clear_rows": clear, "visible_rows": visible}
     for name in _OF_ROWS:
         # what is culled holds no number
-        values = np.stack([getattr(e.render.splats, name) for e in row])
-        bounds = np.stack([getattr(e.error_bounds.screen, f"e_{name}") for e in row]) + np.abs(values)
+        key = name.removeprefix("effective_")
+        values = np.stack([getattr(e.render.splats, key) for e in row])
+        bounds = np.stack([getattr(e.error_bounds.screen, f"e_{key}") for e in row]) + np.abs(values)
         finite = np.isfinite(values) & np.isfinite(bounds)
         found |= {name: np.where(finite, values, 0.0), f"error_bound_{name}": np.where(finite, bounds, 0.0)}
     return found
@@ -296,11 +244,11 @@ def _splats(row: list[Expected]) -> dict[str, np.ndarray]:
 
 def _gradients(row: list[Expected], colors: str, own_colors: bool) -> dict[str, np.ndarray]:
     pulled = [e.gradients for e in row]
-    names = {name: name for name in (*_GAUSSIANS, "viewmats", "backgrounds")} | {"colors": colors}
+    of_each = ("viewmats", "backgrounds", *_BY_CENTRES, *["colors"] * own_colors)
+    names = {name: name for name in (*_GAUSSIANS, "viewmats", "backgrounds", *_BY_CENTRES)} | {"colors": colors}
     found: dict[str, np.ndarray] = {}
     for name, own in names.items():
-        of_each = name in ("viewmats", "backgrounds") or (name == "colors" and own_colors)
-        gathered = np.stack if of_each else _added
+        gathered = np.stack if name in of_each else _added
         found[f"v_{own}"] = gathered([value[name] for value, _ in pulled])
         found[f"error_bound_v_{own}"] = gathered([bound[name] for _, bound in pulled])
     return found
@@ -352,6 +300,7 @@ def expected_arrays(scene: Scene) -> dict[str, np.ndarray]:
     arrays = {**scene_arrays(scene), "v_image": v_image, "v_T_final": v_T_final}
     for name in ("image", "T_final", "dominant_ids", "n_blended"):
         arrays[name] = getattr(drawn, name)
+    arrays |= {"dominant_weights": drawn.dominant_weights}
     arrays |= _error_bounds(error_bounds) | _stages(drawn.splats, error_bounds)
     for name in GRADIENTS:
         arrays[f"v_{name}"], arrays[f"error_bound_v_{name}"] = gradients[name], bounds[name]
@@ -364,6 +313,7 @@ def _error_bounds(error_bounds: PixelErrorBounds) -> dict[str, np.ndarray]:
     return {
         "error_bound_image": error_bounds.image + error_bounds.absolute,
         "error_bound_T_final": error_bounds.T_final + 1.0,
+        "error_bound_dominant_weights": error_bounds.dominant_weight + 1.0,
         "unambiguous": error_bounds.unambiguous,
         "decided": error_bounds.decided,
         "smooth_rows": smooth,
@@ -441,62 +391,6 @@ def export(folder: Path) -> list[str]:
 def _full_options(scene: Scene) -> dict[str, Any]:
     """Return the scene's options with every default written out: a port has no defaults to take."""
     return scene_options(scene) | {"tile_size": scene.side, "sh_degree": scene.degree}
-
-
-_BANDS = tuple((0.125 * (k % 5) - 0.25, 0.0625 * (k % 7) - 0.125, 0.25 - 0.0625 * (k % 3)) for k in range(15))
-
-
-def _camera(width: int = 12, height: int = 9, turned: bool = False) -> Camera:
-    K = np.array([[12.0, 0.0, 5.5], [0.0, 11.0, 4.75], [0.0, 0.0, 1.0]])
-    viewmat = np.eye(4)
-    if turned:
-        viewmat[:3] = [[0.0, 0.0, -1.0, 0.5], [0.6, 0.8, 0.0, -0.25], [0.8, -0.6, 0.0, 1.5]]
-    return Camera(viewmat, K, width, height)
-
-
-def _scene(records: list[Record], turned: bool = False, profile: Profile = PAPER) -> Scene:
-    camera = _camera(turned=turned)
-    return Scene(pack(records, camera), camera, np.array([0.125, 0.25, 0.5]), profile)
-
-
-def vector_scenes() -> dict[str, Scene]:
-    """Return the scenes by name."""
-    one = Record(5.75, 4.25, 2.0, (2.0, 2.0, 2.0), opacity=0.75, sh=((1.0, 0.5, -0.25),))
-    turned = dataclasses.replace(one, size=(3.0, 1.0, 0.5), quat=(1.0, 0.5, -0.25, 0.75))
-    coloured = dataclasses.replace(turned, sh=((0.5, 0.25, 1.0), *_BANDS))
-    stack = [dataclasses.replace(one, depth=1.0 + k, opacity=o) for k, o in enumerate((0.9, 0.99, 0.95, 1.0, 0.5))]
-    clones = [dataclasses.replace(one, opacity=0.5)] * 3
-    faint = [dataclasses.replace(one, opacity=o, depth=1.0 + o) for o in (0.0, 0.003, 0.0035, 0.005, 0.0625)]
-    far_out = [
-        dataclasses.replace(one, x=-30.0, size=(12.0, 12.0, 12.0)),
-        dataclasses.replace(one, y=40.0, size=(16.0,) * 3),
-    ]
-    hidden = [
-        one,
-        dataclasses.replace(one, depth=-1.0),
-        dataclasses.replace(one, depth=0.001),
-        dataclasses.replace(one, x=900.0),
-    ]
-    needle = dataclasses.replace(one, size=(24.0, 0.0625, 0.0625), quat=(1.0, 0.0, 0.0, 0.5), opacity=1.0)
-    scenes = {
-        "one round splat": _scene([one]),
-        "one turned splat": _scene([turned]),
-        "a turned camera": _scene([one, turned], turned=True),
-        "harmonics of degree three": _scene([coloured], turned=True),
-        "a stack that ends early": _scene(stack),
-        "coincident clones": _scene(clones),
-        "opacities about the floor": _scene(faint),
-        "a clamped jacobian": _scene([one, *far_out]),
-        "hidden splats": _scene(hidden),
-        "a needle": _scene([needle, one]),
-        "antialiased": _scene([one, dataclasses.replace(one, size=(0.25, 0.5, 0.25), opacity=1.0)]).with_overrides(
-            antialiased=True
-        ),
-        "the ceiling of 0.99": _scene(stack, profile=GSPLAT_1_6),
-        "inria": _scene([one, turned, *stack[2:]], profile=INRIA),
-        "golden": golden_scene(),
-    }
-    return {name.replace(" ", "_"): scene for name, scene in scenes.items()}
 
 
 _SUMS = {"image": "[blocks, 3]", "T_final": "[blocks, 1]", "dominant_ids": "[blocks, 1]", "n_blended": "[blocks, 1]"}

@@ -58,17 +58,18 @@ def test_a_sound_port_passes_every_vector(folder: Path, tmp_path: Path, name: st
     found = check(folder, tmp_path / "results", np.dtype(backend.dtype).name)
     assert not found.failed, found.failed
     assert (found.missing, found.strange) == (unanswered, [])
-    # the oracle is too slow for thousands of Gaussians, and no rasterizer says what it does with colours on the way
+    # the oracle is too slow for thousands of Gaussians, and no rasterizer tells colours on the way
     large = [vector for vector in unanswered if vector.startswith("large_")]
     assert bool(large) == (name == "oracle")
     if name == "oracle":
         # it draws frame by frame, from quaternions and scales
         assert all(vector.startswith(("large_", "packed", "covariances")) for vector in unanswered)
         lists = {"tiles_per_gauss", "list_rows", "list_keys"}
-        assert set(found.absent) == {"dominant_counts", "n_cameras", "n_batches", "tile_size", *lists}
+        told = {"n_cameras", "n_batches", "tile_size", "width", "height", "tile_width", "tile_height"}
+        assert set(found.absent) == {"dominant_counts", *told, *lists}
     else:
         assert all(vector.startswith("stage_") for vector in unanswered)
-        assert [array for array in found.absent if not array.startswith("value")] == ["effective_opacities", "colors"]
+        assert [array for array in found.absent if not array.startswith("value")] == ["colors"]
     assert len(found.verdicts) > 400
 
 
@@ -161,7 +162,7 @@ def test_inputs_are_exact_in_float32_and_masks_leave_most_of_every_vector_to_be_
             for name in (name for name, entry in arrays.items() if entry["role"] == "input"):
                 assert np.array_equal(stored[name], stored[name].astype(np.float32)), f"{vector['file']}: {name}"
             for mask in {"decided", "unambiguous", "clear_rows"} & set(stored.files):
-                assert np.mean(stored[mask]) > 0.5, f"{vector['file']}: {mask}"
+                assert np.mean(stored[mask] if stored[mask].size else True) > 0.5, f"{vector['file']}: {mask}"
             for cotangent in {"v_image", "v_images"} & set(stored.files):
                 assert np.any(stored[cotangent] != 0.0)
 
