@@ -93,7 +93,10 @@ def made(value: Any) -> Any:
 
 
 def numbers(value: Any, name: str = "") -> dict[str, np.ndarray]:
-    """Return the numbers of a value as arrays by name; ragged lists as their items and where each list ends."""
+    """Return the numbers of a value as arrays by name; ragged lists as their items and where each list ends.
+
+    Places in a list are one array, and what has names tells their number, too: an answer of another length is told.
+    """
     if value is None or isinstance(value, str):
         return {}
     if is_dataclass(value) or isinstance(value, SimpleNamespace):
@@ -294,6 +297,21 @@ def _differs(backend: Any, name: str, args: list[Any]) -> bool:
     return False
 
 
+def main(names: list[str]) -> int:
+    """Add calls for some mutants to the file; with an unknown name, or none, it stays as it is."""
+    from pop_ref.conformance.mutants import MUTANTS, PROGRAM
+
+    strange = set(names) - {mutant.name for mutant in (*MUTANTS, *PROGRAM)}
+    if strange or not names:
+        said = f"there is no mutant {', '.join(sorted(strange))}" if strange else "no mutant is named"
+        print(f"{said}: python -m pop_ref.conformance.vector_stages MUTANT ...; docs/MUTANTS.md lists them")
+        return 2
+    text = json.dumps(record(names)) + "\n"
+    beside = FILE.with_suffix(".new")
+    beside.write_text(text, encoding="utf-8")
+    beside.replace(FILE)
+    return 0
+
+
 if __name__ == "__main__":
-    FILE.write_text(json.dumps(record(sys.argv[1:])) + "\n", encoding="utf-8")
-    sys.exit(0)
+    sys.exit(main(sys.argv[1:]))

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pop_ref.conformance import vector_stages
 from pop_ref.conformance.adapter import KEPT, LARGEST, OracleAdapter, Reference, forget, remembered
 from pop_ref.conformance.backends import SHIPPED, shipped
 from pop_ref.conformance.corpus import (
@@ -165,6 +166,19 @@ def test_inputs_are_exact_in_float32_and_masks_leave_most_of_every_vector_to_be_
                 assert np.mean(stored[mask] if stored[mask].size else True) > 0.5, f"{vector['file']}: {mask}"
             for cotangent in {"v_image", "v_images"} & set(stored.files):
                 assert np.any(stored[cotangent] != 0.0)
+
+
+def test_calls_are_kept_for_mutants_that_there_are(monkeypatch, tmp_path: Path, capsys) -> None:
+    kept = tmp_path / "calls.json"
+    kept.write_bytes(vector_stages.FILE.read_bytes())
+    monkeypatch.setattr(vector_stages, "FILE", kept)
+    for names, said in (([], "no mutant is named"), (["nobody"], "there is no mutant nobody")):
+        assert vector_stages.main(names) == 2
+        assert said in capsys.readouterr().out
+    # a call of the file tells this one from the oracle already
+    assert vector_stages.main(["all_directions_count_too_much"]) == 0
+    assert kept.read_bytes() == Path(vector_stages.__file__).with_suffix(".json").read_bytes()
+    assert list(tmp_path.iterdir()) == [kept]
 
 
 def test_vectors_of_an_older_version_are_refused(index: dict[str, Any], tmp_path: Path) -> None:

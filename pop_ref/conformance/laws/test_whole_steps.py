@@ -69,7 +69,7 @@ def test_every_step_is_the_oracles_under_every_setting(backend):
     hidden = replace(MASKED, order=(0,), seed=40)
     # several tiles, and more rows of pixels than the compiled engine takes in one part, which is 16
     large = [replace(short, size=(21, 37), order=(0,), count=9, seed=1078) for short in (PRIOR, MASKED)]
-    # a splat over two rows of tiles, of which none reaches the first column
+    # a splat lies over two rows of tiles and does not reach their first column
     aside = replace(MASKED, size=(40, 37), order=(0,), count=9, seed=2117)
     # no window has a centre that counts
     unseen = replace(MASKED, order=(0,), seed=3071)
