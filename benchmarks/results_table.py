@@ -1,36 +1,23 @@
-"""Tables of what was measured: training runs, docs/reliability.md, and the training steps of NOTES.md.
+"""Tables of what was measured: docs/reliability.md, and the training steps of NOTES.md.
 
-benchmarks/results/training.jsonl has one line a run: what the run wrote into stats/val_step*.json, after its name here.
+    python benchmarks/results_table.py              print the tables of a training step
+    python benchmarks/results_table.py --write      put them into NOTES.md, between their marks
+    python benchmarks/results_table.py --check      exit with 1 when NOTES.md holds others
 
-    python benchmarks/results_table.py --add FILE NAME      add a run's statistics under a name
-    python benchmarks/results_table.py                      print the tables of runs and of steps
-    python benchmarks/results_table.py --write              put those of steps into NOTES.md, between their marks
-    python benchmarks/results_table.py --check [PAGE...]    exit with 1 when NOTES.md or these pages hold others
-
-`python docs/tables.py --write` puts those of runs into README.md and docs/results.md, and the first of a step into
-README.md. Runs of one capture, method and weight of the POP term that differ in their seed share a row: means, and in
-brackets the smallest and largest PSNR and SSIM. What `benchmarks.faults` and `benchmarks.load` have written makes the
-tables of docs/reliability.md, and `results/cpu.json` those of a training step.
+`python docs/tables.py --write` puts the first of a step into docs/speed.md. What `benchmarks.faults` and
+`benchmarks.load` have written makes the tables of docs/reliability.md, and `results/cpu.json` those of a training step.
 """
 
 from __future__ import annotations
 
-import json
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from benchmarks.record import markdown, read_json, with_table
-from paper_repro.paper import paper
-from pop_fast.view.report.source import COLUMNS, row
-from pop_fast.view.report.source import markdown as table_of_runs
 
 RESULTS = Path(__file__).resolve().parent / "results"
-RUNS = RESULTS / "training.jsonl"
-# of runs under the older reading of growth by blur, which stand in no table
-ANY_VIEW = "any_view/"
-Stats = dict[str, Any]
 # what came of a disturbed change of the disk, by its key in faults.json
 _CAME = {"ended": "ended", "told": "reported", "continued": "continued"}
 _KINDS = ("read", "refused", "told", "escaped", "crashed", "hung")
@@ -39,92 +26,6 @@ NOT_YET = "Not measured yet: run `python benchmarks/run.py`."
 FEWEST_CORES = 16
 BOUNDS = {"operations": "o", "bytes": "b"}
 ENGINES = {"fast": "`fast`", "compiled": "`compiled`, autograd", "native": "`compiled`, native"}
-
-
-def table(runs: Path = RUNS) -> str:
-    """Make the table of all runs, by capture, POP before others."""
-    return table_of_runs([_row(runs) for runs in _groups(runs)])
-
-
-def summary(runs: Path = RUNS) -> str:
-    """Make the short table: POP at the paper's weight of its term, and the two baselines, a capture a line."""
-    chosen = _by_capture(runs)
-    rows = [[capture, *(_short(of.get(name)) for name in ("pop", "gsplat", "3dgs"))] for capture, of in chosen.items()]
-    return markdown(["capture", "POP", "gsplat's default strategy", "3DGS"], rows)
-
-
-def _by_capture(runs: Path) -> dict[str, dict[str, Stats]]:
-    """Return means over seeds by capture and method."""
-    chosen: dict[str, dict[str, Stats]] = {}
-    for stats in map(_mean, _groups(runs)):
-        # of several weights of the POP term the smallest, which is the paper's
-        chosen.setdefault(stats["capture"], {}).setdefault(stats["method"], stats)
-    return chosen
-
-
-def _short(stats: Stats | None) -> str:
-    return "not run" if stats is None else f"{stats['psnr']:.2f} dB, {stats['num_GS']:,}"
-
-
-def differences() -> str:
-    """Make the table of what POP is less gsplat's strategy: of these runs, and of the paper's main tables."""
-    rows = []
-    for capture, of in sorted(_by_capture(RUNS).items()):
-        if "pop" in of and "gsplat" in of:
-            steps = f"{of['pop']['step'] + 1:,} steps, measured here"
-            rows.append([capture, steps, *_differences(of["pop"], of["gsplat"], "num_GS")])
-    published = paper()
-    for dataset, number in (("Mip-NeRF 360", 1), ("Tanks & Temples", 2), ("Deep Blending", 1)):
-        ours, base = (published.table(number).row(row).values[dataset] for row in ("pop", "gsplat"))
-        rows.append([dataset, "30,000 steps, the paper's", *_differences(ours, base, "num_gaussians_k")])
-    head = ["scene", "schedule", "PSNR", "SSIM", "Gaussians"]
-    return markdown(head, rows, ["---", "---", "---:", "---:", "---:"])
-
-
-def _differences(ours: Mapping[str, Any], base: Mapping[str, Any], count: str) -> list[str]:
-    psnr, ssim = (ours[name] - base[name] for name in ("psnr", "ssim"))
-    return [f"{psnr:+.2f} dB", f"{ssim:+.3f}", f"{ours[count] / base[count]:.1%}"]
-
-
-def _groups(path: Path) -> list[list[Stats]]:
-    runs = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    groups: dict[tuple[Any, ...], list[Stats]] = {}
-    for stats in runs:
-        if stats["run"].startswith(ANY_VIEW):
-            continue
-        key = (stats["capture"], stats["method"] != "pop", stats["method"], stats.get("lambda_pop", 0.0))
-        groups.setdefault(key, []).append(stats)
-    return [groups[key] for key in sorted(groups)]
-
-
-def _mean(runs: Sequence[Stats]) -> Stats:
-    """Return the first run's statistics with the means of what is a number in all of them."""
-    merged = dict(runs[0])
-    for name, value in merged.items():
-        if isinstance(value, (int, float)) and name != "step":
-            mean = sum(stats[name] for stats in runs) / len(runs)
-            merged[name] = round(mean) if isinstance(value, int) else mean
-    return merged
-
-
-def _row(runs: Sequence[Stats]) -> list[str]:
-    cells = row(_mean(runs))
-    if len(runs) == 1:
-        return cells
-    cells[0] += f", {len(runs)} seeds"
-    for name, key, form in (("PSNR", "psnr", ".2f"), ("SSIM", "ssim", ".4f")):
-        values = [stats[key] for stats in runs]
-        cells[COLUMNS.index(name)] += f" ({min(values):{form}} to {max(values):{form}})"
-    return cells
-
-
-def add(statistics: Path, name: str, runs: Path = RUNS) -> None:
-    """Add a run's statistics; a run of the same name is replaced."""
-    kept = [json.loads(line) for line in runs.read_text(encoding="utf-8").splitlines()]
-    kept = [stats for stats in kept if stats["run"] != name]
-    kept.append({"run": name, **json.loads(statistics.read_text(encoding="utf-8"))})
-    kept.sort(key=lambda stats: (stats["run"].startswith(ANY_VIEW), stats["run"]))
-    runs.write_text("".join(json.dumps(stats, separators=(",", ":")) + "\n" for stats in kept), encoding="utf-8")
 
 
 def fuzzed() -> str:
@@ -334,28 +235,16 @@ def with_tables(text: str, timed: Mapping[str, Any]) -> str:
 
 def main(words: list[str]) -> int:
     """Run the script."""
-    if words[:1] == ["--add"]:
-        add(Path(words[1]), words[2])
-        return 0
-    tables, timed, notes = (
-        (table(), differences(), summary()),
-        read_json(RESULTS / "cpu.json"),
-        NOTES.read_text(encoding="utf-8"),
-    )
+    timed, notes = read_json(RESULTS / "cpu.json"), NOTES.read_text(encoding="utf-8")
     if words == ["--write"]:
         NOTES.write_text(with_tables(notes, timed), encoding="utf-8")
-        return 0
-    if words[:1] != ["--check"]:
-        of_steps = (make(timed) if part in timed else NOT_YET for part, make in TABLES.values())
-        print("\n\n".join((*tables, *(f"{name}\n\n{made}" for name, made in zip(TABLES, of_steps, strict=True)))))
-        return 0
-    text = "\n".join(Path(word).read_text(encoding="utf-8") for word in words[1:])
-    if words[1:] and any(f"\n{made}\n" not in text for made in tables):
-        print(f"{' '.join(words[1:])}: a results table is not what the runs say; run 'python docs/tables.py --write'")
-        return 1
-    if with_tables(notes, timed) != notes:
-        print("NOTES.md: a table of the training step is not what was measured; run results_table.py --write")
-        return 1
+    elif words == ["--check"]:
+        if with_tables(notes, timed) != notes:
+            print("NOTES.md: a table of the training step is not what was measured; run results_table.py --write")
+            return 1
+    else:
+        made = {name: make(timed) if part in timed else NOT_YET for name, (part, make) in TABLES.items()}
+        print("\n\n".join(f"{name}\n\n{table}" for name, table in made.items()))
     return 0
 
 

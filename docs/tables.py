@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from benchmarks import blocks as run_in_blocks
@@ -22,7 +23,9 @@ from benchmarks import kinds as kinds_of_captures
 from benchmarks import results_table
 from benchmarks.record import markdown as table
 from benchmarks.record import read_json
+from paper_repro.jobs import load_row
 from paper_repro.methods import load_pinned
+from paper_repro.results import Result, read_all
 from paper_repro.status import everything, status_table
 from paper_repro.status import outcome as outcome_of
 from pop_fast.train.presets import METHODS, options_for
@@ -273,6 +276,27 @@ def outcome() -> str:
     return outcome_of(everything())
 
 
+# the rows of README.md's table, and its captures with their photographs' size
+SHOWN_ROWS = ("pop", "reset", "gsplat", "3dgs", "taming", "speedy_splat", "mini_splatting", "mini_splatting_star",
+              "pup", "pup_star")  # fmt: skip
+SHOWN_SCENES = {"fox": "fox, 270x480", "bear_512": "bear, 256x256", "bonsai_800": "bonsai, 400x266",
+                "garden_512": "garden, 256x256"}  # fmt: skip
+
+
+def summary() -> str:
+    """Make the table of README.md: PSNR and Gaussians at scale small, means over seeds."""
+    found = read_all("small")
+    rows = []
+    for row in SHOWN_ROWS:
+        runs = [[r for r in found if (r.row, r.scene) == (row, scene)] for scene in SHOWN_SCENES]
+        rows.append([load_row(row).title, *map(_of_seeds, runs)])
+    return table(["method", *SHOWN_SCENES.values()], rows, ["---", *["---:"] * len(SHOWN_SCENES)])
+
+
+def _of_seeds(runs: list[Result]) -> str:
+    return f"{fmean(r.psnr for r in runs):.2f} dB, {fmean(r.num_gaussians for r in runs):,.0f}" if runs else "–"
+
+
 def few_photographs() -> str:
     """Make the table of captures with few photographs left, as benchmarks/few_photographs.py does."""
     settings = ("--depth-lambda 0.1", "--depth-lambda 0.01", "--method gsplat")
@@ -465,9 +489,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "conventions": conventions,
     "profiles": profiles,
     "speed": speed,
-    "summary": results_table.summary,
-    "results": results_table.table,
-    "differences": results_table.differences,
+    "summary": summary,
     "few_photographs": few_photographs,
     "estimates": estimates,
     "kinds": kinds,

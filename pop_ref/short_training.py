@@ -8,6 +8,7 @@ scripts: no short training of it may grow.
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -73,7 +74,7 @@ class Trained:
         return {name: count for name, count in done.items() if count}
 
 
-def taken_steps(short: ShortTraining) -> list[dict[str, Any]]:
+def taken_steps(short: ShortTraining, before: Sequence[Mapping[str, Any]] | None = None) -> list[dict[str, Any]]:
     """Take the steps of a short training.
 
     Source: POP paper, section 3, and the papers and code of the methods (`recipes`, `methods.Extras`).
@@ -81,6 +82,7 @@ def taken_steps(short: ShortTraining) -> list[dict[str, Any]]:
 
     Args:
         short: what is trained, and on what.
+        before: of every step "params", "m" and "v" that it begins with; None: those that the last one left.
 
     Returns:
         Of every step: its "view", its "loss", which is that of the parameters before it, and "params", "m" and "v"
@@ -93,26 +95,32 @@ def taken_steps(short: ShortTraining) -> list[dict[str, Any]]:
         (0, 1, (6, 3))
     """
     if short.method in ("pup", "mini-splatting", "speedy-splat"):
-        return _taken_with_passes(short)
+        return _taken_with_passes(short, before)
     recipe = Trained(short).recipe
     state, draws = training.start(short.params), short.draws()
     found: list[dict[str, Any]] = []
-    for view in short.order:
+    for step, view in enumerate(short.order):
+        state = state if before is None else replace(state, rows=_rows(before[step]))
         camera, target, scale, _, *more = _seen(short, view, recipe)
         state, loss = training.train_step(state, camera, target, scale, draws.normals, recipe, *more)
         found.append(_record(view, loss, state.rows))
     return found
 
 
-def _taken_with_passes(short: ShortTraining) -> list[dict[str, Any]]:
+def _taken_with_passes(short: ShortTraining, before: Sequence[Mapping[str, Any]] | None) -> list[dict[str, Any]]:
     trained = Trained(short)
     found: list[dict[str, Any]] = []
-    for view in short.order:
+    for step, view in enumerate(short.order):
+        trained.driven.rows = trained.driven.rows if before is None else _rows(before[step])
         seen = trained.look(view)
         trained.move(view, seen)
         trained.change()
         found.append(_record(view, seen.loss, trained.driven.rows))
     return found
+
+
+def _rows(record: Mapping[str, Any]) -> Rows:
+    return Rows(record["params"], record["m"], record["v"])
 
 
 def _record(view: int, loss: float, rows: Rows) -> dict[str, Any]:

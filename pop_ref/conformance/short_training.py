@@ -36,6 +36,7 @@ from pop_ref.density import DensityConfig, Rows, Statistics, accumulate, zero_st
 from pop_ref.losses import photometric_pop_vjp
 from pop_ref.methods import KEYS
 from pop_ref.optimizer import learning_rates, sh_degree_at
+from pop_ref.recipes import Recipe
 from pop_ref.records import Camera, Gaussians
 from pop_ref.render import Render, render, render_vjp
 from pop_ref.settings import BETAS, EPS
@@ -347,7 +348,7 @@ def _with(state: Collected, look: _Look, watch: Watch, config: DensityConfig) ->
 # under it moments of single precision may be flushed to zero
 _SMALLEST: Final = float(np.finfo(np.float32).tiny)
 # world units that no step moves a Gaussian by, and that no two are within
-_PLACE: Final = 0.01
+PLACE: Final = 0.01
 # of the steps of a short training so many must be clear of rounding
 _LEAST_JUDGED: Final = 0.6
 
@@ -367,29 +368,85 @@ def assert_steps(
     Returns:
         What was done to the Gaussians.
     """
-    # frozen, which a protocol of attributes does not allow
-    given: Any = short
-    trained, happened, judged = Trained(given), set[str](), 0
-    waiting = np.zeros(0)
+    judge, happened, judged = OracleSteps(short, backend.dtype), set[str](), 0
     for step, record in enumerate(found):
-        rows, view = trained.driven.rows, int(record["view"])
-        seen = trained.look(view)
-        step_bounds = _Bounds(trained, view, seen, backend.dtype)
-        waiting = waiting if len(waiting) == len(rows) else np.zeros_like(rows.params["shN"])
-        errors, waiting = step_bounds.gradients(trained, waiting)
-        trained.move(view, seen)
-        trained.driven.rows = _with_errors(trained, rows, errors, backend.dtype)
-        happened |= set(trained.change())
-        if step_bounds.clear:
+        wanted = judge.step(int(record["view"]))
+        happened |= wanted.happened
+        if wanted.clear:
             judged += 1
             at = f"step {step} of {short.method}"
-            size = abs(seen.loss) + step_bounds.loss_size
-            assert_close("steps.loss", record["loss"], seen.loss, size, backend.dtype, True, place=_at(f"{at}: loss"))
-            _assert_rows(record, trained.driven.rows, backend.dtype, at)
-        _assert_whose(record["params"]["means"], trained.driven.rows.params["means"], f"step {step} of {short.method}")
-        trained.driven.rows = Rows(*({key: record[kind][key] for key in KEYS} for kind in ("params", "m", "v")))
+            sizes = wanted.loss, wanted.loss_size
+            assert_close("steps.loss", record["loss"], *sizes, backend.dtype, True, place=_at(f"{at}: loss"))
+            _assert_rows(record, wanted.rows, backend.dtype, at)
+        _assert_whose(record["params"]["means"], wanted.rows.params["means"], f"step {step} of {short.method}")
+        judge.go_on(Rows(*({key: record[kind][key] for key in KEYS} for kind in ("params", "m", "v"))))
     assert judged >= least * len(found), "rounding decides a pixel of most steps"
     return happened
+
+
+@dataclass(frozen=True)
+class WantedStep:
+    """What the oracle makes of a step, and what rounding may do to it.
+
+    Attributes:
+        loss, loss_size: and the size of its unit.
+        rows: Gaussians and moments after the step; further arrays of their parameters hold, of each entry of "params",
+            "m" and "v", the size of a unit ("size m means"), and by how much Adam's update may differ ("spread means").
+        rates: learning rates.
+        clear: whether rounding decides nothing of the render.
+        happened: what was done to the Gaussians.
+    """
+
+    loss: float
+    loss_size: float
+    rows: Rows
+    rates: Mapping[str, float]
+    clear: bool
+    happened: set[str]
+
+
+class OracleSteps:
+    """A short training that the oracle takes step by step, with what rounding may do.
+
+    Args:
+        short: what is trained.
+        dtype: the precision that is judged.
+    """
+
+    def __init__(self, short: ShortTraining, dtype: Any) -> None:
+        # frozen, which a protocol of attributes does not allow
+        given: Any = short
+        self._trained, self._waiting, self._dtype = Trained(given), np.zeros(0), dtype
+
+    @property
+    def rows(self) -> Rows:
+        """Return the Gaussians and moments before the next step."""
+        found: Rows = self._trained.driven.rows
+        return found
+
+    @property
+    def recipe(self) -> Recipe:
+        """Return what is minimised."""
+        return self._trained.recipe
+
+    def go_on(self, rows: Rows) -> None:
+        """Let the next step begin with these."""
+        self._trained.driven.rows = rows
+
+    def step(self, view: int) -> WantedStep:
+        """Take a step with a view."""
+        trained, before, number = self._trained, self.rows, self._trained.step
+        seen = trained.look(view)
+        bounds = _Bounds(trained, view, seen, self._dtype)
+        fits = len(self._waiting) == len(before)
+        waiting = self._waiting if fits else np.zeros_like(before.params["shN"])
+        errors, self._waiting = bounds.gradients(trained, waiting)
+        clear = bounds.clear
+        trained.move(view, seen)
+        self.go_on(_with_errors(trained, before, errors, self._dtype))
+        happened = set(trained.change())
+        size = abs(seen.loss) + bounds.loss_size
+        return WantedStep(seen.loss, size, self.rows, _rates(trained, number), clear, happened)
 
 
 def _at(where: str) -> Any:
@@ -398,7 +455,7 @@ def _at(where: str) -> Any:
 
 def _assert_whose(found: np.ndarray, expected: np.ndarray, at: str) -> None:
     assert len(found) == len(expected), f"{at} left {len(found)} Gaussians, expected {len(expected)}"
-    others = np.flatnonzero(np.any(np.abs(found - expected) > _PLACE, axis=1))
+    others = np.flatnonzero(np.any(np.abs(found - expected) > PLACE, axis=1))
     assert not len(others), f"{at} left another Gaussian at row {others[:1]}"
 
 
@@ -501,34 +558,39 @@ def _degree_of(params: Mapping[str, np.ndarray]) -> int:
 
 def _with_errors(trained: Trained, before: Rows, errors: Mapping[str, np.ndarray], dtype: Any) -> Rows:
     """Return the rows after Adam, with the size of a unit of each entry under more keys, which go with their rows."""
-    moved, step, short, recipe = trained.driven.rows, trained.step, trained.short, trained.recipe
-    rates = learning_rates(step, short.scene_scale, recipe.max_steps, recipe.lr, recipe.updates)
+    moved, rates, beta2 = trained.driven.rows, _rates(trained, trained.step), trained.recipe.lr.beta2
     limit = tolerances.agreement("steps.params", dtype)
     more: dict[str, np.ndarray] = {}
     for key in KEYS:
         m, v = moved.m[key], moved.v[key]
         g = np.abs(m - BETAS[0] * before.m[key]) / (1.0 - BETAS[0])
         size_m = (1.0 - BETAS[0]) * errors[key] + np.abs(before.m[key]) + np.abs(m)
-        size_v = (1.0 - BETAS[1]) * 2.0 * g * errors[key] + v
+        size_v = (1.0 - beta2) * 2.0 * g * errors[key] + v
         allowed = [
             tolerances.agreement(name, dtype) * size
             for name, size in ((f"steps.{key}", size_m), ("steps.squares", size_v))
         ]
-        squared = (1.0 - BETAS[1]) * (tolerances.agreement(f"steps.{key}", dtype) * errors[key]) ** 2 + _SMALLEST
+        squared = (1.0 - beta2) * (tolerances.agreement(f"steps.{key}", dtype) * errors[key]) ** 2 + _SMALLEST
         number, update = trained.driven.counters[key], np.zeros_like(m)
         spread = np.zeros_like(m)
         if number > 0 and not np.array_equal(m, before.m[key]):
-            update = _update(m, v, number, rates[key])
-            ends = [_update(m + i * allowed[0], np.maximum(v + j * (allowed[1] + squared), 0.0), number, rates[key])
+            of = number, rates[key], beta2
+            update = _update(m, v, *of)
+            ends = [_update(m + i * allowed[0], np.maximum(v + j * (allowed[1] + squared), 0.0), *of)
                     for i in (-1.0, 1.0) for j in (-1.0, 1.0)]  # fmt: skip
             spread = np.max([np.abs(end - update) for end in ends], axis=0)
         size = np.abs(moved.params[key]) + np.abs(update) + spread / limit
         squares = size_v + squared / tolerances.agreement("steps.squares", dtype)
-        more |= {f"size params {key}": size, f"size m {key}": size_m, f"size v {key}": squares}
+        more |= {f"size params {key}": size, f"size m {key}": size_m, f"size v {key}": squares, f"spread {key}": spread}
     none = {name: np.zeros_like(array) for name, array in more.items()}
     return Rows({**moved.params, **more}, {**moved.m, **none}, {**moved.v, **none})
 
 
-def _update(m: np.ndarray, v: np.ndarray, number: float, rate: float) -> np.ndarray:
-    denominator = np.sqrt(v) / np.sqrt(1.0 - BETAS[1] ** number) + EPS
+def _rates(trained: Trained, step: int) -> Mapping[str, float]:
+    recipe, scale = trained.recipe, trained.short.scene_scale
+    return learning_rates(step, scale, recipe.max_steps, recipe.lr, recipe.updates)
+
+
+def _update(m: np.ndarray, v: np.ndarray, number: float, rate: float, beta2: float) -> np.ndarray:
+    denominator = np.sqrt(v) / np.sqrt(1.0 - beta2**number) + EPS
     return -rate / (1.0 - BETAS[0] ** number) * m / denominator

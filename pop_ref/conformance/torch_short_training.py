@@ -6,7 +6,7 @@ Settings, capture and engine are those that a run has. Nothing is written, but w
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
 from typing import Any
@@ -67,10 +67,37 @@ class Trainee:
     def _module(self, name: str) -> Any:
         return importlib.import_module(f"{self._package}.{name}")
 
-    def taken_steps(self, short: ShortTraining) -> list[dict[str, Any]]:
-        """See `pop_ref.short_training.taken_steps`; the order of the views is the run's own."""
-        run = self._run(short)
-        return [self._taken(run, step) for step in range(short.steps)]
+    def taken_steps(
+        self, short: ShortTraining, before: Sequence[Mapping[str, Any]] | None = None
+    ) -> list[dict[str, Any]]:
+        """See `pop_ref.short_training.taken_steps`; the order of the views is the run's own, unless `before` is told.
+
+        Raises:
+            ValueError: the Gaussians that a step begins with are of another number than the step before has left.
+        """
+        run = self._run(short) if before is None else self._run(short, seed=self._seed_of(short))
+        found: list[dict[str, Any]] = []
+        for step in range(short.steps):
+            if before is not None:
+                self._begin_with(run, before[step])
+            found.append(self._taken(run, step))
+        return found
+
+    def _seed_of(self, short: ShortTraining) -> int:
+        """Return a seed of a run that sees the views in the order of the short training."""
+        order = list(short.order)
+        return next(k for k in range(100_000) if self.view_order(short.views, k, len(order)) == order)
+
+    def _begin_with(self, run: Any, record: Mapping[str, Any]) -> None:
+        with self._torch.no_grad():
+            for key in KEYS:
+                state = run.optimizers[key].state[run.params[key]]
+                held = {"params": run.params[key], "m": state["exp_avg"], "v": state["exp_avg_sq"]}
+                for kind, tensor in held.items():
+                    given = self._torch.as_tensor(record[kind][key])
+                    if tensor.shape != given.shape:
+                        raise ValueError(f"{len(tensor)} Gaussians are left, and {len(given)} begin the next step")
+                    tensor.copy_(given)
 
     def batched_steps(self, short: ShortTraining) -> list[dict[str, Any]]:
         """Take steps of several views each: "view" lists them."""

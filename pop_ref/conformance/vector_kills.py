@@ -33,6 +33,7 @@ from pop_ref.conformance.mutants.trial import alive
 from pop_ref.conformance.scenes import Scene, scene_from
 from pop_ref.conformance.vector_check import read_index, verdicts_of
 from pop_ref.conformance.vector_stages import made, outputs
+from pop_ref.conformance.vector_steps import HeldTraining, answered_steps
 from pop_ref.conformance.vector_training import Replay, step_sums
 from pop_ref.conformance.vectors import FORMS, KINDS, export
 from pop_ref.constants import PAPER, Profile
@@ -149,6 +150,7 @@ def answered(backend: Any, kind: str, arrays: Arrays, options: dict[str, Any]) -
         "adam": _adam,
         "density": _density,
         "training": _training,
+        "steps": _steps,
     }
     # every stage function has a kind of its own
     return answers.get(kind, _stage)(backend, arrays, options)
@@ -341,9 +343,7 @@ def _density(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
         found |= {
             name: np.asarray(mask).astype(np.int64) for name, mask in zip(("cloned", "split"), masks, strict=True)
         }
-    # another number of rows is an answer, too: it is as wrong as can be
-    return {name: value if value.shape == arrays[name].shape else np.full(arrays[name].shape, np.nan)
-            for name, value in found.items()}  # fmt: skip
+    return _in_form(found, arrays)
 
 
 def _training(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
@@ -352,6 +352,19 @@ def _training(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
     script = Replay(arrays, options)
     found = step_sums(backend.stage("scripted_steps")(script, script.rows()))
     return {name: value for name, value in found.items() if not name.startswith("error_bound_")}
+
+
+def _steps(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
+    if not backend.has("taken_steps"):
+        return {}
+    short = HeldTraining(arrays, options)
+    return _in_form(answered_steps(backend.stage("taken_steps")(short, short.before)), arrays)
+
+
+def _in_form(found: Arrays, arrays: Arrays) -> Arrays:
+    """Return answers, and of another number of rows numbers that are as wrong as can be: that is an answer, too."""
+    return {name: value if value.shape == arrays[name].shape else np.full(arrays[name].shape, np.nan)
+            for name, value in found.items()}  # fmt: skip
 
 
 def _stage(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:

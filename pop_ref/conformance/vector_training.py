@@ -16,7 +16,7 @@ import numpy as np
 from pop_ref import losses, methods, ssim
 from pop_ref.activations import opacities_from_logits, scales_from_log_scales
 from pop_ref.conformance.scenes import in_precision, pattern
-from pop_ref.conformance.strategy_script import METHODS, READINGS, Script, script_of, trainings_of
+from pop_ref.conformance.strategy_script import METHODS, READINGS, Draws, Script, script_of, trainings_of
 from pop_ref.conformance.vector_check import entry, equal, output
 from pop_ref.contributions import Contributions
 from pop_ref.density import Statistics, densify_and_prune, grow_masks, rows_from_params
@@ -309,15 +309,14 @@ class Recorder:
     Attributes:
         views, gradients: by step.
         passes: by view, number of Gaussians, bands and divisor.
-        drawn: random numbers, flat.
+        numbers: random ones.
     """
 
     def __init__(self, script: Script) -> None:
-        self._script, self._source = script, script.draws()
+        self._script, self.numbers = script, KeptDraws(script.draws())
         self.seen: dict[int, ScriptedView] = {}
         self.pulled: dict[int, dict[str, np.ndarray]] = {}
         self.passes: dict[tuple[int, ...], Pass] = {}
-        self.drawn: list[np.ndarray] = []
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._script, name)
@@ -341,9 +340,25 @@ class Recorder:
         """Show a pass."""
         return self.passes.setdefault((index, n, sh_degree, divisor), self._script.over(index, n, sh_degree, divisor))
 
-    def draws(self) -> Recorder:
+    def draws(self) -> KeptDraws:
         """Show random numbers."""
-        return self
+        return self.numbers
+
+
+class KeptDraws:
+    """Random numbers that are kept as they are drawn, all exact in single precision.
+
+    Attributes:
+        drawn: every call's numbers, flat.
+    """
+
+    def __init__(self, source: Draws) -> None:
+        self._source, self.drawn = source, list[np.ndarray]()
+
+    @property
+    def flat(self) -> np.ndarray:
+        """Return all numbers in the order of their use."""
+        return np.concatenate([np.zeros(0), *self.drawn])
 
     def normals(self, n: int) -> np.ndarray:
         """Draw for the children of n split parents. [2, n, 3]"""
@@ -358,6 +373,31 @@ class Recorder:
         return values
 
 
+class HeldDraws:
+    """The random numbers of a vector, one after the other.
+
+    Args:
+        values: all of them. Drawing more raises LookupError.
+    """
+
+    def __init__(self, values: np.ndarray) -> None:
+        self._values, self._used = values, 0
+
+    def normals(self, n: int) -> np.ndarray:
+        """Draw for the children of n split parents. [2, n, 3]"""
+        return self._next(6 * n).reshape(2, n, 3)
+
+    def uniforms(self, n: int) -> np.ndarray:
+        """Draw from [0, 1). [n]"""
+        return self._next(n)
+
+    def _next(self, count: int) -> np.ndarray:
+        self._used += count
+        if self._used > len(self._values):
+            raise LookupError(f"{self._used} random numbers are drawn, {len(self._values)} are there")
+        return self._values[self._used - count : self._used]
+
+
 class Replay:
     """A script that shows what a vector holds, and nothing else.
 
@@ -367,7 +407,7 @@ class Replay:
     """
 
     def __init__(self, arrays: dict[str, np.ndarray], options: dict[str, Any]) -> None:
-        self._arrays, self._used = arrays, 0
+        self._arrays = arrays
         self.settings = {k: tuple(v) if isinstance(v, list) else v for k, v in options["settings"].items()}
         self.lr, self.steps = LearningRates(**options["lr"]), tuple(int(step) for step in arrays["steps"])
         for name in _OPTIONS:
@@ -411,27 +451,13 @@ class Replay:
         mask = self._arrays["masks"][index]
         return None if np.all(mask) else mask
 
-    def draws(self) -> Replay:
+    def draws(self) -> HeldDraws:
         """Return the random numbers."""
-        return self
-
-    def normals(self, n: int) -> np.ndarray:
-        """Draw for the children of n split parents. [2, n, 3]"""
-        return self._next(6 * n).reshape(2, n, 3)
-
-    def uniforms(self, n: int) -> np.ndarray:
-        """Draw from [0, 1). [n]"""
-        return self._next(n)
+        return HeldDraws(self._arrays["draws"])
 
     def sh_degree(self, step: int) -> int:
         """Return the bands that are drawn at a step."""
         return int(self._arrays["sh_degrees"][self.steps.index(step)])
-
-    def _next(self, count: int) -> np.ndarray:
-        self._used += count
-        if self._used > len(self._arrays["draws"]):
-            raise LookupError(f"{self._used} random numbers are drawn, {len(self._arrays['draws'])} are there")
-        return self._arrays["draws"][self._used - count : self._used]
 
     def _rows(self, step: int, n: int) -> slice:
         at = self.steps.index(step)
@@ -460,7 +486,7 @@ def _training(script: Script) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     arrays |= {name: np.concatenate([np.swapaxes(getattr(v, name), 0, 1) for v in views]) for name in _VIEW}
     arrays |= {f"grad_{key}": np.concatenate([shown.pulled[s][key] for s in script.steps]) for key in KEYS}
     arrays |= _passes(script, shown.passes)
-    arrays["draws"] = np.concatenate([np.zeros(0), *shown.drawn])
+    arrays["draws"] = shown.numbers.flat
     settings = {**methods.method_settings(str(script.method)), **script.settings}
     options = {name: getattr(script, name) for name in _OPTIONS}
     return arrays | outputs, {**options, "settings": settings, "lr": asdict(script.lr)}

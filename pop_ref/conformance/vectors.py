@@ -3,8 +3,8 @@
 `export` writes one npz a vector and an `index.json` that explains every array and how it is compared: single images
 with every stage on the way, few scenes, one for each thing that goes wrong in a port; calls of several cameras,
 with batches, depth modes and plain colours; the corpus at scale, whose images and gradients are kept as weighted sums;
-losses and training steps (`vector_training`); single stages (`vector_stages`). `vector_check` judges a port's results
-by that index alone. Needs numpy only.
+losses and scripted trainings (`vector_training`); whole steps on photographs (`vector_steps`); single stages
+(`vector_stages`). `vector_check` judges a port's results by that index alone. Needs numpy only.
 
 What a call is packed as, and in what form covariances come, is told by options: images are the same.
 """
@@ -48,6 +48,7 @@ from pop_ref.conformance.vector_check import (
 )
 from pop_ref.conformance.vector_scenes import calls, vector_scenes
 from pop_ref.conformance.vector_stages import stage_kinds, stage_vectors
+from pop_ref.conformance.vector_steps import steps_kind, steps_vectors
 from pop_ref.conformance.vector_training import training_kind, training_vectors
 from pop_ref.margins import margins
 from pop_ref.splatting import project
@@ -264,6 +265,7 @@ _TRAINING = {
     "adam": training.adam_vectors,
     "density": training.density_vectors,
     "training": training_vectors,
+    "steps": steps_vectors,
 }
 
 
@@ -278,6 +280,7 @@ def kinds() -> dict[str, dict[str, Any]]:
         "adam": training.adam_kind(),
         "density": training.density_kind(),
         "training": training_kind(),
+        "steps": steps_kind(),
         **stage_kinds(),
     }
 

@@ -9,7 +9,6 @@ import json
 import re
 import runpy
 import shlex
-import subprocess
 import sys
 import tomllib
 from pathlib import Path
@@ -94,13 +93,6 @@ def test_marks_of_no_table_are_refused(text: str, tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(tables, "ROOT", tmp_path)
     with pytest.raises(ValueError, match="needs"):
         tables.with_tables(page)
-
-
-def test_the_results_script_agrees_with_the_readme() -> None:
-    script = ROOT / "benchmarks" / "results_table.py"
-    pages = [ROOT / "README.md", DOCS / "results.md"]
-    done = subprocess.run([sys.executable, script, "--check", *pages], capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_every_stage_of_the_oracle_has_its_row() -> None:

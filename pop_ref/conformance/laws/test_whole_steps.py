@@ -18,43 +18,35 @@ from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.law import law
 from pop_ref.conformance.scenes import in_precision
 from pop_ref.conformance.short_training import ShortTraining, assert_steps
-from pop_ref.methods import KEYS, RECIPE_OF
+from pop_ref.conformance.vector_steps import (
+    ASIDE,
+    BLURRED,
+    CHANGED,
+    CHANGES,
+    ENTROPY,
+    FEW,
+    FIRST,
+    HIDDEN,
+    LARGE,
+    MASKED,
+    OF_METHODS,
+    ORDER,
+    PRIOR,
+    PRUNED,
+    REWOUND,
+    SHORT,
+    STILL,
+    UNSEEN,
+    WAITING,
+    WINDOW,
+)
+from pop_ref.methods import KEYS
 from pop_ref.refinement import without_common_motion
 from pop_ref.settings import LearningRates
 from pop_ref.short_training import Trained
 
 # of band 0
 SH_C0 = 0.28209479177387814
-# no step of these changes the Gaussians
-STILL = {"refine_start_iter": 100, "reset_every": 0}
-SHORT = {"max_steps": 8, "sh_interval": 2}
-# so slow that what rounding does not decide at the first step it decides at no later one
-SLOW = LearningRates(means=2e-5, scales=5e-4, quats=1e-4, opacities=5e-3, sh0=2.5e-4, sh_rest=1.25e-5)
-FIRST = {"pop_stop_iter": 3, "lambda_pop": 0.5, "pop_views": "window"}
-SECOND = {"pop_start_iter": 1, "pop_stop_iter": 3, "lambda_pop": 0.0, "lambda_entropy": 0.5}
-HALVED = {"lambda_ssim": 0.25, "d_ssim_halved": True, "padding": "same", "l2_stop_iter": 3}
-# without red, as a green screen: what reads one channel alone takes it for black
-BEHIND = (0.0, 0.5, 0.0)
-ORDER = (0, 1, 0, 1, 0)
-
-PRIOR = ShortTraining("pop", {**STILL, **FIRST}, {**SHORT, **HALVED, "lr": SLOW}, ORDER, seed=125, scene_scale=4.0)
-ENTROPY = ShortTraining(
-    "pop",
-    {**STILL, **SECOND},
-    {**SHORT, "pixel_scale": 0.25, "l2_stop_iter": 3, "lr": SLOW},
-    ORDER,
-    seed=16,
-    antialiased=True,
-)
-MASKED = ShortTraining(
-    "pop",
-    {**STILL, "lambda_pop": 0.5, "pop_over": "visible"},
-    {**SHORT, "pixelwise": "l1", "lambda_ssim": 0.25},
-    ORDER[:3],
-    seed=195,
-    masked=True,
-    background=BEHIND,
-)
 
 
 def _assert_steps(backend, short):
@@ -63,68 +55,25 @@ def _assert_steps(backend, short):
 
 @law("training", "taken_steps")
 def test_every_step_is_the_oracles_under_every_setting(backend):
-    # another Gaussian is important in either view
-    window = replace(PRIOR, order=(0, 1), seed=1216, count=9)
-    # visible Gaussians dominate no pixel
-    hidden = replace(MASKED, order=(0,), seed=40)
-    # several tiles, and more rows of pixels than the compiled engine takes in one part, which is 16
-    large = [replace(short, size=(21, 37), order=(0,), count=9, seed=1078) for short in (PRIOR, MASKED)]
-    # a splat lies over two rows of tiles and does not reach their first column
-    aside = replace(MASKED, size=(40, 37), order=(0,), count=9, seed=2117)
-    # no window has a centre that counts
-    unseen = replace(MASKED, order=(0,), seed=3071)
-    for short in (PRIOR, window, ENTROPY, MASKED, hidden, *large, aside, unseen):
+    for short in (PRIOR, WINDOW, ENTROPY, MASKED, HIDDEN, *LARGE, ASIDE, UNSEEN):
         _assert_steps(backend, short)
-
-
-# every parameter waits, rests, or goes back at a step of its own
-WAITING = {"sh_start_iter": 1, "sh_rest_every": 3, "opacities_stop_iter": 3}
-REWOUND = {"means_rewind_iter": 3, "means_rewind_to": 1, "edits_replace_update": True}
-FALLING = replace(SLOW, others_decay=0.125)
 
 
 @law("training", "taken_steps")
 def test_every_step_is_the_oracles_under_every_rule_of_updates(backend):
-    grows = {"refine_start_iter": 1, "refine_every": 2, "grow_grad2d": 1e-6, "grow_scale3d": 100.0, "prune_opa": 0.0}
-    rates = {"max_steps": 8, "sh_interval": 1, "lr": SLOW}
-    waiting = ShortTraining("pop", {**STILL, **WAITING}, rates, (*ORDER, 1), seed=126)
-    rewound = ShortTraining("pop", {**grows, **REWOUND}, {**SHORT, "lr": FALLING}, ORDER[:4], seed=40)
-    _assert_steps(backend, waiting)
-    assert "cloned" in _assert_steps(backend, rewound)
-
-
-LATER = ("3dgs", "taming", "speedy-splat")
+    _assert_steps(backend, WAITING)
+    assert "cloned" in _assert_steps(backend, REWOUND)
 
 
 @law("training", "taken_steps")
 def test_every_step_of_every_method_is_the_oracles(backend):
-    # principal points lie off the centre, where Inria's code takes them to be
-    for method in RECIPE_OF:
-        _assert_steps(backend, ShortTraining(method, order=(0, 1), seed=14 if method in LATER else 11))
-
-
-# large and faint are told apart by far, so that rounding decides nothing
-CHANGES = {
-    "refine_start_iter": 0,
-    "refine_stop_iter": 4,
-    "refine_every": 2,
-    "grow_grad2d": 1e-6,
-    "grow_scale3d": 0.45,
-    "prune_opa": 0.3,
-    "prune_scale3d": 2.0,
-    "prune_too_big_after": 0,
-    "reset_every": 2,
-    "reset_opa": 0.2,
-}
+    for short in OF_METHODS:
+        _assert_steps(backend, short)
 
 
 @law("training", "taken_steps")
 def test_every_step_is_the_oracles_while_the_gaussians_change(backend):
-    short = ShortTraining("gsplat", CHANGES, SHORT, ORDER[:4], seed=173, scene_scale=2.0)
-    happened = _assert_steps(backend, short)
-    blur = {**CHANGES, "reset_every": 0, "theta_blur": 0.05, "blur_start_iter": 0, "blur_stop_iter": 3}
-    blur |= {"prune_opa": 0.05, "final_prune_iter": 2, "final_prune_opa": 0.6}
-    happened |= _assert_steps(backend, replace(short, method="pop", settings=blur, seed=34, order=ORDER[:3]))
+    happened = _assert_steps(backend, CHANGED) | _assert_steps(backend, BLURRED)
     assert happened == {"cloned", "split", "pruned", "reset"}, f"{happened} only"
 
 
@@ -149,12 +98,8 @@ def test_a_strategy_of_somebody_else_draws_other_numbers_at_every_step_and_the_s
 
 @law("training", "taken_steps")
 def test_every_step_is_the_oracles_with_terms_for_few_photographs(backend):
-    weights = {"depth_lambda": 0.5, "opacity_reg": 0.25, "scale_reg": 0.125}
     for masked, scale in ((False, 4.0), (True, 0.5)):
-        short = ShortTraining(
-            "pop", STILL, {**SHORT, **weights}, ORDER[:2], 34, sparse=18, masked=masked, scene_scale=scale
-        )
-        _assert_steps(backend, short)
+        _assert_steps(backend, replace(FEW, masked=masked, scene_scale=scale))
 
 
 @law("training", "corrected_steps")
@@ -183,21 +128,11 @@ class _From(ShortTraining):
         return [replace(c, viewmat=v.astype(np.float64)) for c, v in zip(super().cameras, self.corrected, strict=True)]
 
 
-# scores of who goes and who stays are apart, and others would go by those of other photographs, bands or renders
 @law("training", "taken_steps")
 def test_what_a_method_prunes_by_is_of_all_photographs(backend):
-    speedy = {**STILL, "hard_prune_iters": (0, 1), "hard_prune_share": 0.4, "soft_prune_iters": ()}
-    mini = {**STILL, "reinit_iters": (), "sample_iter": 90, "prune_iter": 1, "prune_mass": 0.25, "sh_start_iter": 0}
-    pup = {**STILL, "rounds_start_iter": 1, "round_steps": 3, "prune_shares": (0.5,), "score_divisor": 2}
-    for method, seeds, settings in (("speedy-splat", (8, 34), speedy), ("mini-splatting", (6,), mini),
-                                    ("pup", (3, 24), pup)):  # fmt: skip
-        for seed in seeds:
-            short = ShortTraining(method, settings, SHORT, (0, 1), seed, count=9, views=3, held_out=1)
-            if seed == 24:
-                # of one band, which is drawn from the second step on
-                short = replace(short, degree=1, options={**SHORT, "sh_interval": 1})
-            found = backend.stage("taken_steps")(short)
-            assert "pruned" in assert_steps(backend, short, found, least=0.0), method
+    for short in PRUNED:
+        found = backend.stage("taken_steps")(short)
+        assert "pruned" in assert_steps(backend, short, found, least=0.0), short.method
 
 
 @law("training", "taken_steps")
