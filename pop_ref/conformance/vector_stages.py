@@ -12,6 +12,7 @@ import inspect
 import json
 import sys
 from collections.abc import Callable, Collection, Iterable
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -254,6 +255,8 @@ def record(names: Collection[str]) -> list[Any]:
     Args:
         names: of the mutants.
     """
+    import pytest
+
     from pop_ref.conformance.backends import shipped
     from pop_ref.conformance.mutants import MUTANTS, PROGRAM
     from pop_ref.conformance.mutants.copies import living
@@ -267,11 +270,13 @@ def record(names: Collection[str]) -> list[Any]:
             if any(_differs(backend, *call) for call in kept):
                 continue
             asked = _Logging()
-            obeys(law_named(mutant.law), asked, _EXAMPLES)
+            # a law about what the oracle does not offer asks it for nothing
+            with suppress(pytest.skip.Exception):
+                obeys(law_named(mutant.law), asked, _EXAMPLES)
             for name, args in asked.calls.values():
                 call = (name, [moved(arg, in_precision) for arg in args])
                 # laws read parts of some records only, and a sound program may fill the rest otherwise
-                if _differs(backend, *call) and not (sound.has(name) and _differs(sound, *call)):
+                if _differs(backend, *call) and not _differs(sound, *call):
                     kept.append(call)
                     found.append([name, [plain(each) for each in call[1]]])
                     print(f"{mutant.name}: {name}", flush=True)
@@ -280,6 +285,8 @@ def record(names: Collection[str]) -> list[Any]:
 
 
 def _differs(backend: Any, name: str, args: list[Any]) -> bool:
+    if not backend.has(name):
+        return False
     try:
         wanted = expected(name, args)
     except Exception:

@@ -185,6 +185,24 @@ def test_calls_are_kept_for_mutants_that_there_are(monkeypatch, tmp_path: Path, 
     assert list(tmp_path.iterdir()) == [kept]
 
 
+@pytest.mark.slow  # a copy of the program is loaded and tried
+def test_a_call_is_kept_for_a_mutant_of_the_program_which_lacks_functions_of_other_calls(monkeypatch, tmp_path: Path):
+    kept = tmp_path / "calls.json"
+    calls = json.loads(vector_stages.FILE.read_text(encoding="utf-8"))
+    # which are functions of the oracle alone
+    others = [call for call in calls if call[0] in ("sigma_at_pixel", "stops")]
+    kept.write_text(json.dumps(others), encoding="utf-8")
+    monkeypatch.setattr(vector_stages, "FILE", kept)
+    vector_stages.recorded.cache_clear()
+    try:
+        assert vector_stages.main(["gradient_of_scales_for_logarithms"]) == 0
+    finally:
+        vector_stages.recorded.cache_clear()
+    found = json.loads(kept.read_text(encoding="utf-8"))
+    assert len(others) == 2
+    assert [call[0] for call in found] == [*(call[0] for call in others), "scales_from_log_scales_vjp"]
+
+
 def test_vectors_of_an_older_version_are_refused(index: dict[str, Any], tmp_path: Path) -> None:
     (tmp_path / "index.json").write_text(json.dumps(index | {"version": 3}))
     with pytest.raises(ValueError, match="version is 3, this program reads 4; write the vectors again"):
