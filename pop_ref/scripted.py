@@ -139,7 +139,8 @@ class ShortTraining(Protocol):
         method: one of RECIPE_OF.
         settings: of its strategy, by name; others are those of its recipe.
         options: of the rest of its recipe, by the names of `Recipe`; others are its own.
-        order: the view of every step.
+        order: the views in the order in which steps see them.
+        batch: views of a step, whose losses and gradients are averaged; density control sees one after the other.
         scene_scale: world units.
         background: colour behind everything. [3]
         antialiased: whether opacities make up for the low-pass.
@@ -149,6 +150,7 @@ class ShortTraining(Protocol):
     settings: Mapping[str, Any]
     options: Mapping[str, Any]
     order: tuple[int, ...]
+    batch: int
     scene_scale: float
     background: tuple[float, float, float]
     antialiased: bool

@@ -54,18 +54,20 @@ class Trained:
         state = training.Training(driven.rows, driven.window, self.step, driven.waiting)
         return training.look(state, *_seen(self.short, view, self.recipe))
 
-    def move(self, view: int, found: training.Look) -> None:
-        """Let Adam move what is due, and let the view join the window."""
+    def move(self, views: Sequence[int], looks: Sequence[training.Look]) -> None:
+        """Let Adam move what is due by the mean gradient, and let one view after the other join the window."""
         driven, short, recipe = self.driven, self.short, self.recipe
         state = training.Training(driven.rows, driven.window, self.step, driven.waiting)
         numbers = methods.optimizer.update_numbers(methods.KEYS, self.step, recipe)
         driven.counters |= {name: float(number) for name, number in numbers.items()}
-        driven.rows, driven.waiting = training.update(driven.rows, found.grads, state, short.scene_scale, recipe)
-        camera, mask = short.cameras[view], short.mask(view)
-        seen = (found.v_means2d, found.visible, found.dominant_counts, camera.width, camera.height)
-        kept = None if mask is None else int(np.sum(mask))
-        if self.step < recipe.density.refine_stop_iter:
-            driven.window = density.accumulate(driven.window, *seen, recipe.density, kept)
+        grads = {name: np.mean([found.grads[name] for found in looks], axis=0) for name in methods.KEYS}
+        driven.rows, driven.waiting = training.update(driven.rows, grads, state, short.scene_scale, recipe)
+        for view, found in zip(views, looks, strict=True):
+            camera, mask = short.cameras[view], short.mask(view)
+            seen = (found.v_means2d, found.visible, found.dominant_counts, camera.width, camera.height)
+            kept = None if mask is None else int(np.sum(mask))
+            if self.step < recipe.density.refine_stop_iter:
+                driven.window = density.accumulate(driven.window, *seen, recipe.density, kept)
 
     def change(self) -> dict[str, int]:
         """Do to the Gaussians what is due after the step, and return what was done by its kind."""
@@ -85,8 +87,8 @@ def taken_steps(short: ShortTraining, before: Sequence[Mapping[str, Any]] | None
         before: of every step "params", "m" and "v" that it begins with; None: those that the last one left.
 
     Returns:
-        Of every step: its "view", its "loss", which is that of the parameters before it, and "params", "m" and "v"
-        after it.
+        Of every step: its "view", a list where there are several, its "loss", which is that of the parameters before
+        it, and "params", "m" and "v" after it.
 
     Example:
         >>> from pop_ref.conformance.short_training import ShortTraining
@@ -94,8 +96,8 @@ def taken_steps(short: ShortTraining, before: Sequence[Mapping[str, Any]] | None
         >>> first["view"], second["view"], first["params"]["means"].shape
         (0, 1, (6, 3))
     """
-    if short.method in ("pup", "mini-splatting", "speedy-splat"):
-        return _taken_with_passes(short, before)
+    if short.batch > 1 or short.method in ("pup", "mini-splatting", "speedy-splat"):
+        return _taken_by_parts(short, before)
     recipe = Trained(short).recipe
     state, draws = training.start(short.params), short.draws()
     found: list[dict[str, Any]] = []
@@ -107,15 +109,18 @@ def taken_steps(short: ShortTraining, before: Sequence[Mapping[str, Any]] | None
     return found
 
 
-def _taken_with_passes(short: ShortTraining, before: Sequence[Mapping[str, Any]] | None) -> list[dict[str, Any]]:
+def _taken_by_parts(short: ShortTraining, before: Sequence[Mapping[str, Any]] | None) -> list[dict[str, Any]]:
+    """Take steps of several views, or of a method that passes over all photographs between two steps."""
     trained = Trained(short)
     found: list[dict[str, Any]] = []
-    for step, view in enumerate(short.order):
+    for step in range(len(short.order) // short.batch):
         trained.driven.rows = trained.driven.rows if before is None else _rows(before[step])
-        seen = trained.look(view)
-        trained.move(view, seen)
+        views = short.order[step * short.batch : (step + 1) * short.batch]
+        looks = [trained.look(view) for view in views]
+        trained.move(views, looks)
         trained.change()
-        found.append(_record(view, seen.loss, trained.driven.rows))
+        loss = sum(seen.loss for seen in looks) / len(looks)
+        found.append(_record(views[0] if len(views) == 1 else list(views), loss, trained.driven.rows))
     return found
 
 
@@ -123,7 +128,7 @@ def _rows(record: Mapping[str, Any]) -> Rows:
     return Rows(record["params"], record["m"], record["v"])
 
 
-def _record(view: int, loss: float, rows: Rows) -> dict[str, Any]:
+def _record(view: int | list[int], loss: float, rows: Rows) -> dict[str, Any]:
     return {"view": view, "loss": loss, "params": dict(rows.params), "m": dict(rows.m), "v": dict(rows.v)}
 
 

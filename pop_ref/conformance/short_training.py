@@ -370,7 +370,7 @@ def assert_steps(
     """
     judge, happened, judged = OracleSteps(short, backend.dtype), set[str](), 0
     for step, record in enumerate(found):
-        wanted = judge.step(int(record["view"]))
+        wanted = judge.step(*np.atleast_1d(record["view"]).tolist())
         happened |= wanted.happened
         if wanted.clear:
             judged += 1
@@ -433,20 +433,28 @@ class OracleSteps:
         """Let the next step begin with these."""
         self._trained.driven.rows = rows
 
-    def step(self, view: int) -> WantedStep:
-        """Take a step with a view."""
+    def step(self, *views: int) -> WantedStep:
+        """Take a step with a view, or with several."""
         trained, before, number = self._trained, self.rows, self._trained.step
-        seen = trained.look(view)
-        bounds = _Bounds(trained, view, seen, self._dtype)
-        fits = len(self._waiting) == len(before)
-        waiting = self._waiting if fits else np.zeros_like(before.params["shN"])
-        errors, self._waiting = bounds.gradients(trained, waiting)
-        clear = bounds.clear
-        trained.move(view, seen)
+        looks = [trained.look(view) for view in views]
+        bounds = [_Bounds(trained, view, seen, self._dtype) for view, seen in zip(views, looks, strict=True)]
+        errors = {key: np.mean([each.gradients[key] for each in bounds], axis=0) for key in KEYS}
+        self._wait(errors, number)
+        clear = all(each.clear for each in bounds)
+        trained.move(views, looks)
         self.go_on(_with_errors(trained, before, errors, self._dtype))
         happened = set(trained.change())
-        size = abs(seen.loss) + bounds.loss_size
-        return WantedStep(seen.loss, size, self.rows, _rates(trained, number), clear, happened)
+        loss = sum(seen.loss for seen in looks) / len(views)
+        size = sum(abs(seen.loss) + each.loss_size for seen, each in zip(looks, bounds, strict=True)) / len(views)
+        return WantedStep(loss, size, self.rows, _rates(trained, number), clear, happened)
+
+    def _wait(self, errors: dict[str, np.ndarray], number: int) -> None:
+        """Add the error bounds of gradients that wait, where the bands beyond the first move at some steps only."""
+        every = self.recipe.updates.sh_rest_every
+        if every > 1:
+            if len(self._waiting) == len(errors["shN"]):
+                errors["shN"] = errors["shN"] + self._waiting
+            self._waiting = np.zeros(0) if (number + 1) % every == 0 else errors["shN"]
 
 
 def _at(where: str) -> Any:
@@ -508,13 +516,9 @@ class _Bounds:
         v_image = np.abs(self.seen.v_image[..., :3])
         return float(np.sum(v_image * (self.pixels.image + self.pixels.absolute)))
 
-    def gradients(self, trained: Trained, waiting: np.ndarray) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Return the error bound of every raw parameter's gradient, and of those that wait, in units of eps.
-
-        Args:
-            trained: before the step.
-            waiting: the error bound of what waited until now. [N, K - 1, 3]
-        """
+    @functools.cached_property
+    def gradients(self) -> dict[str, np.ndarray]:
+        """Return the error bound of every raw parameter's gradient, in units of eps."""
         units, o = self._of_render(), self.gaussians.opacities
         grads = self.seen.grads
         # 1 - o loses digits where o is near 1
@@ -527,12 +531,7 @@ class _Bounds:
             "sh0": units["sh"][:, :1],
             "shN": units["sh"][:, 1:],
         }
-        errors = {key: raw[key] + np.abs(grads[key]) for key in KEYS}
-        every = trained.recipe.updates.sh_rest_every
-        if every == 1:
-            return errors, np.zeros_like(waiting)
-        errors["shN"] = errors["shN"] + waiting
-        return errors, np.zeros_like(waiting) if (trained.step + 1) % every == 0 else errors["shN"]
+        return {key: raw[key] + np.abs(grads[key]) for key in KEYS}
 
     def _of_render(self) -> dict[str, np.ndarray]:
         v = np.abs(self.seen.v_image)

@@ -232,7 +232,6 @@ TABLE: Final[dict[str, Tolerance]] = {
     "sensitivity.one": Tolerance(units=1, worst=0),
     "sensitivity.rows": Tolerance(units=1, worst=0),
     "sensitivity.square": Tolerance(units=1, worst=0),
-    "steps.batch": Tolerance(units=80, worst=8.3),
     "steps.coarse": Tolerance(units=40, worst=4),
     "steps.loss": Tolerance(units=0.6, worst=0.06),
     "steps.means": Tolerance(units=0.013, worst=0.0013),

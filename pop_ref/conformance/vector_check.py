@@ -316,6 +316,7 @@ AXES: Final = {
     "S": "steps of a training",
     "A": "Gaussians after each step, one step after the other",
     "L": "sparse points",
+    "O": "views of all steps",
     "n_rest": "harmonics' coefficients beyond degree 0",
     "R": "Gaussians before each step, one step after the other",
     "P": "passes over views",
@@ -335,7 +336,7 @@ OPTIONS: Final = {
     "antialiased": "opacities are multiplied by sqrt(max(0, det(covar2d) / det(covar2d + eps2d I)))",
     "render_mode": "what an image of a call holds; its kind explains it under 'modes'",
     "radius_clip": "px; Gaussians whose extents 'radii' are both at most this are left out of a call; 0: nobody",
-    "batch": "dimensions of a call's batch, whose entries lie along E; none without one",
+    "batch": "of a call: dimensions of its batch, whose entries lie along E, none without one; of steps: views of each",
     "packed": "a renderer that has it keeps rows of visible Gaussians only; arrays stay those of all",
     "covars": "a renderer that takes covariances is given rotation(quat) diag(scales)^2 rotation(quat)^T instead; "
     "v_quats and v_scales are what the symmetric part of its gradient by these gives",

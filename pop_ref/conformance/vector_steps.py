@@ -106,6 +106,12 @@ _BLURRED_INSIDE: Final = replace(
     masked=True,
 )
 _OTHER_RATES: Final = replace(SLOW, means_decay=0.5, others_decay=0.125, beta2=0.75)
+# whoever halved the gradients of two views, or collected one alone, would grow others
+_TWO_GROW: Final = {**CHANGES, "reset_every": 0, "prune_scale3d": 100.0, "prune_opa": 0.01, "grow_grad2d": 0.0126}
+BATCHES: Final = [
+    replace(PRIOR, batch=2, order=(0, 1)),
+    replace(CHANGED, batch=2, order=(0, 1) * 3, seed=202, settings=_TWO_GROW),
+]
 _TERMS: Final = {**SHORT, "depth_lambda": 0.5, "opacity_reg": 0.25, "scale_reg": 0.125}
 FEW: Final = ShortTraining("pop", STILL, _TERMS, ORDER[:2], seed=34, sparse=18, scene_scale=4.0)
 # scores of who goes and who stays are apart, and others would go by those of other photographs, bands or renders
@@ -151,6 +157,9 @@ def _cases() -> dict[str, ShortTraining]:
         "opacities_that_rest": replace(PRIOR, settings={**PRIOR.settings, "opacities_stop_iter": 0}, order=(0, 1)),
         # dominated pixels that a mask leaves out, and the share of all pixels, would be others
         "blurred_inside_masks": _BLURRED_INSIDE,
+        "of_two_views": BATCHES[0],
+        "of_two_views_that_grow": BATCHES[1],
+        "of_two_views_that_blur_inside_masks": replace(_BLURRED_INSIDE, batch=2, order=(1, 0) * 3),
         "waiting": WAITING, "rewound": REWOUND, "changed": CHANGED, "blurred": BLURRED,
         "of_few_photographs": FEW, "of_few_masked_photographs": replace(FEW, masked=True, scene_scale=0.5),
     }  # fmt: skip
@@ -190,13 +199,13 @@ class _Recorded(ShortTraining):
 def _vector(short: ShortTraining) -> Vector:
     recorded = _Recorded(**{f.name: getattr(short, f.name) for f in fields(ShortTraining)})
     taken, wanted, before = OracleSteps(recorded, np.float32), list[WantedStep](), list[Rows]()
-    for view in short.order:
+    for step in range(short.steps):
         rows = taken.rows
         # without the sizes that come with the rows of the last step
         given = Rows(*({key: in_precision(of[key]) for key in KEYS} for of in (rows.params, rows.m, rows.v)))
         taken.go_on(given)
         before.append(given)
-        wanted.append(taken.step(view))
+        wanted.append(taken.step(*short.order[step * short.batch : (step + 1) * short.batch]))
     arrays = _shown(short) | {"draws": recorded.kept[-1].flat, "step_rows": _lengths(before)}
     for kind in _STATES:
         arrays |= {f"{kind}_{key}": np.concatenate([getattr(rows, kind)[key] for rows in before]) for key in KEYS}
@@ -205,7 +214,7 @@ def _vector(short: ShortTraining) -> Vector:
         "method": short.method, "settings": {**method_settings(short.method), **short.settings},
         "recipe": {name: getattr(recipe, name) for name in _RECIPE}, "lr": asdict(recipe.lr),
         "profile": asdict(recipe.profile), "scene_scale": short.scene_scale, "antialiased": short.antialiased,
-        "width": short.size[0], "height": short.size[1],
+        "batch": short.batch, "width": short.size[0], "height": short.size[1],
     }  # fmt: skip
     return arrays | _answers(wanted), options
 
@@ -300,6 +309,7 @@ class HeldTraining(ShortTraining):
             masked=not np.all(arrays["masks"]),
             background=(float(behind[0]), float(behind[1]), float(behind[2])),
             antialiased=options["antialiased"],
+            batch=options["batch"],
             sparse=len(arrays["points"]),
             size=(options["width"], options["height"]),
             degree=round(np.sqrt(arrays["params_shN"].shape[1] + 1)) - 1,
@@ -371,12 +381,13 @@ def steps_kind() -> dict[str, Any]:
     arrays["clear_steps"] = entry("mask", "[S]", "rounding decides nothing of what the step sees", "bool")
     arrays["judged_rows"] = entry("mask", "[A]", "the same of each row", "bool")
     about = (
-        "steps of a training on photographs, one view a step, by 'method' under 'settings' (of its strategy: POP term, "
+        "steps of a training on photographs by 'method' under 'settings' (of its strategy: POP term, "
         "density control, rules of updates), 'recipe' (loss and schedule) and 'lr' (learning rates; means times "
         "'scene_scale' times means_decay^(step / max_steps); those of scales, quats, sh0 and sh_rest times "
         "others_decay^(step / max_steps)). Steps count from 0, and Adam's from 1. Take each from the parameters and "
         "moments that the vector holds for it; the statistics of a window and gradients that wait go on from step to "
-        "step. Photographs are compared as 0 to 1"
+        "step. Of a step of several views losses and gradients are averaged, and the window sees one after the other. "
+        "Photographs are compared as 0 to 1"
     )
     return {"about": about, "arrays": arrays}
 
@@ -386,7 +397,7 @@ def _shape(rows: str, rest: str) -> str:
 
 
 _SHOWN: Final = {
-    "order": ("[S]", "which view each step sees"),
+    "order": ("[O]", "which views the steps see, 'batch' of them each"),
     "viewmats": ("[V, 4, 4]", "world -> camera, of each view"),
     "Ks": ("[V, 3, 3]", "intrinsics, px, of each view"),
     "photos": ("[V, H, W, 3]", "photographs, 0 to 255"),
