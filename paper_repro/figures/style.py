@@ -8,6 +8,7 @@ steps, seeds and scale, and whether that is the protocol of the paper.
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import math
 import re
@@ -309,20 +310,22 @@ def show(axes: Axes, picture: np.ndarray, **more: Any) -> AxesImage:
 
 
 def save(drawn: Drawn, stem: Path) -> list[Path]:
-    """Write stem.svg, stem.png and stem.csv.
+    """Write stem.svg, stem.png and stem.csv; the PNG's text "Source" is the hash of the CSV.
 
     Raises:
         PopError: a file cannot be written.
     """
     paths = [stem.with_name(f"{stem.name}.{suffix}") for suffix in ("svg", "png", "csv")]
-    write_atomically(paths[0], partial(_write_svg, drawn.figure))
-    more: dict[str, Any] = {"metadata": {"Software": None}, "pil_kwargs": {"optimize": True}}
-    write_atomically(paths[1], partial(drawn.figure.savefig, format="png", **more))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(drawn.columns)
     writer.writerows([_cell(value) for value in row] for row in drawn.rows)
-    write_atomically(paths[-1], lambda file: file.write(text.getvalue().encode("utf-8")))
+    numbers = text.getvalue().encode("utf-8")
+    write_atomically(paths[0], partial(_write_svg, drawn.figure))
+    said = {"Software": None, "Source": f"sha256:{hashlib.sha256(numbers).hexdigest()}"}
+    more: dict[str, Any] = {"metadata": said, "pil_kwargs": {"optimize": True}}
+    write_atomically(paths[1], partial(drawn.figure.savefig, format="png", **more))
+    write_atomically(paths[-1], lambda file: file.write(numbers))
     return paths
 
 

@@ -207,10 +207,11 @@ def test_names_in_python_blocks_resolve() -> None:
             assert hasattr(module, alias.name), alias.name
 
 
-def test_the_pictures_are_small_and_made_of_our_own_scene() -> None:
+def test_the_pictures_are_small_and_show_no_photograph_but_of_our_own_scene() -> None:
     # those of the page of commands are that page's test's
     pictures = re.findall(r"!\[[^]]*\]\((?!commands/)([^)]+)\)", TEXT)
-    assert set(pictures) == {"docs/demo.png", "docs/page.png"}
+    # figure_1 shows no photograph
+    assert set(pictures) == {"docs/demo.png", "docs/figure_1.png", "docs/page.png"}
     assert all((ROOT / picture.removeprefix("../")).stat().st_size < 300_000 for picture in pictures)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import itertools
 import re
 import shutil
@@ -31,6 +32,7 @@ from paper_repro.train_row import Options, capture_folder, load_capture_of
 from pop_fast.errors import PopError
 from tests.repro.made import asked, curve, drawn, lines, result, texts
 
+ROOT = Path(__file__).parents[2]
 METHODS = ("3dgs", "gsplat", "pup", "mini_splatting", "taming", "speedy_splat", "pop")
 OF_RESULTS = ("1", "2", "4a", "4b", "6a", "6b", "7")
 STEPS = {"max_steps": 10_000}
@@ -519,6 +521,14 @@ def test_the_grid_in_the_repository_is_of_the_still_life_and_worth_showing():
         found = list(csv.DictReader(file))
     assert [(line["scene"], line["row"]) for line in found] == [("still_life", "pop"), ("still_life", "3dgs")]
     assert all(float(line["psnr"]) > 25.0 for line in found)
+
+
+def test_the_figure_of_the_readme_is_of_the_results_that_are_kept(tmp_path):
+    assert main(["figure", "1", "--scale", "small", "--out", str(tmp_path)]) == 0
+    (kept,) = re.findall(rb"Source\0sha256:([0-9a-f]{64})", (ROOT / "docs" / "figure_1.png").read_bytes())
+    now = hashlib.sha256((tmp_path / "figure_1.csv").read_bytes()).hexdigest()
+    assert kept.decode() == now, "run 'pop-repro figure 1 --scale small --out out' and copy figure_1.png to docs/"
+    assert "](docs/figure_1.png)" in (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def test_without_renders_or_a_scene_figures_say_where_they_looked(tmp_path):
