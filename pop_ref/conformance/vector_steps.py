@@ -387,7 +387,7 @@ def steps_kind() -> dict[str, Any]:
         "others_decay^(step / max_steps)). Steps count from 0, and Adam's from 1. Take each from the parameters and "
         "moments that the vector holds for it; the statistics of a window and gradients that wait go on from step to "
         "step. Of a step of several views losses and gradients are averaged, and the window sees one after the other. "
-        "Photographs are compared as 0 to 1"
+        "Photographs are compared as 0 to 1. pop_ref/settings.py says what every setting does"
     )
     return {"about": about, "arrays": arrays}
 
