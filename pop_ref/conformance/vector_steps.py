@@ -7,9 +7,10 @@ that wait) is its own. The settings below are those of the laws, which try furth
 
 from __future__ import annotations
 
+import copy
 import functools
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, replace
 from typing import Any, Final
 
 import numpy as np
@@ -145,6 +146,77 @@ _LATER: Final = ("3dgs", "taming", "speedy-splat")
 OF_METHODS: Final = [ShortTraining(method, order=(0, 1), seed=14 if method in _LATER else 11) for method in RECIPE_OF]
 
 
+class AtOneDepth(ShortTraining):
+    """A short training of dozens that lie at nearly one depth, in another order than their rows, and one far behind.
+
+    Sorts that deal depths into parts of their range have more in one part than they may expect.
+    """
+
+    @functools.cached_property
+    def params(self) -> Mapping[str, np.ndarray]:
+        rows = super().params
+        depths = 4.0 + 2.0**-12 * (7 * np.arange(self.count) % self.count)
+        depths[-1] = 4000.0
+        faint = in_precision(0.25 * rows["opacities"] - 2.0)
+        return _at_depths({**rows, "opacities": faint}, self.cameras[0], depths)
+
+
+class OverManyTiles(ShortTraining):
+    """A short training on a picture of one row, whose third Gaussian lies over more tiles than a word has bits."""
+
+    @functools.cached_property
+    def _every_camera(self) -> list[Camera]:
+        # pixels are square
+        return [replace(c, K=np.array([c.K[0], [0.0, c.K[0, 0], c.K[1, 2]], c.K[2]])) for c in super()._every_camera]
+
+    @functools.cached_property
+    def params(self) -> Mapping[str, np.ndarray]:
+        rows = {name: array.copy() for name, array in super().params.items()}
+        R, t = self.cameras[0].viewmat[:3, :3], self.cameras[0].viewmat[:3, 3]
+        seen = rows["means"] @ R.T + t
+        # at the height of the picture, as no other row of pixels is there
+        seen[:, 1] = np.linspace(-0.4, 0.4, self.count) * seen[:, 2] / self.cameras[0].K[1, 1]
+        seen[2, 0] = (0.5 * self.size[0] - self.cameras[0].K[0, 2]) * seen[2, 2] / self.cameras[0].K[0, 0]
+        rows["means"] = in_precision((seen - t) @ R)
+        # round and not turned, so that a turn changes nothing: rounding would cost more than gradients by it are
+        rows["scales"][2], rows["quats"][2] = 0.5, (1.0, 0.0, 0.0, 0.0)
+        return rows
+
+
+class BehindTheOpaque(ShortTraining):
+    """A short training in which three opaque Gaussians end every pixel before dozens that lie behind them."""
+
+    @functools.cached_property
+    def params(self) -> Mapping[str, np.ndarray]:
+        rows, depths = dict(super().params), 3.0 + np.arange(self.count)
+        rows = {name: array.copy() for name, array in _at_depths(rows, self.cameras[0], depths).items()}
+        R, t = self.cameras[0].viewmat[:3, :3], self.cameras[0].viewmat[:3, 3]
+        opaque = slice(3, 6)
+        rows["opacities"][opaque], rows["scales"][opaque] = 6.5, np.log([[20.0], [25.0], [30.0]])
+        rows["means"][opaque] = (np.array([[0.0, 0.0, depth] for depth in depths[opaque]]) - t) @ R
+        return {name: in_precision(array) for name, array in rows.items()}
+
+
+def _at_depths(rows: Mapping[str, np.ndarray], camera: Camera, depths: np.ndarray) -> dict[str, np.ndarray]:
+    """Return Gaussians moved along their rays to other depths, as large on the screen; those behind stay."""
+    R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
+    seen = rows["means"] @ R.T + t
+    grown = np.where(seen[:, 2:] > 0.0, depths[:, None] / seen[:, 2:], 1.0)
+    return {
+        **rows,
+        "means": in_precision((seen * grown - t) @ R),
+        "scales": in_precision(rows["scales"] + np.log(grown)),
+    }
+
+
+_ONE_LOOK: Final = {"settings": PRIOR.settings, "options": PRIOR.options, "order": (0,), "scene_scale": 4.0}
+CORNERS: Final = [
+    AtOneDepth(**_ONE_LOOK, seed=1, count=40, size=(5, 5)),
+    OverManyTiles(**_ONE_LOOK, seed=14, count=7, size=(1041, 1)),
+    BehindTheOpaque(**_ONE_LOOK, seed=3, count=40),
+]
+
+
 def _cases() -> dict[str, ShortTraining]:
     """Return what is trained, by name."""
     found = {
@@ -157,6 +229,7 @@ def _cases() -> dict[str, ShortTraining]:
         "opacities_that_rest": replace(PRIOR, settings={**PRIOR.settings, "opacities_stop_iter": 0}, order=(0, 1)),
         # dominated pixels that a mask leaves out, and the share of all pixels, would be others
         "blurred_inside_masks": _BLURRED_INSIDE,
+        "at_one_depth": CORNERS[0], "over_many_tiles": CORNERS[1], "behind_the_opaque": CORNERS[2],
         "of_two_views": BATCHES[0],
         "of_two_views_that_grow": BATCHES[1],
         "of_two_views_that_blur_inside_masks": replace(_BLURRED_INSIDE, batch=2, order=(1, 0) * 3),
@@ -185,19 +258,10 @@ def steps_vectors() -> dict[str, Vector]:
     return {name: _vector(short) for name, short in _cases().items()}
 
 
-@dataclass(frozen=True)
-class _Recorded(ShortTraining):
-    """A short training whose random numbers are kept."""
-
-    kept: list[KeptDraws] = field(default_factory=list[KeptDraws])
-
-    def draws(self) -> Any:
-        self.kept.append(KeptDraws(super().draws()))
-        return self.kept[-1]
-
-
 def _vector(short: ShortTraining) -> Vector:
-    recorded = _Recorded(**{f.name: getattr(short, f.name) for f in fields(ShortTraining)})
+    recorded, kept = copy.copy(short), KeptDraws(short.draws())
+    # of this one alone, which is frozen
+    object.__setattr__(recorded, "draws", lambda: kept)
     taken, wanted, before = OracleSteps(recorded, np.float32), list[WantedStep](), list[Rows]()
     for step in range(short.steps):
         rows = taken.rows
@@ -206,7 +270,7 @@ def _vector(short: ShortTraining) -> Vector:
         taken.go_on(given)
         before.append(given)
         wanted.append(taken.step(*short.order[step * short.batch : (step + 1) * short.batch]))
-    arrays = _shown(short) | {"draws": recorded.kept[-1].flat, "step_rows": _lengths(before)}
+    arrays = _shown(short) | {"draws": kept.flat, "step_rows": _lengths(before)}
     for kind in _STATES:
         arrays |= {f"{kind}_{key}": np.concatenate([getattr(rows, kind)[key] for rows in before]) for key in KEYS}
     recipe: Any = taken.recipe

@@ -24,6 +24,7 @@ from pop_ref.conformance.vector_steps import (
     BLURRED,
     CHANGED,
     CHANGES,
+    CORNERS,
     ENTROPY,
     FEW,
     FIRST,
@@ -55,7 +56,7 @@ def _assert_steps(backend, short):
 
 @law("training", "taken_steps")
 def test_every_step_is_the_oracles_under_every_setting(backend):
-    for short in (PRIOR, WINDOW, ENTROPY, MASKED, HIDDEN, *LARGE, ASIDE, UNSEEN):
+    for short in (PRIOR, WINDOW, ENTROPY, MASKED, HIDDEN, *LARGE, ASIDE, UNSEEN, *CORNERS):
         _assert_steps(backend, short)
 
 
