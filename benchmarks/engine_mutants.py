@@ -1,6 +1,7 @@
 """Faults drawn at random from the C++ engine that trains on CPUs: how many of them do the kit's laws notice?
 
     python -m benchmarks.engine_mutants --draw 60 --work out/engine     # goes on where it was stopped
+    python -m benchmarks.engine_mutants --lines --work out/engine       # which lines no law runs, by gcov
     python -m benchmarks.engine_mutants                                 # what the JSON says
 
 A site is an operator, a number or a statement of the engine's C++, and of the arithmetic that it shares with the CUDA
@@ -13,10 +14,12 @@ hand which law of later has noticed it.
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import random
 import re
 import select
+import shutil
 import signal
 import subprocess
 import sys
@@ -24,6 +27,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 if __package__ in (None, ""):
@@ -31,6 +35,7 @@ if __package__ in (None, ""):
 
 from benchmarks.record import commit, read_json, write_json
 from cuda_ext.toolkit import find_compiler, no_compiler
+from pop_fast.children import module_command
 from pop_fast.compiled import build, library
 from pop_ref.conformance.backends import shipped
 from pop_ref.conformance.mutants.trial import every_law, noticed
@@ -193,7 +198,7 @@ def draw(count: int, seed: int, work: Path) -> None:
             raise SystemExit("the sound engine does not compile, or breaks a law: nothing can be told of faulty ones")
         tried["sound"] = {"sites": len(every), "seed": seed, "commit": commit(ROOT)}
     for fault in random.Random(seed).sample(every, len(every)):
-        if len(tried) - 1 >= count:
+        if len([name for name in tried if name not in ("sound", "lines")]) >= count:
             return
         if fault.name in tried or (engine := compiled(fault, work)) is None:
             continue
@@ -203,17 +208,57 @@ def draw(count: int, seed: int, work: Path) -> None:
         print(fault.name, tried[fault.name], flush=True)
 
 
+def lines_run(work: Path) -> dict[str, Any]:
+    """Return how many of the engine's lines the laws run, and those that they do not, by file.
+
+    Raises:
+        SystemExit: there is no gcov or compiler, or the sound engine breaks a law.
+    """
+    gcov = shutil.which("gcov")
+    if gcov is None:
+        raise SystemExit("there is no gcov, which comes with g++")
+    with TemporaryDirectory(dir=work) as folder:
+        engine = Path(folder) / "counted.so"
+        units = [str(build.HERE / unit) for unit in build.UNITS]
+        flags = (*_FLAGS, "--coverage", "-fprofile-update=atomic", "-shared", f"-I{ROOT}")
+        subprocess.run([*_compiler(), *flags, "-o", str(engine), *units], check=True, cwd=folder)
+        judge = subprocess.run(
+            module_command("benchmarks.engine_mutants", "--judge", str(engine)), check=False, cwd=ROOT
+        )
+        if judge.returncode:
+            raise SystemExit("the sound engine breaks a law: no line can be told to be judged")
+        counted = [path.name for path in Path(folder).glob("*.gcda")]
+        found = subprocess.run(
+            [gcov, "--json-format", "--stdout", *counted], capture_output=True, text=True, check=True, cwd=folder
+        )
+    ran: dict[tuple[str, int], bool] = {}
+    for text in found.stdout.splitlines():
+        for file in json.loads(text)["files"]:
+            if (path := Path(folder, file["file"]).resolve()).is_relative_to(ROOT):
+                # a line of a template is counted once for each type that it is made for
+                for line in file["lines"]:
+                    at = str(path.relative_to(ROOT)), line["line_number"]
+                    ran[at] = ran.get(at, False) or line["count"] > 0
+    left: dict[str, list[str]] = {}
+    for name, number in sorted(at for at, run in ran.items() if not run):
+        left.setdefault(name, []).append((ROOT / name).read_text(encoding="utf-8").splitlines()[number - 1].strip())
+    return {"lines": len(ran), "run": sum(ran.values()), "not run": left, "commit": commit(ROOT)}
+
+
 def told(tried: dict[str, Any]) -> list[str]:
     """Return what the JSON says, a line each: how many die, and what lives."""
-    rows = {name: row for name, row in tried.items() if name != "sound" and "changes nothing" not in row}
+    about = ("sound", "lines")
+    rows = {name: row for name, row in tried.items() if name not in about and "changes nothing" not in row}
     died = [row["noticed by"] for row in rows.values() if row["noticed by"]]
     errors = sum(said in ("crash", "hang") for said in died)
-    same = len(tried) - 1 - len(rows)
+    same = len([name for name in tried if name not in about]) - len(rows)
     lived = {name: row for name, row in rows.items() if not row["noticed by"]}
     lives = [
         f"lived: {name}{', until ' + by if (by := row.get('noticed since by')) else ''}" for name, row in lived.items()
     ]
-    return [f"{len(died)} of {len(rows)} die, {errors} of them by a crash; {same} change nothing", *lives]
+    counted = tried.get("lines")
+    reached = [f"laws run {counted['run']:,} of {counted['lines']:,} lines"] if counted else []
+    return [f"{len(died)} of {len(rows)} die, {errors} of them by a crash; {same} change nothing", *reached, *lives]
 
 
 def main() -> None:
@@ -221,8 +266,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--draw", type=int, help="how many faults to try, those of the JSON among them")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--lines", action="store_true", help="count which lines laws run")
+    parser.add_argument("--judge", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--work", type=Path, default=Path("out/engine"), help="folder for what is compiled")
     args = parser.parse_args()
+    if args.judge is not None:
+        sys.exit(_judge(args.judge) or 0)
+    if args.lines:
+        args.work.mkdir(parents=True, exist_ok=True)
+        write_json(RESULTS, read_json(RESULTS) | {"lines": lines_run(args.work.resolve())})
     if args.draw is not None:
         args.work.mkdir(parents=True, exist_ok=True)
         draw(args.draw, args.seed, args.work.resolve())

@@ -409,3 +409,19 @@ def test_a_made_photograph_shows_what_stands_nearest_at_its_brightness(script: A
     assert picture[180, 60].max() < side
     darker = kinds.rendered(kinds.Photograph(view, (far, near), stops=-1.0), paints)
     assert darker[180, 240].tolist() == [round(255 * 0.35 ** (1 / 2.2))] * 3
+
+
+# of an engine that is sound: what it measures of itself, errors, and threads where it is given none
+NOT_JUDGED = {"c_api.h", "counts.cpp", "step.cpp", "step.h", "threads.h"}
+# lines of errors, and heads of templates, which compilers count for some types alone
+TOLD = ("*given->bad_row", "template <class Real> struct", ": size(size), count(size * size)")
+
+
+def test_the_laws_run_every_line_of_the_engine_that_computes_what_is_trained() -> None:
+    counted = json.loads((BENCHMARKS / "results" / "engine_mutants.json").read_text(encoding="utf-8"))["lines"]
+    left = {Path(name).name: lines for name, lines in counted["not run"].items()}
+    others = {name: lines for name, lines in left.items() if name not in NOT_JUDGED}
+    assert all(line.startswith(TOLD) for lines in others.values() for line in lines), others
+    assert counted["lines"] - counted["run"] == sum(map(len, left.values()))
+    said = f"Of the engine's {counted['lines']:,} lines the laws run {counted['run']:,}"
+    assert said in (ROOT / "docs" / "kit.md").read_text(encoding="utf-8")
