@@ -24,6 +24,7 @@ from paper_repro.evidence import (
     told,
 )
 from paper_repro.paper import paper
+from paper_repro.results import most_timed_on
 from paper_repro.scenes import scale_named
 
 # what a question gets on one scene: comparisons; None for one that lacks a run; why one cannot be made of its runs
@@ -237,13 +238,6 @@ def _scenes(question: Question, found: Groups, scale: str) -> list[str]:
 
 def _on_one_machine(used: Mapping[str, Group]) -> dict[str, Group]:
     """Keep the runs on that machine, engine and number of threads on which most rows were timed."""
-    rows: dict[str, set[str]] = {}
-    for row, group in used.items():
-        for run in group.runs:
-            if run.is_timed:
-                rows.setdefault(run.trained_on, set()).add(row)
-    if not rows:
-        return {}
-    best = max(sorted(rows), key=lambda where: ("pop" in rows[where], len(rows[where])))
+    best = most_timed_on((row, run) for row, group in used.items() for run in group.runs)
     kept = {row: tuple(r for r in group.runs if r.is_timed and r.trained_on == best) for row, group in used.items()}
     return {row: Group(runs) for row, runs in kept.items() if runs}

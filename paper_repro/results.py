@@ -150,8 +150,10 @@ class Result:
 
     @property
     def trained_on(self) -> str:
-        """Say of the training time what it is a time of: machine, engine, threads."""
-        return f"{self.machine}, {self.engine}, {self.threads} thread{'' if self.threads == 1 else 's'}"
+        """Say of the training time what it is a time of: machine and kind of its processor, engine, threads."""
+        # processors of several generations have one name; on a GPU they matter little
+        kind = "" if ", " in self.machine else f" ({self.cpu or 'of an unknown kind'})"
+        return f"{self.machine}{kind}, {self.engine}, {self.threads} thread{'' if self.threads == 1 else 's'}"
 
     def at(self, step: int, key: str = "num_gaussians") -> float | None:
         """Give a value of the curve at a step, linearly between the logged ones; None outside of them."""
@@ -160,6 +162,19 @@ class Result:
             if s0 <= step <= s1:
                 return v0 + (v1 - v0) * (step - s0) / (s1 - s0)
         return known[0][1] if len(known) == 1 and known[0][0] == step else None
+
+
+def most_timed_on(runs: Iterable[tuple[str, Result]]) -> str | None:
+    """Return on which machine most rows were timed, one with POP before others; None where no time compares.
+
+    Args:
+        runs: each with the row that it stands for.
+    """
+    rows: dict[str, set[str]] = {}
+    for row, run in runs:
+        if run.is_timed:
+            rows.setdefault(run.trained_on, set()).add(row)
+    return max(sorted(rows), key=lambda where: ("pop" in rows[where], len(rows[where])), default=None)
 
 
 def to_line(result: Result) -> str:

@@ -6,7 +6,7 @@ A name stands next to its marker, none over another.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final
@@ -28,6 +28,7 @@ from paper_repro.figures.style import (
     name_of,
 )
 from paper_repro.paper import paper
+from paper_repro.results import Result, most_timed_on
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,17 +64,15 @@ class _Point:
 
 def psnr_against_time(asked: Asked) -> Drawn:
     """Figure 1: PSNR against training time; the area of a marker is the number of Gaussians."""
-    chosen, by_clock = _timed(asked, asked.scenes(paper().datasets["Tanks & Temples"]))
+    chosen, without = _timed(asked, asked.scenes(paper().datasets["Tanks & Temples"]))
     means = {row: _means(chosen, row) for row in chosen.runs}
     largest = max(n for _, _, n in means.values())
     points = [
         _Point(row, seconds, psnr, n, _LARGEST * n / largest, f"{name_of(row)}\n{count(n)}")
         for row, (seconds, psnr, n) in means.items()
     ]
-    machines = sorted({r.trained_on for r in chosen.all})
-    where = machines[0] if len(machines) == 1 else f"{len(machines)} machines, so that times do not compare"
+    where = " and ".join(sorted({r.trained_on for r in chosen.all}))
     clock = "" if all(r.is_timed for r in chosen.all) else ", by the clock though there may have been other work"
-    without = [f"Without {', '.join(by_clock)}: time there is by the clock."] if by_clock else []
     note = foot(
         asked, chosen, f"Area of a marker: number of Gaussians, written at it. Time on {where}{clock}.", *without
     )
@@ -168,17 +167,29 @@ def _sweep_table(
     return ("scene", "row", "seed", "run", "psnr", "num_gaussians"), rows
 
 
-def _timed(asked: Asked, scenes: Sequence[str]) -> tuple[Chosen, tuple[str, ...]]:
-    """Choose the scenes to average over, without those whose times do not compare where the others have every row.
+def _timed(asked: Asked, scenes: Sequence[str]) -> tuple[Chosen, list[str]]:
+    """Choose what was timed on one machine, without scenes whose times do not compare where others have every row.
 
     Returns:
-        The results, and the scenes that were left out for their times.
+        The results, and what the note says of those that are left out.
     """
-    chosen = choose(asked, (*METHODS, "pop"), scenes)
+    rows = (*METHODS, "pop")
+    every = [r for r in asked.results if r.row in rows and r.scene in scenes]
+    best = most_timed_on((r.row, r) for r in every)
+
+    def there(result: Result) -> bool:
+        return best is None or result.trained_on == best
+
+    chosen = choose(asked, rows, scenes, there)
     untimed = {r.scene for r in chosen.all if not r.is_timed}
-    if not untimed or untimed == set(chosen.scenes):
-        return chosen, ()
-    return choose(asked, (*METHODS, "pop"), [scene for scene in scenes if scene not in untimed]), tuple(sorted(untimed))
+    said: list[str] = []
+    if untimed and untimed != set(chosen.scenes):
+        chosen = choose(asked, rows, [scene for scene in scenes if scene not in untimed], there)
+        said.append(f"Without {', '.join(sorted(untimed))}: time there is by the clock.")
+    elsewhere = {r.row for r in every if r.scene in chosen.scenes} - set(chosen.runs)
+    if elsewhere:
+        said.append(f"Timed on another machine: {', '.join(name_of(row) for row in rows if row in elsewhere)}.")
+    return replace(chosen, missing=tuple(row for row in chosen.missing if row not in elsewhere)), said
 
 
 def _means(chosen: Chosen, row: str) -> tuple[float, float, float]:

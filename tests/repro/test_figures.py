@@ -300,10 +300,18 @@ def test_the_note_says_captures_steps_seeds_and_whether_it_is_the_protocol():
     assert said.endswith("Scale paper: the published protocol. Not every row was run on room.")
 
 
-def test_times_of_different_machines_are_said_not_to_compare():
-    runs = [result("pop"), result("gsplat", machine="another")]
-    assert "2 machines, so that times do not compare" in texts(drawn("1", runs))
-    assert "Time on a machine, native, 1 thread." in texts(drawn("1", runs[:1]))
+def test_a_figure_of_times_is_of_one_machine_and_says_what_was_timed_elsewhere():
+    runs = [result("pop"), result("gsplat", machine="another"), result("3dgs"), result("taming", cpu="another kind")]
+    made = drawn("1", runs)
+    assert {line["row"] for line in lines(made)} == {"pop", "3dgs"}
+    said = texts(made)
+    assert "Time on a machine (a kind), native, 1 thread." in said
+    assert "Timed on another machine: gsplat, Taming-3DGS." in said
+    assert "Not run: PUP-3DGS, PUP-3DGS*, Mini-Splatting, Mini-Splatting* and Speedy-Splat." in said
+    # one with POP comes before one with more rows
+    made = drawn("1", [replace(runs[0], cpu=None), *runs[2:], result("pup")])
+    assert {line["row"] for line in lines(made)} == {"pop"}
+    assert "a machine (of an unknown kind)" in texts(made)
     untimed = [result("pop", seconds={"load": 1.0, "train": 9.0, "evaluate": 1.0})]
     assert "1 thread, by the clock though" in texts(drawn("1", untimed))
 
