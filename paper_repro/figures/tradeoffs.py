@@ -77,7 +77,7 @@ def psnr_against_time(asked: Asked) -> Drawn:
         asked, chosen, f"Area of a marker: number of Gaussians, written at it. Time on {where}{clock}.", *without
     )
     sheet = Sheet(note, 2.3)
-    axes = sheet.panel(right=0.1)
+    axes = sheet.panel(left=0.52, right=0.1)
     _plane(axes, points, "training time (s)", 0.16)
     # small markers lie on large ones
     for point in sorted(points, key=lambda point: -point.area):
