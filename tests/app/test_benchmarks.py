@@ -412,16 +412,18 @@ def test_a_made_photograph_shows_what_stands_nearest_at_its_brightness(script: A
 
 
 # of an engine that is sound: what it measures of itself, errors, and threads where it is given none
-NOT_JUDGED = {"c_api.h", "counts.cpp", "step.cpp", "step.h", "threads.h"}
-# lines of errors, and heads of templates, which compilers count for some types alone
-TOLD = ("*given->bad_row", "template <class Real> struct", ": size(size), count(size * size)")
+NOT_JUDGED = {"c_api.h", "counts.cpp", "threads.h"}
+# lines of errors, of bytes and times that are told, and heads of templates, which compilers count for some types alone
+TOLD = re.compile(
+    r"catch|^}$|bytes\(|trace|^return n;$|^\*given->bad_row|^template <class Real> struct|^: size\(size\)"
+)
 
 
 def test_the_laws_run_every_line_of_the_engine_that_computes_what_is_trained() -> None:
     counted = json.loads((BENCHMARKS / "results" / "engine_mutants.json").read_text(encoding="utf-8"))["lines"]
     left = {Path(name).name: lines for name, lines in counted["not run"].items()}
     others = {name: lines for name, lines in left.items() if name not in NOT_JUDGED}
-    assert all(line.startswith(TOLD) for lines in others.values() for line in lines), others
+    assert all(TOLD.search(line) for lines in others.values() for line in lines), others
     assert counted["lines"] - counted["run"] == sum(map(len, left.values()))
     said = f"Of the engine's {counted['lines']:,} lines the laws run {counted['run']:,}"
     assert said in (ROOT / "docs" / "kit.md").read_text(encoding="utf-8")
