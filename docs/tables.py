@@ -115,9 +115,7 @@ STAGES = (
     Stage("blending with early ray termination", "eq. 1", ("compositing", "pixel"), ("compiled/compositing.py",)),
     Stage("dominant Gaussians", "eq. 5", ("dominance",), ("stages/compositing.py",)),
     Stage("a whole view", "eq. 1", ("render", "splatting", "depth"), ("api/rasterize.py", "compiled/compositing.py")),
-    Stage(
-        "L1, L2, SSIM and both objectives", "eqs. 2, 4, 9", ("losses", "ssim", "magnitudes"), ("compiled/losses.py",)
-    ),
+    Stage("L1, L2, SSIM and both objectives", "eqs. 2, 4, 9", ("losses", "ssim"), ("compiled/losses.py",)),
     Stage("importance mask and POP loss", "eqs. 7, 8", ("polarization",), ("stages/regularizers.py",)),
     Stage("terms for few photographs: sparse depth, mean opacity, mean scale", "–", ("regularizers",)),
     Stage("density control", "eqs. 3, 6", ("density", "density_rows")),
@@ -159,10 +157,10 @@ NOT_STAGES = frozenset(
 LAWS_ELSEWHERE = {
     "render": "pop_ref/conformance/laws/test_whole.py",
     "depth": "pop_ref/conformance/laws/test_signature_arguments.py",
-    "training": "tests/golden",
-    "appearance": "tests/oracle/test_losses.py",
-    "refinement": "tests/oracle/test_losses.py",
-    "regularizers": "tests/oracle/test_losses.py",
+    "training": "pop_ref/conformance/laws/test_whole_steps.py",
+    "appearance": "pop_ref/conformance/laws/test_few_photographs.py",
+    "refinement": "pop_ref/conformance/laws/test_few_photographs.py",
+    "regularizers": "pop_ref/conformance/laws/test_few_photographs.py",
     "margins": "tests/oracle/test_margins.py",
 }
 
