@@ -219,8 +219,14 @@ _READINGS: Final[tuple[tuple[str, dict[str, Any], dict[str, Any]], ...]] = (
     ("gsplat", {"prune_opa": 0.3, "prune_too_big": False}, {"steps": EVERY_STEP[:14]}),
     ("mini-splatting", {"importance": "outdoor", "max_gaussians": 40}, {"cameras": 2}),
     ("taming", {"final_count": 30, "misaligned_prune_weights": False}, {"packed": True}),
-    ("pop", SCREEN, {"width": 8, "height": 16}),
-    ("mini-splatting", {"grad_denominator": "window"}, {"steps": EVERY_STEP[:10]}),
+    # bounds that extents come up to, 3 and 4 of 16 px
+    (
+        "pop",
+        {**SCREEN, "grow_scale2d": 0.1875, "prune_scale2d": 0.25, "prune_opa": 0.3, "revised_opacity": True},
+        {"width": 8, "height": 16},
+    ),
+    # more points asked for than pixels are shown
+    ("mini-splatting", {"grad_denominator": "window", "reinit_points": 400}, {"steps": EVERY_STEP[:10]}),
 )
 # trainings under every other reading of a method
 READINGS: Final = tuple(

@@ -70,9 +70,17 @@ def test_where_nothing_is_rendered_no_depth_pulls(backend, samples):
         max_size=6,
     ),
     masked=st.booleans(),
+    # beyond one side alone, and on the border of each
+    first=[
+        {"viewmat": np.eye(4), "at": [(x, y, z) for x, y in places for z in (1.0, 4.0)], "masked": False}
+        for places in (
+            [(1.0, -1.0), (1.0, H), (-1.0, 1.0), (W, 1.0)],
+            [(1.0, -0.25), (1.0, H - 0.25), (-0.25, 1.0), (W - 0.25, 1.0)],
+        )
+    ],
 )
 def test_points_behind_the_camera_outside_the_picture_or_left_out_by_a_mask_have_no_depth(backend, viewmat, at, masked):
-    # quarters of a pixel off the pixels' borders, where rounding decides nothing
+    # quarters of a pixel off the pixels' borders, where rounding decides nothing unless the camera stands in the origin
     u, v, z = (np.array([point[axis] for point in at]) for axis in range(3))
     u, v = u + 0.25, v + 0.25
     K = np.array([[4.0, 0.0, 2.5], [0.0, 2.0, 1.5], [0.0, 0.0, 1.0]])
@@ -105,6 +113,11 @@ def test_the_depth_of_sparse_points_weighs_in_units_of_the_scene(backend, scene_
     ]
     expected = 0.25 * scene_scale
     assert_close("few_photographs.depth", losses[1] - losses[0], expected, 1.0 + expected, backend.dtype)
+    # of a photograph that sees no points, and where they weigh nothing
+    for weight, points in ((0.5, None), (0.0, np.array([[0.0, 0.0, 2.0]]))):
+        without = backend.stage("train_step")(*seen, Recipe(depth_lambda=weight), points)[1]
+        expected = 1.5 * losses[0] - 0.5 * losses[1]
+        assert_close("few_photographs.depth", without, expected, 1.0 + scene_scale, backend.dtype)
 
 
 @law("few_photographs", "mean_activation", "mean_activation_vjp")

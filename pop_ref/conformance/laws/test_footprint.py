@@ -93,6 +93,9 @@ def test_antialiasing_hides_a_point_and_hardly_touches_a_large_splat(backend, ep
     covars = np.array([np.zeros((2, 2)), 2.0**60 * np.eye(2)])
     factors = backend.stage("compensations")(covars, eps2d)
     assert_close("footprint.energy", factors, np.array([0.0, 1.0]), 1.0, backend.dtype)
+    if backend.has("compensations_vjp"):
+        pulled = backend.stage("compensations_vjp")(covars, eps2d, np.ones(2))
+        assert_same_bits("a point's gradient", pulled[0], np.zeros((2, 2)))
 
 
 @law("footprint", "compensations", power=st.integers(4, 10), eps2d=dyadic(0.125, 1.0))
@@ -177,15 +180,17 @@ def test_a_splat_is_kept_exactly_while_its_extent_overlaps_the_image(backend, ed
     assert not np.any(on_screen(np.array([[4.0, 2.0]]), np.zeros((1, 2), dtype=np.int64), width, height))
 
 
-@law("footprint", "on_screen", PROFILES, x=dyadic(-24.0, 40.0), reach=st.integers(1, 20))
-def test_the_square_extent_is_kept_while_it_meets_a_tile(backend, x, reach):
+@law("footprint", "on_screen", PROFILES, at=dyadic(-24.0, 40.0), reach=st.integers(1, 20), axis=st.integers(0, 1),
+     first=[{"at": at, "reach": 2, "axis": axis} for at in (-8.0, 16.0) for axis in (0, 1)])  # fmt: skip
+def test_the_square_extent_is_kept_while_it_meets_a_tile(backend, at, reach, axis):
     # D2 as the tile grid decides it, truncation towards zero included
-    profile = dataclasses.replace(INRIA, tile_size=4)
-    p = x - 0.5
-    first = min(max(int((p - reach) / 4), 0), 2)
-    last = min(max(int((p + reach + 3) / 4), 0), 2)
-    kept = backend.stage("on_screen")(np.array([[x, 2.0]]), np.array([[reach, reach]]), 8, 4, profile)
-    assert_same_bits("kept", kept, [first < last])
+    profile, size, means2d = dataclasses.replace(INRIA, tile_size=4), (8, 12), np.array([[4.0, 6.0]] * 4)
+    means2d[0, axis] = at
+    first = min(max(int((at - 0.5 - reach) / 4), 0), size[axis] // 4)
+    last = min(max(int((at - 0.5 + reach + 3) / 4), 0), size[axis] // 4)
+    # without an extent, or along one axis alone, nothing is seen
+    kept = backend.stage("on_screen")(means2d, np.array([[reach, reach], [0, 0], [0, 5], [5, 0]]), *size, profile)
+    assert_same_bits("kept", kept, [first < last, False, False, False])
 
 
 @law("footprint", "radii_from_covars2d")

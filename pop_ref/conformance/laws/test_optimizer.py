@@ -114,10 +114,12 @@ def test_the_position_rate_falls_log_linearly_to_a_hundredth(backend, step, scal
 
 
 RULES_OF_RATES = (
-    UpdateRules(means_rewind_iter=150, means_rewind_to=50),
+    # no round begins, whatever it would do
+    UpdateRules(means_rewind_iter=150, means_rewind_to=50, round_decay=0.5, round_decay_every=1),
     UpdateRules(means_rewind_iter=90, means_rewind_to=0),
     UpdateRules(rounds_start_iter=120, round_steps=60, round_decay=0.5, round_decay_every=20),
     UpdateRules(rounds_start_iter=100, round_steps=250, round_decay=0.875, round_decay_every=7),
+    UpdateRules(rounds_start_iter=120, round_steps=30, round_decay=0.5, round_decay_every=1),
 )
 # of a schedule of 300 steps, those at which a rule of the above begins or ends, and those beside
 TURNS = (0, 1, 49, 50, 89, 90, 99, 100, 107, 119, 120, 139, 140, 149, 150, 179, 180, 181, 239, 240, 299)
