@@ -190,7 +190,7 @@ class Watch:
     def params(self) -> dict[str, np.ndarray]:
         """Return raw parameters in numbers of single precision."""
         # of few, rounding decides no pixel of some seeds
-        return raw_params(gaussians(self.seed, degree=2, count=14 if self.masked else 6))
+        return raw_params(gaussians(self.seed, degree=2, count=14 if self.masked else 6, seen_first=True))
 
     @functools.cached_property
     def cameras(self) -> list[Camera]:

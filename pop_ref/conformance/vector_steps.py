@@ -10,7 +10,7 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from typing import Any, Final
 
 import numpy as np
@@ -20,6 +20,7 @@ from pop_ref.conformance.scenes import in_precision
 from pop_ref.conformance.short_training import PLACE, OracleSteps, ShortTraining, WantedStep
 from pop_ref.conformance.vector_check import close, entry, equal, output
 from pop_ref.conformance.vector_training import HeldDraws, KeptDraws, Vector
+from pop_ref.conformance.views import gaussians, raw_params
 from pop_ref.constants import Profile
 from pop_ref.density import Rows
 from pop_ref.methods import KEYS, RECIPE_OF, method_settings
@@ -161,6 +162,14 @@ class AtOneDepth(ShortTraining):
         return _at_depths({**rows, "opacities": faint}, self.cameras[0], depths)
 
 
+class SeenFirst(ShortTraining):
+    """A short training in which the first Gaussian is seen, and dominates pixels; of others it is behind the camera."""
+
+    @functools.cached_property
+    def params(self) -> Mapping[str, np.ndarray]:
+        return raw_params(gaussians(self.seed, self.degree, self.count, self.size, seen_first=True))
+
+
 class OverManyTiles(ShortTraining):
     """A short training on a picture of one row, whose third Gaussian lies over more tiles than a word has bits."""
 
@@ -214,6 +223,11 @@ CORNERS: Final = [
     AtOneDepth(**_ONE_LOOK, seed=1, count=40, size=(5, 5)),
     OverManyTiles(**_ONE_LOOK, seed=14, count=7, size=(1041, 1)),
     BehindTheOpaque(**_ONE_LOOK, seed=3, count=40),
+    *(
+        SeenFirst(**{f.name: getattr(short, f.name) for f in fields(short)})
+        # the mask leaves out all that the fourth dominates
+        for short in (PRIOR, replace(MASKED, seed=62, order=(0,)))
+    ),
 ]
 
 
@@ -230,6 +244,7 @@ def _cases() -> dict[str, ShortTraining]:
         # dominated pixels that a mask leaves out, and the share of all pixels, would be others
         "blurred_inside_masks": _BLURRED_INSIDE,
         "at_one_depth": CORNERS[0], "over_many_tiles": CORNERS[1], "behind_the_opaque": CORNERS[2],
+        "with_the_first_seen": CORNERS[3], "masked_with_the_first_seen": CORNERS[4],
         "of_two_views": BATCHES[0],
         "of_two_views_that_grow": BATCHES[1],
         "of_two_views_that_blur_inside_masks": replace(_BLURRED_INSIDE, batch=2, order=(1, 0) * 3),

@@ -51,10 +51,13 @@ def cameras(
     return found
 
 
-def gaussians(seed: int, degree: int = 1, count: int = 14, size: tuple[int, int] = SIZE) -> Gaussians:
+def gaussians(
+    seed: int, degree: int = 1, count: int = 14, size: tuple[int, int] = SIZE, *, seen_first: bool = False
+) -> Gaussians:
     """Return Gaussians before the first camera, one of them behind it and one far outside the picture.
 
-    Quaternions have norms other than 1, sizes along the axes differ, and coefficients of every band are there.
+    Quaternions have norms other than 1, sizes along the axes differ, and coefficients of every band are there. The two
+    that the camera does not see are the first two; with `seen_first` they are the second and third.
     """
     rng = np.random.default_rng(seed)
 
@@ -69,7 +72,10 @@ def gaussians(seed: int, degree: int = 1, count: int = 14, size: tuple[int, int]
             sh=tuple(map(tuple, rng.normal(0.0, 0.15, ((degree + 1) ** 2, 3)) + 0.25)),
         )
 
-    return pack([one(k) for k in range(count)], cameras(1, size=size)[0])
+    records = [one(k) for k in range(count)]
+    if seen_first:
+        records[:3] = records[2], records[0], records[1]
+    return pack(records, cameras(1, size=size)[0])
 
 
 def raw_params(g: Gaussians) -> dict[str, np.ndarray]:
@@ -117,7 +123,7 @@ def frames(
         blind: the camera that has every Gaussian behind it.
         entry: of the batch; each has cameras of its own.
     """
-    g, rng = gaussians(seed, degree, size=size), np.random.default_rng(1000 + seed)
+    g, rng = gaussians(seed, degree, size=size, seen_first=seed % 2 == 1), np.random.default_rng(1000 + seed)
     shared = rng.uniform(-0.5, 1.5, (len(g), channels))
     found = []
     profile = backend.profile or PAPER

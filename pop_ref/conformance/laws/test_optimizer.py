@@ -114,8 +114,9 @@ def test_the_position_rate_falls_log_linearly_to_a_hundredth(backend, step, scal
 
 
 RULES_OF_RATES = (
-    # no round begins, whatever it would do
+    # no round begins and nothing is rewound, whatever that would do
     UpdateRules(means_rewind_iter=150, means_rewind_to=50, round_decay=0.5, round_decay_every=1),
+    UpdateRules(means_rewind_to=50),
     UpdateRules(means_rewind_iter=90, means_rewind_to=0),
     UpdateRules(rounds_start_iter=120, round_steps=60, round_decay=0.5, round_decay_every=20),
     UpdateRules(rounds_start_iter=100, round_steps=250, round_decay=0.875, round_decay_every=7),
