@@ -24,7 +24,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -158,13 +158,13 @@ def _read_by(unit: str) -> set[str]:
     return found
 
 
-def noticed_by(engine: Path) -> str:
-    """Return the first law that breaks on an engine, "crash" or "hang", or "" where all laws hold."""
+def in_a_child(judge: Callable[..., str], *args: Any) -> str:
+    """Return what a function of text says in a child process, "crash" or "hang" where it does not come to its end."""
     here, there = os.pipe()
     child = os.fork()
     if child == 0:
         with os.fdopen(there, "w", encoding="utf-8") as answer:
-            answer.write(_judge(engine))
+            answer.write(judge(*args))
         os._exit(0)
     os.close(there)
     with os.fdopen(here, encoding="utf-8") as answer:
@@ -174,6 +174,11 @@ def noticed_by(engine: Path) -> str:
         said = answer.read()
     _, status = os.waitpid(child, 0)
     return "hang" if not ready else said if status == 0 else "crash"
+
+
+def noticed_by(engine: Path) -> str:
+    """Return the first law that breaks on an engine, "crash" or "hang", or "" where all laws hold."""
+    return in_a_child(_judge, engine)
 
 
 def _judge(engine: Path) -> str:

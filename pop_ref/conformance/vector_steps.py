@@ -77,6 +77,8 @@ WAITING: Final = ShortTraining(
     (*ORDER, 1),
     seed=126,
 )
+# all bands, drawn one after the other, and no band but the first
+BANDS: Final = [replace(WAITING, degree=3, seed=10), replace(PRIOR, degree=0, seed=6, order=(0, 1, 0))]
 _GROWS: Final = {
     "refine_start_iter": 1, "refine_every": 2, "grow_grad2d": 1e-6, "grow_scale3d": 100.0, "prune_opa": 0.0
 }  # fmt: skip
@@ -248,6 +250,7 @@ def _cases() -> dict[str, ShortTraining]:
         "of_two_views": BATCHES[0],
         "of_two_views_that_grow": BATCHES[1],
         "of_two_views_that_blur_inside_masks": replace(_BLURRED_INSIDE, batch=2, order=(1, 0) * 3),
+        "of_all_bands": BANDS[0], "of_one_band": BANDS[1],
         "waiting": WAITING, "rewound": REWOUND, "changed": CHANGED, "blurred": BLURRED,
         "of_few_photographs": FEW, "of_few_masked_photographs": replace(FEW, masked=True, scene_scale=0.5),
     }  # fmt: skip

@@ -20,6 +20,7 @@ from pop_ref.conformance.scenes import in_precision
 from pop_ref.conformance.short_training import ShortTraining, assert_steps
 from pop_ref.conformance.vector_steps import (
     ASIDE,
+    BANDS,
     BATCHES,
     BLURRED,
     CHANGED,
@@ -62,7 +63,8 @@ def test_every_step_is_the_oracles_under_every_setting(backend):
 
 @law("training", "taken_steps")
 def test_every_step_is_the_oracles_under_every_rule_of_updates(backend):
-    _assert_steps(backend, WAITING)
+    for short in (WAITING, *BANDS):
+        _assert_steps(backend, short)
     assert "cloned" in _assert_steps(backend, REWOUND)
 
 
