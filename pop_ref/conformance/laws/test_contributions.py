@@ -26,6 +26,7 @@ from pop_ref.conformance.gradient_error_bounds import (
 from pop_ref.conformance.law import law
 from pop_ref.conformance.scenes import Scene
 from pop_ref.conformance.strategies import arrays_of, dyadic, faint_opacities, plain_sizes, quats, scenes
+from pop_ref.conformance.views import cameras, gaussians
 from pop_ref.constants import INRIA, PROFILES
 from pop_ref.contributions import contributions
 from pop_ref.fisher import fisher_blocks, screen_moments
@@ -299,11 +300,17 @@ def _second_moments(moments):
     return found
 
 
-@law("fisher", "fisher_blocks", scene=shapely)
+@law("fisher", "fisher_blocks", scene=shapely, first=[{"scene": Scene(gaussians(3, 2, 6), cameras(1)[0])}])
 def test_fisher_blocks_are_the_oracles(backend, scene):
     given = screened(backend, scene)
-    seen = given.scene
-    moments = screen_moments(*given.view, seen.background, seen.profile).astype(backend.dtype).astype(np.float64)
+    moments = screen_moments(*given.view, given.scene.background, given.scene.profile)
+    moments = moments.astype(backend.dtype).astype(np.float64)
+    # as many bands as there are, and the first alone
+    for degree in (given.scene.sh_degree, 0):
+        _assert_blocks(backend, given, dataclasses.replace(given.scene, sh_degree=degree), moments)
+
+
+def _assert_blocks(backend, given, seen, moments):
     args = (seen.gaussians, seen.camera, moments, seen.sh_degree, seen.profile)
     expected, found = fisher_blocks(*args), backend.stage("fisher_blocks")(*args)
     assert np.any(expected != 0.0), "no block has anything in it"

@@ -44,7 +44,7 @@ from pop_ref.conformance.vector_steps import (
     WINDOW,
 )
 from pop_ref.methods import KEYS
-from pop_ref.refinement import without_common_motion
+from pop_ref.refinement import refined_viewmat, without_common_motion
 from pop_ref.settings import LearningRates
 
 # of band 0
@@ -115,6 +115,9 @@ def test_every_step_sees_from_corrected_cameras(backend):
         viewmats = np.stack([camera.viewmat for camera in short.cameras])
         corrections = without_common_motion(np.random.default_rng(5).normal(0.0, 0.03, (short.views, 6)), viewmats)
         found, seen = backend.stage("corrected_steps")(short, corrections)
+        refined = np.stack([refined_viewmat(*of) for of in zip(viewmats, corrections, strict=True)])
+        size = 1.0 + np.abs(viewmats[:, :, 3:]).max(axis=1, keepdims=True)
+        assert_close("agreement.refined_viewmat", seen, refined, 4.0 * size, backend.dtype, against_oracle=True)
         assert_steps(
             backend, _From(**{f.name: getattr(short, f.name) for f in fields(short)}, corrected=seen), found, least=0.0
         )
