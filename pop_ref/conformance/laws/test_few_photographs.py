@@ -142,6 +142,7 @@ SHAPES = {"exposures": (3, 4), "cameras": (6,)}
 def test_rates_of_exposures_and_cameras_fall_from_step_to_step_and_not_as_one_another(backend):
     # under a gradient that stays, each of Adam's updates is as long as its rate; opposite ones have nothing in common
     signs = np.array([1.0, -1.0])
+    assert backend.stage("appearance_steps")([], np.stack([np.eye(4)] * 2), 8, FALLING) == {}
     for learned, n in product((("exposures",), ("cameras",), tuple(SHAPES)), (1, 2, 5)):
         grads = {name: np.multiply.outer(signs, np.ones(SHAPES[name])) for name in learned}
         found = backend.stage("appearance_steps")([grads] * n, np.stack([np.eye(4)] * 2), 8, FALLING)
