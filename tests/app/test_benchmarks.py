@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import importlib.util
 import json
@@ -18,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import estimates
+from benchmarks import conditions, estimates
 from benchmarks.few_photographs import left_of, table_of
 from pop_fast import compiled
 from pop_fast.io.heartbeat import duration
@@ -427,3 +428,34 @@ def test_the_laws_run_every_line_of_the_engine_that_computes_what_is_trained() -
     assert counted["lines"] - counted["run"] == sum(map(len, left.values()))
     said = f"Of the engine's {counted['lines']:,} lines the laws run {counted['run']:,}"
     assert said in (ROOT / "docs" / "kit.md").read_text(encoding="utf-8")
+
+
+CONDITIONS = json.loads((BENCHMARKS / "results" / "conditions.json").read_text(encoding="utf-8"))
+
+
+def test_every_condition_is_broken_once_and_refusals_never() -> None:
+    every = conditions.sites()
+    assert len({site.name for site in every}) == len({(site.package, site.file, site.text) for site in every})
+    assert all(ast.parse(site.text) for site in every[::40])
+    names = {site.name for site in every}
+    for new in ("True", "False", "((r_x > 0))", "((r_y > 0))"):
+        assert f"pop_ref/tiles.py: r_x > 0 and r_y > 0 -> {new}" in names
+    assert "pop_ref/tiles.py: r_x > 0 -> (r_x >= 0)" in names
+    assert not any("isfinite" in site.old for site in every if site.file == "selection.py")
+
+
+def test_of_conditions_the_page_says_what_the_trial_found() -> None:
+    names = {site.name for site in conditions.sites()}
+    assert set(CONDITIONS["lives"]) <= names, "the sources have changed: try those anew"
+    shares = re.findall(r"(\d+) of (\d+) die", "\n".join(conditions.told(CONDITIONS)))
+    died, faults = (sum(int(share[k]) for share in shares) for k in range(2))
+    said = f"{died} of {faults} ({100 * died / faults:.0f} %"
+    assert said in (ROOT / "docs" / "kit.md").read_text(encoding="utf-8"), said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name, how in CONDITIONS["lives"].items() if "noticed since by" in how])
+def test_a_broken_condition_that_lived_dies_by_the_law_that_is_named(name: str) -> None:
+    (site,) = (site for site in conditions.sites() if site.name == name)
+    law = CONDITIONS["lives"][name]["noticed since by"]
+    assert conditions.noticed_by(site, site.precisions[0], [law], conditions.FEW).startswith(f"{law}: ")
