@@ -437,7 +437,7 @@ LAWS = {
     "tight_tiles.tight_tile_lists": "tiles:tight_lists_are_parts_of_the_rectangles_in_the_same_order",
     "tiles.listed_pixels": "compositing:a_round_splat_on_the_axis_looks_as_the_formula_says",
     "compositing.background_or_black": "compositing:a_round_splat_on_the_axis_looks_as_the_formula_says",
-    "tiles.tile_lists": "tiles:lists_run_front_to_back_and_equal_depths_keep_index_order",
+    "tiles.tile_lists": "tiles:lists_hold_each_splat_once_in_each_tile_of_its_rectangle",
 }
 TESTS = {
     "optimizer.is_updated": "test_training.test_a_step_that_edits_the_population_moves_nothing_in_inrias_loop",
