@@ -78,14 +78,15 @@ def test_any_tile_size_gives_the_same_image(backend, scene, size):
 
 @law("whole", RENDER, INRIAS)
 def test_square_extents_are_culled_by_tiles_of_the_size_that_is_asked_for(backend):
-    # 22.5 px is where its extent begins: beyond a picture of five tiles of 4 px, and in the second tile of 16
-    camera = Camera(np.eye(4), np.array([[4.0, 0.0, 10.0], [0.0, 4.0, 6.0], [0.0, 0.0, 1.0]]), 20, 12)
-    columns = [[[17.0, 0.0, 4.0]], [[1.0, 0.0, 0.0, 0.0]], [[0.25] * 3], [0.75], np.zeros((1, 1, 3))]
-    for size in (4, 16):
+    # 52.5 px is where its extent begins: beyond a picture of three tiles of 16 px, and in the second tile of 32; smaller
+    # tiles are refused where warps draw
+    camera = Camera(np.eye(4), np.array([[16.0, 0.0, 20.0], [0.0, 16.0, 6.0], [0.0, 0.0, 1.0]]), 40, 12)
+    columns = [[[9.0, 0.0, 4.0]], [[1.0, 0.0, 0.0, 0.0]], [[0.0625] * 3], [0.75], np.zeros((1, 1, 3))]
+    for size in (16, 32):
         scene = backend.sees(Scene(Gaussians(*map(np.array, columns)), camera, (0.25, 0.5, 0.75), INRIA, size))
         radii = backend.render(scene).radii
         if radii is not None:
-            assert np.all(radii > 0) == (scene.side == 16), f"with tiles of {scene.side} px it has extents {radii}"
+            assert np.all(radii > 0) == (scene.side == 32), f"with tiles of {scene.side} px it has extents {radii}"
 
 
 @law("whole", RENDER, EXTENTS)
