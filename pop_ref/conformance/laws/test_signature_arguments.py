@@ -132,12 +132,12 @@ def test_a_profile_has_its_own_planes_and_low_pass_where_a_call_is_at_the_defaul
 
 
 def _in_units(frame, unit):
-    """Return a frame of the same world, whose lengths are told in a unit: its picture is the same."""
+    """Return a frame of the same world, with lengths, and quaternions, told in a unit: its picture is the same."""
     scene = frame.scene
     viewmat = scene.camera.viewmat.copy()
     viewmat[:3, 3] *= unit
     g = scene.gaussians
-    lengths = {"means": g.means * unit, "scales": g.scales * unit}
+    lengths = {"means": g.means * unit, "scales": g.scales * unit, "quats": g.quats * unit**2}
     return dataclasses.replace(frame, scene=scene.with_overrides(**lengths, viewmat=viewmat))
 
 

@@ -78,8 +78,8 @@ def test_any_tile_size_gives_the_same_image(backend, scene, size):
 
 @law("whole", RENDER, INRIAS)
 def test_square_extents_are_culled_by_tiles_of_the_size_that_is_asked_for(backend):
-    # 52.5 px is where its extent begins: beyond a picture of three tiles of 16 px, and in the second tile of 32; smaller
-    # tiles are refused where warps draw
+    # its extent begins at 52.5 px, beyond a picture of three tiles of 16 px, and in the second tile of 32; where warps
+    # draw, smaller tiles are refused
     camera = Camera(np.eye(4), np.array([[16.0, 0.0, 20.0], [0.0, 16.0, 6.0], [0.0, 0.0, 1.0]]), 40, 12)
     columns = [[[9.0, 0.0, 4.0]], [[1.0, 0.0, 0.0, 0.0]], [[0.0625] * 3], [0.75], np.zeros((1, 1, 3))]
     for size in (16, 32):
