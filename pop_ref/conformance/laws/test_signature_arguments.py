@@ -179,6 +179,10 @@ def test_every_camera_has_the_colours_and_harmonics_that_were_given_for_it(backe
     for channels in (0, 3):
         row = frames(backend, 3, 3, channels=channels, camera_colors=True)
         assert_call_is_the_oracles(backend, Call((row,), camera_colors=True))
+        # the second from where the first stands, through a lens of its own
+        pose = row[0].scene.camera.viewmat
+        moved = dataclasses.replace(row[1], scene=row[1].scene.with_overrides(viewmat=pose))
+        assert_call_is_the_oracles(backend, Call(((row[0], moved),), camera_colors=True))
 
 
 @law("signature", SIGNATURE, CAMERAS, COLORS)
