@@ -6,6 +6,7 @@ Arguments away from their defaults, several cameras, batches, packed rows, and m
 from __future__ import annotations
 
 import dataclasses
+from itertools import product
 
 import numpy as np
 
@@ -178,7 +179,8 @@ def test_several_cameras_in_one_call_see_what_each_sees_alone(backend):
 def test_every_camera_has_the_colours_and_harmonics_that_were_given_for_it(backend):
     for channels in (0, 3):
         row = frames(backend, 3, 3, channels=channels, camera_colors=True)
-        assert_call_is_the_oracles(backend, Call((row,), camera_colors=True))
+        # more cameras than three bits count
+        assert_call_is_the_oracles(backend, Call((row * 3,), camera_colors=True))
         # the second from where the first stands, through a lens of its own
         pose = row[0].scene.camera.viewmat
         moved = dataclasses.replace(row[1], scene=row[1].scene.with_overrides(viewmat=pose))
@@ -235,8 +237,10 @@ def test_packed_rows_of_batch_entries_draw_the_same(backend):
 @law("signature", SIGNATURE, DEPTH)
 def test_the_accumulated_depth_is_the_oracles_alone_and_behind_colours(backend):
     for seed in (0, 1):
-        for mode in ("D", "RGB+D"):
-            assert_call_is_the_oracles(backend, Call((frames(backend, seed),), render_mode=mode))
+        (frame,) = frames(backend, seed)
+        # thousands of units away, too
+        for unit, mode in product((1.0, 2.0**12), ("D", "RGB+D")):
+            assert_call_is_the_oracles(backend, Call(((_in_units(frame, unit),),), render_mode=mode))
 
 
 @law("signature", SIGNATURE, DEPTH)
