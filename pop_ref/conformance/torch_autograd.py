@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -26,15 +27,17 @@ class Ask:
 
     Attributes:
         wanted: names of the arguments that require a gradient.
-        layout: of the arguments in memory: "dense", or one of LAYOUTS.
+        layout: of the arguments in memory: "dense", one of LAYOUTS, or "repeated": each Gaussian's first size along all
+            axes, without memory for the others.
         cotangent: of the outputs: "dense", one of LAYOUTS, "channels", a pixel's first number in all of its channels
             without memory for the others, or "expanded", the first number everywhere likewise.
         outputs: which of "image" and "alpha" have a cotangent.
-        before: what else is done: "nothing", "no_grad" and "inference_mode" draw under torch's mode of that name first,
-            "another" draws another scene between the forward and the backward pass, "twice" goes back twice and draws
-            another scene in between, "present" leaves ones as gradients from before, "edited" changes the arguments in
-            place between the passes, "written" the outputs, "moved" draws the same tensors with other numbers first,
-            and "autocast" draws where torch would have matrix products in half precision.
+        before: what else is done: "nothing"; "no_grad" and "inference_mode" draw twice under torch's mode of that name,
+            the former in another thread, and write to the first image in between; "another" draws another scene between
+            the forward and the backward pass; "twice" goes back twice and draws another scene in between; "present"
+            leaves ones as gradients from before; "edited" changes the arguments in place between the passes, "written"
+            the outputs; "moved" draws the same tensors with other numbers first, and puts these back without autograd's
+            notice; "autocast" draws where torch would have matrix products in half precision.
     """
 
     wanted: tuple[str, ...] = NAMES
@@ -83,6 +86,8 @@ class Laid:
         elif layout == "reversed":
             # rows in an order of their own, of which every second is somebody else's
             base = torch.stack([torch.full_like(value, float("nan")), value], dim=0)
+        elif layout == "repeated":
+            base = value[..., :1].clone()
         else:
             base = value.clone(memory_format=torch.contiguous_format)
         self.base = base.requires_grad_(wanted)
@@ -95,6 +100,8 @@ class Laid:
             return base[3:-2].view(self._shape)
         if self._layout == "sliced":
             return base[..., 0]
+        if self._layout == "repeated":
+            return base.expand(self._shape)
         return base[1] if self._layout == "reversed" else base
 
     @property
@@ -163,7 +170,8 @@ def _differentiate(
         ask: how.
     """
     torch = importlib.import_module("torch")
-    laid = {name: Laid(value, ask.layout, name in ask.wanted) for name, value in values.items()}
+    of = {name: "dense" if ask.layout == "repeated" and name != "scales" else ask.layout for name in values}
+    laid = {name: Laid(value, of[name], name in ask.wanted) for name, value in values.items()}
     arguments = {name: each.view for name, each in laid.items()}
     unsettled: set[str] = set()
 
@@ -178,10 +186,7 @@ def _differentiate(
 
     still = None
     if ask.before in ("no_grad", "inference_mode"):
-        with getattr(torch, ask.before)():
-            still = drawn()[0]
-            # what is drawn after it is no matter of its
-            other()
+        still = _unfollowed(ask.before, drawn, other)
     if ask.before == "moved":
         _moved(laid, values, drawn)
     outputs: dict[str, Any] = dict(zip(("image", "alpha"), drawn(), strict=True))
@@ -203,6 +208,21 @@ def _differentiate(
     )
 
 
+def _unfollowed(mode: str, drawn: Callable[[], Sequence[Any]], other: Callable[[], Any]) -> Any:
+    """Return the second of two images that are drawn under a mode, the first of which is written to."""
+
+    def found() -> Any:
+        with getattr(importlib.import_module("torch"), mode)():
+            drawn()[0].zero_()
+            image = drawn()[0]
+            # what is drawn after it is no matter of its
+            other()
+        return image
+
+    with ThreadPoolExecutor(1) as thread:
+        return thread.submit(found).result() if mode == "no_grad" else found()
+
+
 def _moved(laid: dict[str, Laid], values: dict[str, Any], draw: Callable[[], Any]) -> None:
     """Draw with other numbers in the same tensors, as they are between two steps of an optimizer, and put them back."""
     with importlib.import_module("torch").no_grad():
@@ -215,7 +235,8 @@ def _moved(laid: dict[str, Laid], values: dict[str, Any], draw: Callable[[], Any
     draw()
     with importlib.import_module("torch").no_grad():
         for name, each in laid.items():
-            each.view.copy_(values[name])
+            # as some optimizers write, so that no version of the tensor tells
+            each.view.data.copy_(values[name])
 
 
 def _settings_of_torch() -> dict[str, Any]:

@@ -20,12 +20,19 @@ BEHIND = (0.25, 0.5, 0.75)
 PARAMETERS = ("means", "quats", "scales", "opacities")
 
 
-def _scene(backend):
-    """Return a scene as the backend reads it, its bounds, and cotangents where no decision is near its threshold."""
+def _scene(backend, alike=False):
+    """Return a scene as the backend reads it, its bounds, and cotangents where no decision is near its threshold.
+
+    Args:
+        backend: that reads it.
+        alike: whether every Gaussian has one size along all axes.
+    """
     profile = backend.profile or PAPER
     camera = cameras(1, profile.principal_point == "centred")[0]
     tile_size = None if profile.extent == "square" else 4
     scene = Scene(gaussians(16, degree=2), camera, BEHIND, profile, tile_size)
+    if alike:
+        scene = scene.with_overrides(scales=np.repeat(scene.gaussians.scales[:, :1], 3, axis=1))
     seen, bounds = with_error_bounds(backend, scene)
     v_image, v_T_final = cotangents(seen)
     sure = bounds.smooth
@@ -34,7 +41,7 @@ def _scene(backend):
 
 def _assert_gradients(backend, ask, weight=1.0, plus=0.0, digits=1.0):
     """Hold the gradients of an ask, of cotangents times `digits`, to the oracle's; return what came of it."""
-    seen, bounds, v_image, v_T_final = _scene(backend)
+    seen, bounds, v_image, v_T_final = _scene(backend, ask.layout == "repeated")
     v_image, v_T_final = digits * v_image, digits * v_T_final
     if ask.cotangent == "channels":
         v_image = np.repeat(v_image[..., :1], 3, axis=2)
@@ -76,6 +83,8 @@ def test_an_argument_without_a_gradient_takes_none_from_the_others(backend):
 def test_how_arguments_lie_in_memory_changes_no_gradient(backend):
     for layout in LAYOUTS:
         _assert_gradients(backend, Ask(layout=layout))
+    # how each is added up over axes is autograd's own
+    _assert_gradients(backend, Ask(layout="repeated", wanted=tuple(name for name in NAMES if name != "scales")))
 
 
 @law("autograd", GRADIENTS, "differentiate")
