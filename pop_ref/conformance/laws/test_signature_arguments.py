@@ -255,7 +255,9 @@ def test_the_expected_depth_is_the_accumulated_one_over_the_opacity(backend):
 def test_depth_follows_plain_colours_of_several_cameras(backend):
     # kernels pad channels to the next number that they are compiled for, or take 32 at a time, and depth comes after
     # those that there are
-    for channels, mode in ((3, "RGB+ED"), (4, "RGB+D"), (2, "RGB+ED"), (6, "RGB+D"), (31, "RGB+D"), (32, "RGB+ED")):
+    behind = ((3, "RGB+ED"), (4, "RGB+D"), (2, "RGB+ED"), (6, "RGB+D"), (31, "RGB+D"), (32, "RGB+ED"))
+    # a background of one channel is none of a depth
+    for channels, mode in (*behind, (1, "D"), (1, "ED")):
         assert_call_is_the_oracles(backend, Call((frames(backend, 9, 2, channels=channels),), render_mode=mode))
 
 
