@@ -13,8 +13,8 @@ import numpy as np
 from pop_ref.conformance.assertions import assert_same_bits
 from pop_ref.conformance.calls import Call, Frame
 from pop_ref.conformance.capabilities import (
-    BATCHES,
     ANTIALIASING,
+    BATCHES,
     CAMERA_COLORS,
     CAMERAS,
     CHANNELS,
