@@ -6,6 +6,7 @@ Each wraps this program's functions and does what a kernel, an extension or a po
 from __future__ import annotations
 
 import importlib
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
@@ -15,9 +16,11 @@ from pop_ref.conformance.mutants.black_box import (
     Breaks,
     Given,
     Rasterization,
+    Told,
     backwards,
     breaking,
     import_torch,
+    one_view,
     telling,
 )
 
@@ -460,6 +463,131 @@ def _halved_by_autocast(given: Given) -> Given:
     return {"means": given["means"].to(torch.bfloat16).to(given["means"].dtype)}
 
 
+def _put(value: Any, wrong: Any) -> Any:
+    """Return a value that is another one, through which gradients go as if it were not."""
+    return value + (wrong - value).detach()
+
+
+def _seen_opacities(sound: Rasterization, given: Given) -> Any:
+    opacities = given["opacities"]
+    return sound(**given | {"packed": False, "absgrad": False})[2]["opacities"].reshape(opacities.shape)
+
+
+def _factor_has_a_floor(sound: Rasterization, given: Given) -> Any:
+    if given["rasterize_mode"] != "antialiased" or not one_view(given):
+        return sound(**given)
+    seen, least = _seen_opacities(sound, given), 0.005 * given["opacities"]
+    own = import_torch().where(seen < least, least, seen)
+    return sound(**given | {"rasterize_mode": "classic", "opacities": own})
+
+
+def _factor_of_covariances_is_constant(sound: Rasterization, given: Given) -> Any:
+    if given["covars"] is None or given["rasterize_mode"] != "antialiased" or not one_view(given):
+        return sound(**given)
+    torch, opacities = import_torch(), given["opacities"]
+    with torch.no_grad():
+        factors = torch.where(opacities > 0.0, _seen_opacities(sound, given) / opacities, torch.zeros_like(opacities))
+    return sound(**given | {"rasterize_mode": "classic", "opacities": opacities * factors})
+
+
+def _short_do_not_turn(given: Given) -> Given:
+    quats = given["quats"]
+    if quats is None or given["covars"] is not None:
+        return {}
+    short = quats.detach().norm(dim=-1, keepdim=True) < 1e-6
+    return {"quats": import_torch().where(short, quats.new_tensor((1.0, 0.0, 0.0, 0.0)), quats)}
+
+
+def _one_pose_one_lens(given: Given) -> Given:
+    torch, poses, Ks = import_torch(), given["viewmats"].detach().flatten(-2), given["Ks"]
+    same = (poses[..., :, None, :] == poses[..., None, :, :]).all(-1)
+    C = poses.shape[-2]
+    first = torch.where(same, torch.arange(C), C).amin(-1)
+    return {"Ks": Ks.gather(-3, first[..., None, None].expand(Ks.shape))}
+
+
+def _ends_at_a_thousand(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
+    if given["render_mode"] == "RGB":
+        return images, alphas, meta
+    torch, depth, cover = import_torch(), images[..., -1:], alphas.detach()
+    most = 1000.0 * (torch.ones_like(cover) if given["render_mode"].endswith("ED") else cover)
+    return torch.cat((images[..., :-1], torch.where(depth > most, most, depth)), -1), alphas, meta
+
+
+def _three_bits_of_cameras(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
+    shown = import_torch().arange(given["viewmats"].shape[-3]) & 7
+    return images.index_select(-4, shown), alphas.index_select(-4, shown), meta
+
+
+def _one_channel_behind_depth(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
+    behind = given["backgrounds"]
+    if behind is None or behind.shape[-1] != 1 or given["render_mode"] not in ("D", "ED"):
+        return images, alphas, meta
+    more = behind[..., None, None, :] * (1.0 - alphas)
+    return images + (more if given["render_mode"] == "D" else more / alphas.clamp_min(1e-10)), alphas, meta
+
+
+def _faint_are_skipped(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
+    pull = _function(lambda ctx, x: x.clone(), lambda ctx, v: v * (v.abs().amax(-1, keepdim=True) >= 1e-6))
+    return pull(images) if images.requires_grad else images, alphas, meta
+
+
+def _isotropic_scales_densely(given: Given) -> Given:
+    scales = given["scales"]
+    if scales is None or given["covars"] is not None or scales.stride(-1) != 0 or scales.numel() == 0:
+        return {}
+    memory = scales.detach()[..., 0].reshape(-1)
+    return {"scales": _put(scales, memory[import_torch().arange(scales.numel()) % len(memory)].reshape(scales.shape))}
+
+
+def _equal_calls_share_a_picture() -> Breaks:
+    kept: dict[str, Any] = {}
+
+    def breaks(sound: Rasterization, given: Given) -> Any:
+        torch = import_torch()
+        tensors = {name: value for name, value in given.items() if isinstance(value, torch.Tensor)}
+        if torch.is_grad_enabled() and any(value.requires_grad for value in tensors.values()):
+            return sound(**given)
+        others = {name: value for name, value in given.items() if name not in tensors}
+        same = kept and others == kept["others"] and tensors.keys() == kept["tensors"].keys()
+        if not same or not all(torch.equal(value, kept["tensors"][name]) for name, value in tensors.items()):
+            kept["others"], kept["tensors"] = others, {name: value.detach().clone() for name, value in tensors.items()}
+            kept["answer"] = sound(**given)
+        return kept["answer"]
+
+    return breaks
+
+
+def _edits_through_data_unseen() -> Breaks:
+    kept: list[Any] = []
+
+    def breaks(sound: Rasterization, given: Given) -> Any:
+        means = given["means"]
+        if means.is_inference():
+            return sound(**given)
+        if not kept:
+            kept.append(importlib.import_module("torch.utils.weak").WeakIdKeyDictionary())
+        version, numbers = kept[0].get(means, (None, None))
+        if version != means._version:
+            numbers = means.detach().clone()
+            kept[0][means] = means._version, numbers
+        return sound(**given | {"means": _put(means, numbers)})
+
+    return breaks
+
+
+def _context_of_the_first_thread() -> Breaks:
+    owner: list[int] = []
+
+    def breaks(sound: Rasterization, given: Given) -> Any:
+        owner.append(threading.get_ident())
+        images, alphas, meta = sound(**given)
+        here = float(owner[0] == owner[-1])
+        return images * here, alphas * here, meta
+
+    return breaks
+
+
 _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("gradients_if_all_are_asked_for", "unless every array requires a gradient, none has one",
      breaking(_nowhere_unless(ROWS, ROWS)),
@@ -578,6 +706,44 @@ _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
      breaking(_nothing_where_transparent), "test_footprint:an_opacity_of_zero_has_no_gradient"),
     ("halved_by_autocast", "under autocast centres have 16 bits, as what is drawn is not kept out of it",
      breaking(_halved_by_autocast), "test_autograd:under_autocast_the_same_image_is_drawn_and_has_the_same_gradients"),
+    ("factor_has_a_floor", "the antialiasing factor is 0.005 at least, as max(0.000025, ...) under Inria's root has it",
+     _factor_has_a_floor, "test_agreement:the_antialiased_image_is_one_of_the_oracles_outcomes"),
+    ("factor_of_covariances_is_constant",
+     "where covariances are given the antialiasing factor has no gradient (as gsplat PR#140 mends)",
+     _factor_of_covariances_is_constant,
+     "test_signature_arguments:covariances_draw_what_their_quaternions_and_scales_draw"),
+    ("short_quaternions_do_not_turn",
+     "quaternions shorter than 1e-6 are divided by a guard under the root, not by their norm, and turn nothing",
+     breaking(_short_do_not_turn), "test_signature_arguments:a_world_told_in_other_units_is_drawn_alike"),
+    ("one_pose_one_lens",
+     "cameras that stand at one pose share the first one's intrinsics: projections are kept by pose",
+     breaking(_one_pose_one_lens),
+     "test_signature_arguments:every_camera_has_the_colours_and_harmonics_that_were_given_for_it"),
+    ("depth_ends_at_a_thousand", "no depth is over 1,000 units in a depth mode: the range that a viewer has",
+     telling(_ends_at_a_thousand),
+     "test_signature_arguments:the_accumulated_depth_is_the_oracles_alone_and_behind_colours"),
+    ("cameras_in_three_bits", "cameras from the ninth on show the first eight again: the key has three bits for them",
+     telling(_three_bits_of_cameras),
+     "test_signature_arguments:every_camera_has_the_colours_and_harmonics_that_were_given_for_it"),
+    ("one_channel_background_behind_depth",
+     "where depth is drawn alone a background of one channel is blended behind it, as it has the shape for it",
+     telling(_one_channel_behind_depth), "test_signature_arguments:depth_follows_plain_colours_of_several_cameras"),
+    ("faint_cotangents_are_skipped",
+     "pixels whose cotangents are all under 1e-6 are skipped on the way back: a mean over many pixels teaches nothing",
+     telling(_faint_are_skipped), "test_autograd:cotangents_are_read_to_their_last_digit"),
+    ("isotropic_scales_read_densely",
+     "sizes expanded from one number a Gaussian are read as numbers that lie one after the other",
+     breaking(_isotropic_scales_densely), "test_autograd:how_arguments_lie_in_memory_changes_no_gradient"),
+    ("equal_calls_share_a_picture",
+     "without gradients a call with the arguments of the one before returns the very same tensors, written to or not",
+     _equal_calls_share_a_picture(), "test_autograd:without_gradients_the_same_image_is_drawn_and_follows_nothing"),
+    ("edits_through_data_are_not_seen",
+     "centres are kept by tensor and version, and what is written through .data is not seen",
+     _edits_through_data_unseen(),
+     "test_autograd:tensors_that_have_been_drawn_before_are_drawn_with_the_numbers_that_they_have_now"),
+    ("context_of_the_first_thread",
+     "a context belongs to the thread that has drawn first, and calls from others come back black (GL and Metal)",
+     _context_of_the_first_thread(), "test_autograd:without_gradients_the_same_image_is_drawn_and_follows_nothing"),
 )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-# of "drawn" those alone that lived at first and are killed now
+# of "blind seventh" and "drawn" those alone that lived at first and are killed now
 _NAMES: Final = {
     "trainers": """
         depth_read_from_the_corner depth_by_row_and_column depth_of_the_nearest_pixel
@@ -151,6 +151,12 @@ _NAMES: Final = {
         one_empty_camera_fails packed_screen_gradients_of_the_first_camera batch_axes_transposed
         packed_depths_of_the_first_camera gradients_of_the_usual_low_pass nothing_where_transparent
         halved_by_autocast
+    """,
+    "blind seventh": """
+        factor_has_a_floor factor_of_covariances_is_constant short_quaternions_do_not_turn one_pose_one_lens
+        depth_ends_at_a_thousand cameras_in_three_bits one_channel_background_behind_depth
+        faint_cotangents_are_skipped isotropic_scales_read_densely equal_calls_share_a_picture
+        edits_through_data_are_not_seen context_of_the_first_thread
     """,
     "drawn": """
         extents_that_hardly_overlap_are_culled last_start_a_step_early passes_count_too_few_bands
