@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -76,7 +77,52 @@ def calls() -> dict[str, Call]:
         "covariances_under_a_wide_low_pass": seen(46, 2, covars=True, eps2d=1.25),
         "packed_depth": seen(47, 3, "D", packed=True),
         "packed_screen_centres_of_three_cameras": seen(48, 3, packed=True, degree=2),
+        **_beyond_the_usual(seen, reader),
     }
+
+
+def _beyond_the_usual(seen: Callable[..., Call], reader: Adapter) -> dict[str, Call]:
+    """Return calls of more cameras, farther away, of smaller numbers than scenes usually have."""
+    return {
+        "nine_cameras": _thrice(seen(49, 3, degree=2, camera_colors=True)),
+        "cameras_at_one_place": _at_one_place(seen(50, 2)),
+        "short_quaternions": _told_in_units(seen(51, 2), quats=2.0**-24),
+        "thousands_of_units_away": _told_in_units(seen(52, 2, "RGB+D"), lengths=2.0**12),
+        "covariances_of_one_camera": seen(53, 1, covars=True, antialiased=True),
+        "a_background_of_one_channel": seen(54, 2, "ED", channels=1),
+        "specks": Call(((Frame(reader.sees(_specks())),),)),
+    }
+
+
+def _thrice(call: Call) -> Call:
+    """Return a call of every camera three times."""
+    return replace(call, frames=(3 * call.frames[0],))
+
+
+def _at_one_place(call: Call) -> Call:
+    """Return a call whose second camera stands where the first one does, and has a lens of its own."""
+    first, second = call.frames[0]
+    moved = replace(second, scene=second.scene.with_overrides(viewmat=first.scene.camera.viewmat))
+    return replace(call, frames=((first, moved),))
+
+
+def _told_in_units(call: Call, quats: float = 1.0, lengths: float = 1.0) -> Call:
+    """Return a call with quaternions, and lengths of the world, times powers of two: its pictures are the same."""
+    frames = []
+    for frame in call.frames[0]:
+        scene, g = frame.scene, frame.scene.gaussians
+        viewmat = scene.camera.viewmat.copy()
+        viewmat[:3, 3] *= lengths
+        told = {"quats": quats * g.quats, "means": lengths * g.means, "scales": lengths * g.scales}
+        frames.append(replace(frame, scene=scene.with_overrides(**told, viewmat=viewmat)))
+    return replace(call, frames=(tuple(frames),))
+
+
+def _specks() -> Scene:
+    """Return white specks in a row, which antialiasing dims to little more than an alpha that is skipped."""
+    camera = _camera()
+    one = Record(5.5, 4.5, size=(0.0375, 0.0375, 0.0375), opacity=0.9375, sh=((1.5, 1.5, 1.5),))
+    return Scene(pack([replace(one, depth=2.0 + k) for k in range(12)], camera), camera, antialiased=True)
 
 
 def _few(call: Call, n: int) -> Call:
