@@ -1,6 +1,6 @@
 """Every condition and bound of the oracle and of the program, broken by itself: how many do the kit's laws notice?
 
-    python -m benchmarks.conditions --work out/conditions     # hours; goes on where it was stopped
+    python -m benchmarks.conditions --work out/conditions     # hours; goes on with what the JSON does not know
     python -m benchmarks.conditions                           # what the JSON says
 
 What is broken: a clause of a condition is left out, a condition holds always or never, a filter of a comprehension lets
@@ -192,12 +192,13 @@ def trial(work: Path, share: tuple[int, int], examples: int) -> None:
         examples: of each law; what lived with fewer, and is not known to change nothing, is tried again.
     """
     kept, known = work / f"conditions_{share[0]}_of_{share[1]}.json", read_json(RESULTS).get("lives", {})
+    before_this = _all_tried(work)
     tried, by_file = read_json(kept), defaultdict[str, Counter[str]](Counter)
-    for name, how in _all_tried(work).items():
+    for name, how in before_this.items():
         by_file[name.split(":")[0]][how["by"].split(": ")[0]] += 1
     # shuffled, so that what has been tried is a sample of all
     for site in random.Random(1).sample(sites(), len(sites()))[share[0] :: share[1]]:
-        before = tried.get(site.name)
+        before = before_this.get(site.name)
         if before is not None and (
             before["by"] or before["examples"] >= examples or "changes nothing" in known.get(site.name, {})
         ):
@@ -220,7 +221,10 @@ def _unlikely(path: str, file: str) -> bool:
 
 
 def _all_tried(work: Path) -> dict[str, dict[str, Any]]:
-    tried: dict[str, dict[str, Any]] = {}
+    """Return what became of every fault that the JSON or a file of `work` knows."""
+    results = read_json(RESULTS)
+    tried = {name: {"by": "a law", "examples": FEW} for name in results.get("died", [])}
+    tried |= {name: {"by": "", "examples": FEW} for name in results.get("lives", {})}
     for kept in sorted(work.glob("conditions_*.json")):
         tried |= read_json(kept)
     return tried
@@ -239,7 +243,8 @@ def gathered(work: Path) -> dict[str, Any]:
         for package in FILES
     }
     lives = {name: known.get(name, {}) for name, how in tried.items() if not how["by"]}
-    return {**counts, "lives": lives, "commit": commit(ROOT)}
+    died = sorted(name for name, how in tried.items() if how["by"])
+    return {**counts, "lives": lives, "died": died, "commit": commit(ROOT)}
 
 
 def told(found: dict[str, Any]) -> list[str]:

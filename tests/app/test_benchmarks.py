@@ -449,6 +449,7 @@ def test_of_conditions_the_page_says_what_the_trial_found() -> None:
     assert set(CONDITIONS["lives"]) <= names, "the sources have changed: try those anew"
     shares = re.findall(r"(\d+) of (\d+) die", "\n".join(conditions.told(CONDITIONS)))
     died, faults = (sum(int(share[k]) for share in shares) for k in range(2))
+    assert died == len(CONDITIONS["died"])
     said = f"{died} of {faults} ({100 * died / faults:.0f} %"
     assert said in (ROOT / "docs" / "kit.md").read_text(encoding="utf-8"), said
 
