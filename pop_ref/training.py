@@ -235,10 +235,25 @@ def train_step(
     seen = (found.v_means2d, found.visible, found.dominant_counts, camera.width, camera.height)
     kept = None if mask is None else int(np.sum(mask))
     statistics = accumulate(state.statistics, *seen, recipe.density, kept)
+    waiting = _still_waiting(waiting, rows, step, recipe.density)
     rows, statistics = control(rows, statistics, scene_scale, step, normals, recipe.density)
-    # rows that wait are not those of Gaussians that have been edited
-    waiting = {} if densifies_at(step, recipe.density) else waiting
     return Training(rows, statistics, step + 1, waiting), found.loss
+
+
+def _still_waiting(
+    waiting: Mapping[str, np.ndarray], rows: Rows, step: int, config: DensityConfig
+) -> Mapping[str, np.ndarray]:
+    """Return the gradients that wait after a step's edits: those of Gaussians that are left, none where some grow."""
+    if densifies_at(step, config):
+        return {}
+    if step != config.final_prune_iter:
+        return waiting
+    rows = reset_opacities(rows, config.reset_opa) if resets_at(step, config) else rows
+    return {name: array[~_faint_at_last(rows, config)] for name, array in waiting.items()}
+
+
+def _faint_at_last(rows: Rows, config: DensityConfig) -> np.ndarray:
+    return opacities_from_logits(rows.params["opacities"]) < config.final_prune_opa
 
 
 def _add_regularizers(
@@ -436,6 +451,6 @@ def control(
     if resets_at(step, config):
         rows = reset_opacities(rows, config.reset_opa)
     if step == config.final_prune_iter:
-        faint = opacities_from_logits(rows.params["opacities"]) < config.final_prune_opa
+        faint = _faint_at_last(rows, config)
         rows, statistics = prune_rows(rows, faint), zero_statistics(len(rows) - int(np.sum(faint)))
     return rows, statistics

@@ -389,12 +389,27 @@ def foot_of(scale: str, results: Sequence[Result], averaged: bool = True) -> lis
         for r in results
     }
     steps = sorted({int(r.schedule["max_steps"]) for r in results})
-    seeds = sorted({r.seed for r in results})
     of_them = "Capture" if len(sizes) == 1 else "Mean over" if averaged else "Captures"
     captures = f"{of_them} {_listed(sizes.values())}"
     length = " to ".join(f"{n:,}" for n in dict.fromkeys((steps[0], steps[-1])))
-    seeded = f"seed {seeds[0]}" if len(seeds) == 1 else f"mean over seeds {_listed(map(str, seeds))}"
-    return [f"{captures}; {length} steps; {seeded}.", scale_sentence(scale)]
+    return [f"{captures}; {length} steps; {_seeded(results)}.", scale_sentence(scale)]
+
+
+def _seeded(results: Sequence[Result]) -> str:
+    """Say what results are means over: the same seeds each, or some of these."""
+    of_each: dict[tuple[str, str], set[int]] = {}
+    for r in results:
+        of_each.setdefault((r.row, r.scene), set()).add(r.seed)
+    seeds = _listed(map(str, sorted(set().union(*of_each.values()))))
+    counts = sorted({len(each) for each in of_each.values()})
+    if any(each != next(iter(of_each.values())) for each in of_each.values()):
+        many = (
+            "one seed"
+            if counts == [1]
+            else f"means over {' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} seeds"
+        )
+        return f"{many} each, of {seeds}"
+    return f"seed {seeds}" if counts == [1] else f"mean over seeds {seeds}"
 
 
 def scale_sentence(scale: str) -> str:

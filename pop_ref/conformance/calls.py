@@ -66,6 +66,7 @@ class Call:
         planes: near_plane, far_plane and eps2d where they are not the profile's.
         covars: whether covariances are given instead of quaternions and scales.
         overruled: with covariances, whether quaternions and scales of other Gaussians are given, too.
+        expanded: whether an argument that is the same in all batch entries has memory for the first alone.
         no_background: whether the argument is left out; scenes are then black behind.
         sparse_grad: as gsplat's.
         absgrad: likewise, where gradients are asked for.
@@ -81,6 +82,7 @@ class Call:
     planes: dict[str, float] = field(default_factory=dict)
     covars: bool = False
     overruled: bool = False
+    expanded: bool = False
     no_background: bool = False
     sparse_grad: bool = False
     absgrad: bool = True
@@ -196,6 +198,7 @@ class Call:
             "rasterize_mode='antialiased'": self.antialiased,
             "covars": self.covars and not self.overruled,
             "covars, quats and scales": self.overruled,
+            "entries without memory of their own": self.expanded,
             f"radius_clip={self.radius_clip:g}": self.radius_clip > 0.0,
             **{f"{name}={value:g}": True for name, value in self.planes.items()},
             f"tile_size={self.tile_size}": self.tile_size != 16,
@@ -220,7 +223,7 @@ def call_as_code(call: Call) -> str:
 def simpler_calls(call: Call) -> Iterator[Call]:
     """Yield the calls that have one argument fewer away from gsplat's defaults."""
     if call.batch:
-        yield from (replace(call, frames=(row,), batch=()) for row in call.frames)
+        yield from (replace(call, frames=(row,), batch=(), expanded=False) for row in call.frames)
     count = len(call.frames[0])
     if count > 1:
         yield from (replace(call, frames=tuple((row[c],) for row in call.frames)) for c in range(count))
@@ -233,7 +236,7 @@ def simpler_calls(call: Call) -> Iterator[Call]:
         behind = np.zeros(3) if call.no_background else np.array([0.25, 0.5, 0.75])
         yield _each_frame(call, lambda f: Frame(f.scene.with_overrides(background=behind), None, f.blind))
     for name, default in (("packed", False), ("render_mode", "RGB"), ("overruled", False), ("covars", False),
-                          ("radius_clip", 0.0), ("sparse_grad", False), ("dominance", False),
+                          ("expanded", False), ("radius_clip", 0.0), ("sparse_grad", False), ("dominance", False),
                           ("absgrad", False)):  # fmt: skip
         if getattr(call, name) != default and not (
             (name == "packed" and call.sparse_grad) or (name == "covars" and call.overruled)

@@ -337,7 +337,7 @@ class TorchAdapter(Adapter):
         if self._rasterization is None:
             raise LookupError(f"{self.name} has no rasterization function")
         pulls, (B, C, _), camera = v_images is not None, call.shape, call.first.scene.camera
-        leaves = {name: self._tensor(value).requires_grad_(pulls) for name, value in call.tensors().items()}
+        leaves = {name: self._entries(call, value).requires_grad_(pulls) for name, value in call.tensors().items()}
         images, alphas, meta = self._rasterization(
             **{name: self._tensor(value) for name, value in call.without_gradients().items()} | leaves,
             Ks=self._tensor(call.intrinsics()),
@@ -364,6 +364,13 @@ class TorchAdapter(Adapter):
                 gradients |= {name: value for name, value in rows.items() if value is not None}
         shown = {name: self._array(meta[name]) for name in meta if meta[name] is not None}
         return Called(self._array(images), self._array(alphas), shown, gradients)
+
+    def _entries(self, call: Call, value: np.ndarray) -> Any:
+        """Return an argument of a call; expanded, if it is the same in all batch entries and the call asks for that."""
+        first = value[(slice(0, 1),) * len(call.batch)]
+        if call.expanded and np.array_equal(np.broadcast_to(first, value.shape), value):
+            return self._tensor(first).expand(value.shape)
+        return self._tensor(value)
 
     def _asked_by(self, call: Call) -> dict[str, Any]:
         """Return the arguments of a call that are not at gsplat's defaults, and the profile where one is taken."""

@@ -295,6 +295,11 @@ def test_the_note_says_captures_steps_seeds_and_whether_it_is_the_protocol():
         "Capture fox (270 × 480); 10,000 steps; mean over seeds 42 and 43. Scale small, not the paper's protocol: real "
         "photographs for a CPU: the whole schedule, small images, theta_blur at least 10 pixels."
     )
+    of_rows = [*runs, result("gsplat", seed=44, schedule=STEPS)]
+    said = foot(asked("7", of_rows), choose(asked("7", of_rows), ["pop", "gsplat"], ["fox"]))
+    assert "; means over 1 to 2 seeds each, of 42, 43 and 44." in said
+    said = foot(asked("7", of_rows), choose(asked("7", of_rows[1:]), ["pop", "gsplat"], ["fox"]))
+    assert "; one seed each, of 43 and 44." in said
     ours = [result("pop", "bicycle", scale="paper", schedule=STEPS)]
     said = foot(asked("7", ours, scale="paper"), choose(asked("7", ours, scale="paper"), ["pop"], ["bicycle", "room"]))
     assert said.endswith("Scale paper: the published protocol. Not every row was run on room.")

@@ -219,6 +219,9 @@ def test_batch_entries_do_not_know_of_each_other(backend):
     # in the order of the first axis, then of the second
     squared = tuple(frames(backend, 4 + entry, entry=entry) for entry in range(4))
     assert_call_is_the_oracles(backend, Call(squared, batch=(2, 2)))
+    # the same Gaussians for other cameras, in the memory of one entry
+    alike = tuple(frames(backend, 4, 2, entry=entry) for entry in range(2))
+    assert_call_is_the_oracles(backend, Call(alike, batch=(2,), expanded=True))
 
 
 @law("signature", SIGNATURE, PACKED, CAMERAS)

@@ -34,6 +34,7 @@ from pop_ref.conformance.vector_steps import (
     MASKED,
     OF_METHODS,
     ORDER,
+    OUTLASTED,
     PRIOR,
     PRUNED,
     REWOUND,
@@ -65,6 +66,7 @@ def test_every_step_is_the_oracles_under_every_setting(backend):
 def test_every_step_is_the_oracles_under_every_rule_of_updates(backend):
     for short in (WAITING, *BANDS):
         _assert_steps(backend, short)
+    assert "pruned" in _assert_steps(backend, OUTLASTED)
     assert "cloned" in _assert_steps(backend, REWOUND)
 
 
