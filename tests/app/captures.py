@@ -1,4 +1,4 @@
-"""Small captures (COLMAP models by pycolmap, transforms.json, cameras as other programs export them) and small splats."""
+"""Small captures: COLMAP models by pycolmap, transforms.json, cameras as other programs export them; and splats."""
 
 from __future__ import annotations
 
