@@ -4,7 +4,7 @@
     python benchmarks/sizes.py out/fox out/bonsai --budgets --json benchmarks/results/budgets.json
 
 Every file is written by `pop export` and measured by `pop eval`, as a user would. A result of the same capture that the
-JSON already holds is replaced, others are kept. `docs/formats.py` makes the tables of docs/FORMATS.md from it.
+JSON already holds is replaced, others are kept. `python docs/tables.py --write` puts the tables into docs/FORMATS.md.
 
 A budget is a tenth and a twentieth of the PLY's bytes. For every format and budget: fewer Gaussians alone, those of the
 highest sensitivity, found by the search that export used before it had budgets; `--target-mb --fine-tune-steps 0`,
@@ -27,7 +27,7 @@ from typing import Any, Final
 
 import torch
 
-from benchmarks.record import machine, read_json, write_json
+from benchmarks.record import machine, markdown, read_json, write_json
 from pop_fast.children import module_command
 from pop_fast.cli.options import LimitOptions
 from pop_fast.data import to_capture_frame
@@ -38,6 +38,7 @@ from pop_fast.train.compact import TRIAL, Tuner
 from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
 from pop_fast.train.views import ViewTensors, evenly
 
+RESULTS: Final = Path(__file__).resolve().parent / "results"
 PLY_BYTES: Final = 248
 # of all blending weights, what --final-prune takes away
 SHARES: Final = (0.0, 0.002, 0.003)
@@ -46,6 +47,8 @@ _NAMES: Final = tuple(name for name in FORMATS if name not in ("gltf", "gltf-spz
 BUDGETS: Final = (10, 20)
 # training views that Gaussians are scored over, at most, as by `pop export`
 _SCORED: Final = 100
+# of `Format.losses`
+_FIELDS: Final = ("centre", "scale", "rotation", "opacity", "colour", "view dependence")
 
 
 def pop(*arguments: str) -> None:
@@ -146,6 +149,66 @@ def within_budgets(result: Path, whole: dict[str, Any], names: list[str]) -> Ite
     for row in rows_of_budgets(result, names, steps):
         entry["rows"].append(row)
         yield entry
+
+
+def formats_table() -> str:
+    """Make the table of file formats: what each is called, takes and is opened by."""
+    rows = [
+        ["`ply`", "`.ply`", "PLY as 3DGS writes it", "248", "248", "every program that knows splats"],
+        *(
+            [f"`{f.name}`", f"`{f.suffix}`", f"{f.title}, `{f.source.removeprefix('https://')}`", *f.size, f.readers]
+            for f in FORMATS.values()
+        ),
+        ["`html`", "`.html`", "a page that shows the splat", "4/3 of `spz`", "4/3 of `spz`", "browsers with WebGL 2"],
+    ]
+    return markdown(["format", "suffix", "what it is", "bytes a Gaussian, degree 0", "degree 3", "opened by"], rows)
+
+
+def losses_table() -> str:
+    """Make the table of what each format rounds."""
+    rows = [["`ply`", *["none"] * len(_FIELDS)]]
+    rows += [[f"`{f.name}`", *(f.losses[field] for field in _FIELDS)] for f in FORMATS.values()]
+    return markdown(["format", *_FIELDS], rows)
+
+
+def sizes_table() -> str:
+    """Make the table of every capture in every format, whole and pruned, as it was measured."""
+    found = read_json(RESULTS / "sizes.json")
+    captures, each = found["captures"], found["ply_bytes"]
+    shares = sorted({row["final_prune"] for of in captures.values() for row in of["rows"]})
+    head = ["capture", "format", *(f"`--final-prune {share:g}`" if share else "whole" for share in shares)]
+    rows, sources = [], []
+    for name, of in captures.items():
+        whole = of["gaussians"] * each
+        sources.append(f"{name}, {of['gaussians']:,} Gaussians, {whole / 1e6:.2f} MB as PLY, {of['psnr']:.2f} dB")
+        cells = {
+            (row["format"], row["final_prune"]): f"{row['bytes'] / 1e6:.2f} MB, 1/{whole / row['bytes']:.1f}, "
+            f"{row['psnr'] - of['psnr']:+.2f} dB"
+            for row in of["rows"]
+        }
+        formats = dict.fromkeys(row["format"] for row in of["rows"])
+        rows += [[name, f"`{format}`", *(cells[format, share] for share in shares)] for format in formats]
+    return f"The whole splats are {'; '.join(sources)}.\n\n{markdown(head, rows)}"
+
+
+def budgets_table() -> str:
+    """Make the table of captures within budgets: by fewer Gaussians, by rounding too, and tuned."""
+    rows = []
+    for name, found in read_json(RESULTS / "budgets.json")["captures"].items():
+        for row in found["rows"]:
+            cells = [f"{row[kind]['psnr'] - found['psnr']:+.2f} dB" for kind in ("fewer", "spent", "tuned")]
+            rows.append([name, f"`{row['format']}`", f"{row['bytes'] / 1e6:.2f} MB, 1/{row['share']}", *cells])
+    steps = f"and tuned, {read_json(RESULTS / 'budgets.json')['steps']} steps"
+    return markdown(["capture", "format", "bytes", "fewer Gaussians alone", "harmonics and digits too", steps], rows)
+
+
+def tuned_table() -> str:
+    """Make the table of the same captures whole, as they were and tuned."""
+    rows = [
+        [name, str(of["factor"]), f"{of['gaussians']:,}", f"{of['psnr']:.2f}", f"{of['psnr_tuned']:.2f}"]
+        for name, of in read_json(RESULTS / "budgets.json")["captures"].items()
+    ]
+    return markdown(["capture", "photographs shrunk by", "Gaussians", "PSNR, dB", "tuned, dB"], rows)
 
 
 def main() -> int:

@@ -20,7 +20,7 @@ from benchmarks import blocks as run_in_blocks
 from benchmarks import estimates as predictions
 from benchmarks import few_photographs as with_few
 from benchmarks import kinds as kinds_of_captures
-from benchmarks import results_table
+from benchmarks import results_table, sizes
 from benchmarks.record import markdown as table
 from benchmarks.record import read_json
 from paper_repro.jobs import load_row
@@ -493,6 +493,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "kinds": kinds,
     **{name: getattr(results_table, name) for name in ("fuzzed", "disturbed", "sanitized", "loads")},
     "blocks": run_in_blocks.table,
+    **{name: getattr(sizes, f"{name}_table") for name in ("formats", "losses", "sizes", "budgets", "tuned")},
     "recipes": recipes,
     "methods": methods,
     "reproduction": reproduction,

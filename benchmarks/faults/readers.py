@@ -1,6 +1,6 @@
 """Every reader of the program, with the file of the corpus that is mutated for it.
 
-A test (`tests/meta/test_readers.py`) runs all of them on the sound files and holds what they have opened to what the
+A test (`tests/app/test_faults.py`) runs all of them on the sound files and holds what they have opened to what the
 program's source opens: a new function that reads a file needs a reader here.
 """
 

@@ -1,7 +1,8 @@
 """Every unit of C++ under sanitizers: of the compiled backend and of the kernels' emulator.
 
 Two libraries are made of the compiled backend, one for AddressSanitizer and UndefinedBehaviorSanitizer, one for
-ThreadSanitizer. The first also counts which lines ran, so that a unit that nothing calls is a failure.
+ThreadSanitizer. The first also counts which lines ran, so that a unit that nothing calls is a failure. Each is used by
+a child, which is this module run by its name.
 """
 
 from __future__ import annotations
@@ -11,16 +12,32 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+import torch
+
 import cuda_ext
+import pop_fast.compiled
 from cuda_ext.host import emulate
 from cuda_ext.toolkit import find_compiler
+from pop_fast import rasterization
+from pop_fast.api.backends import COMPILED
 from pop_fast.children import module_command
+from pop_fast.compiled import build, library
 from pop_fast.compiled.build import CUDA, HERE, SHARED, SOURCES, UNITS
+from pop_fast.compiled.native_step import NativeTrainer
+from pop_fast.data.load import load_capture
+from pop_fast.stages.stage_set import PassInput
+from pop_fast.stages.types import Camera, Gaussians
+from pop_fast.train import TrainConfig, TrainingRun
+from pop_ref.conformance.corpus import PLANS, corpus_scene
+from pop_ref.constants import PAPER
+
+from .corpus import HERE as CORPUS
 
 ROOT = Path(__file__).resolve().parents[2]
 CUDA_EXT = Path(cuda_ext.__file__).resolve().parent
@@ -40,7 +57,7 @@ class Check:
         sources: all that its text depends on.
         flags: of the compiler.
         runtime: the sanitizers' library, which must be loaded before all others.
-        use: what `sanitized_child` does with it, told the library by `POP_SANITIZED`.
+        use: what the child does with it, told the library by `POP_SANITIZED`.
         about: the sanitizers, in words.
     """
 
@@ -77,7 +94,9 @@ EMULATION: Final = "kernels under the emulator"
 EMULATED: Final = (emulate.HERE / "emulator.cpp", CUDA_EXT / "bindings.cpp")
 # its fibers switch stacks, which AddressSanitizer must not follow
 _EMULATED_FLAGS: Final = "-fsanitize=address --param asan-stack=0"
-_EMULATED_TESTS: Final = tuple(f"tests/cuda/gpu/test_{name}.py" for name in ("smoke", "ten_steps"))
+_EMULATED_TESTS: Final = "tests/cuda/gpu/test_ten_steps.py"
+# that the native step knows, and whose passes call every function of scores.cpp between them
+METHODS = ("pop", "gsplat", "3dgs", "taming", "pup", "mini-splatting", "speedy-splat")
 # Python keeps what it has, and asks for much at once
 _OPTIONS: Final = {
     "ASAN_OPTIONS": "detect_leaks=0:allocator_may_return_null=1",
@@ -138,7 +157,7 @@ def _checked(check: Check, compile_first: bool) -> dict[str, Any]:
         _compile(compiler, check)
     for counts in target.parent.glob("*.gcda"):
         counts.unlink()
-    words = module_command("benchmarks.faults.sanitized_child", check.use)
+    words = module_command("benchmarks.faults.sanitizers", check.use)
     told, failures = _ran(words, check, compiler, {"POP_SANITIZED": str(target)})
     return {"about": check.about, "told": told, "lines": _lines(check), "failures": failures}
 
@@ -192,6 +211,94 @@ def _emulated(compile_first: bool) -> dict[str, Any]:
     if reason is not None:
         return {"about": about, "skipped": reason, "failures": []}
     check, compiler = CHECKS["compiled backend"], find_compiler() or []
-    words = module_command("pytest", "-q", "-p", "no:cacheprovider", *_EMULATED_TESTS)
+    words = module_command("pytest", "-q", "-p", "no:cacheprovider", _EMULATED_TESTS)
     told, failures = _ran(words, check, compiler, {"POP_EMULATED_FLAGS": _EMULATED_FLAGS, "POP_CUDA_ON": "emulated"})
     return {"about": about, "told": told[-1:], "failures": failures}
+
+
+def main() -> None:
+    """In a process of its own: put the library of `POP_SANITIZED` in the compiled one's place, and use all of it."""
+    what, path = sys.argv[1], Path(os.environ["POP_SANITIZED"])
+    _use(path, threads=4 if what == "threads" else 2, steps=24 if what == "threads" else 40)
+    loaded = Path("/proc/self/maps").read_text()
+    if str(path) not in loaded or "/_blend_" in loaded:
+        raise SystemExit("another library than the sanitized one was used")
+
+
+def _use(path: Path, threads: int, steps: int) -> None:
+    build.library_path = library.library_path = lambda: path  # type: ignore[assignment]
+    # threads of torch's OpenMP wait for one another where no sanitizer sees it: those of the library are its own
+    library._fork = lambda: None
+    if pop_fast.compiled.why_not() is not None:
+        raise SystemExit("the sanitized library is not loaded")
+    torch.set_num_threads(threads)
+    drawn = sum(_draw(name, dtype) for name in PLANS for dtype in (torch.float32, torch.float64))
+    print(f"{drawn} renders with gradients and all passes")
+    capture = load_capture(str(CORPUS / "colmap"))
+    print(f"{sum(_train(capture, method, threads, steps) for method in METHODS)} training steps in C++")
+
+
+def _train(capture: object, method: str, threads: int, steps: int) -> int:
+    plan = {"refine_start_iter": 2, "refine_every": 5, "grow_grad2d": 1e-6}
+    config = TrainConfig.of(
+        method=method,
+        preset="paper",
+        steps_scaler=steps / 30_000,
+        backend="compiled",
+        threads=threads,
+        ssim_padding="same",
+        test_every=3,
+        progress=False,
+        **{f"{method}.{name}": value for name, value in plan.items()},
+    )
+    run = TrainingRun(config, capture)  # type: ignore[arg-type]
+    while run.step < config.max_steps:
+        run.take_steps(run.step + 1)
+    fused = getattr(run.stepper, "fused", None)
+    if not isinstance(fused, NativeTrainer):
+        raise SystemExit(f"{method} was not trained by the native step")
+    if method == "pop" and not fused.counts()["entries"]:
+        raise SystemExit("the last step had nothing to do")
+    return run.step
+
+
+def _draw(name: str, dtype: torch.dtype) -> int:
+    scene = corpus_scene(name)
+    gaussians, camera = scene.gaussians, scene.camera
+
+    def tensor(array: object) -> torch.Tensor:
+        return torch.as_tensor(array, dtype=dtype)
+
+    inputs = [
+        tensor(getattr(gaussians, key)).requires_grad_() for key in ("means", "quats", "scales", "opacities", "sh")
+    ]
+    degree = int(gaussians.sh.shape[1] ** 0.5) - 1
+    image, alpha, _ = rasterization(
+        **dict(zip(("means", "quats", "scales", "opacities", "colors"), inputs, strict=True)),
+        viewmats=tensor(camera.viewmat)[None],
+        Ks=tensor(camera.K)[None],
+        width=camera.width,
+        height=camera.height,
+        sh_degree=degree,
+        backend="compiled",
+        packed=False,
+        dominance=True,
+    )
+    (image.square().sum() + alpha.sum()).backward()
+    if not all(torch.isfinite(one.grad).all() for one in inputs if one.grad is not None):
+        raise SystemExit(f"{name}: a gradient is not finite")
+    view = Camera(tensor(camera.viewmat), tensor(camera.K), camera.width, camera.height)
+    shot = PassInput(
+        Gaussians(*(one.detach() for one in inputs)), view, degree, torch.zeros(3, dtype=dtype), PAPER, False
+    )
+    passes = COMPILED.open_view(shot)
+    passes.contributions(None)
+    passes.contributions(torch.ones((camera.height, camera.width), dtype=dtype))
+    passes.sensitivities()
+    passes.fisher_blocks()
+    passes.dominant_points()
+    return 1
+
+
+if __name__ == "__main__":
+    main()

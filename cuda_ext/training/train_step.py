@@ -170,11 +170,6 @@ class FusedTrainer:
         return {size: frame.render_stats for size, frame in self._frames.items()}
 
     @property
-    def capacities(self) -> dict[Size, int]:
-        """How many list entries have room, by the image sizes that were drawn since `rebind`."""
-        return {size: frame.lists.capacity for size, frame in self._frames.items()}
-
-    @property
     def _population(self) -> RowBuffers:
         assert self._rows is not None
         return self._rows

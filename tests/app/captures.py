@@ -1,4 +1,4 @@
-"""Write small captures: COLMAP models by pycolmap, transforms.json, and cameras as other programs export them."""
+"""Small captures: COLMAP models by pycolmap, transforms.json, cameras as other programs export them; and splats."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from pop_fast.data import Capture, load_capture
 from pop_fast.errors import PopError
@@ -218,6 +220,23 @@ def realitycapture(capture: Capture, source: Path, folder: Path) -> Path:
         lines.append(",".join([view.name, *map(repr, numbers)]))
     (folder / "cameras.csv").write_text("\n".join(lines) + "\n")
     return folder
+
+
+def many(n: int, bands: int = 15, seed: int = 0) -> dict[str, Tensor]:
+    """Make raw parameters of many Gaussians, most of them near the origin."""
+    random = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(shape, generator=random)
+
+    return {
+        "means": 2.0 * normal(n, 3),
+        "scales": normal(n, 3) - 4.0,
+        "quats": normal(n, 4),
+        "opacities": 3.0 * normal(n),
+        "sh0": normal(n, 1, 3).clamp(-1.7, 1.7),
+        "shN": (0.2 * normal(n, bands, 3)).clamp(-0.9, 0.9),
+    }
 
 
 def assert_one_line(call: Callable[[], object], *words: str) -> str:

@@ -37,7 +37,7 @@ from pop_fast.train.preflight import facts, find_warnings
 from pop_fast.train.views import ViewTensors, render_view
 from tests.app.conftest import TRAIN, Pop, in_a_child
 from tests.app.damage import says
-from tests.app.drift import drift_engine
+from tests.app.test_fused_stepper import drift_engine
 from tests.app.tiny import tiny_capture, tiny_config
 
 NOT_BUILT = "the CUDA extension is not built; run `pop build-cuda`"

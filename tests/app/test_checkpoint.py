@@ -24,7 +24,7 @@ from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from tests.app.conftest import Pop, in_a_child, pop_in_a_child
 from tests.app.damage import FORGED, INF, Content, contents, forge, latest, says, to
-from tests.app.drift import drift_engine
+from tests.app.test_fused_stepper import drift_engine
 from tests.app.tiny import tiny_capture, tiny_config
 
 

@@ -18,8 +18,8 @@ from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
 from pop_fast.train.views import ViewTensors, render_view
 from pop_fast.view.html import PageCamera, camera_of_points, cameras_of, first_view, page_of, view_distances
-from tests.app.clouds import many
-from tests.app.test_paths import walk
+from tests.app.captures import many
+from tests.app.test_render import walk
 from tests.app.tiny import look_at, tiny_capture
 from tests.browser import Browser, browser
 

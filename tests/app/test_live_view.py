@@ -39,7 +39,7 @@ from pop_fast.view.live.server import Pace
 from pop_fast.view.paths import frames_in
 from tests.app.conftest import Pop
 from tests.app.damage import says
-from tests.app.test_paths import ring
+from tests.app.test_render import ring
 from tests.app.tiny import assert_same_run, tiny_capture, tiny_config
 from tests.browser import browser
 

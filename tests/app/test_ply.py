@@ -17,8 +17,7 @@ from plyfile import PlyData, PlyElement
 
 from pop_fast.io.formats import save_as
 from pop_fast.io.ply import asks_for_antialiasing, load_ply, read_header, read_points, save_ply
-from tests.app.captures import assert_one_line
-from tests.app.clouds import many
+from tests.app.captures import assert_one_line, many
 from tests.app.conftest import pop_in_a_child
 from tests.app.damage import says
 

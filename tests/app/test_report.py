@@ -48,7 +48,7 @@ from pop_fast.view.report.model import verdict
 from pop_fast.view.report.source import read_result, running_mean, thin_out
 from tests.app.conftest import TRAIN, TRAIN_AND_CHECK, Pop
 from tests.app.damage import says
-from tests.app.test_paths import around
+from tests.app.test_render import around
 from tests.app.tiny import tiny_capture
 from tests.browser import browser
 

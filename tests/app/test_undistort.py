@@ -20,8 +20,7 @@ from pop_fast.data.read_images import intrinsics, undistortion
 from pop_fast.errors import PopError
 from pop_fast.stages.covariance import covars_from_quats_scales
 from pop_fast.stages.harmonics import colors_from_sh, sh_basis
-from tests.app.captures import assert_one_line, camera, cloud, colmap_capture, look_at, photograph, raw, ring
-from tests.app.clouds import many
+from tests.app.captures import assert_one_line, camera, cloud, colmap_capture, look_at, many, photograph, raw, ring
 
 W, H = 64, 48
 PINHOLE_TERMS = {

@@ -48,7 +48,7 @@ def objective_at(step: int, recipe: Recipe):
 
 
 def test_ten_losses_are_those_written_down() -> None:
-    rungs, written = ladder(), ten_losses.written()
+    rungs, written = ladder(), ten_losses.WRITTEN
     assert [rung.n for rung in rungs] == [rung.n for rung in written]
     np.testing.assert_allclose([rung.loss for rung in rungs], [rung.loss for rung in written], rtol=1e-9)
 

@@ -41,7 +41,6 @@ from tests.walkthrough.test_splat import toy
 NODE = shutil.which("node")
 pytestmark = pytest.mark.skipif(NODE is None, reason="there is no node here to run JavaScript")
 
-FILES = ("splats", "projection", "harmonics")
 CALLS = """
 const calls = JSON.parse(require("fs").readFileSync(0, "utf8"));
 const functions = { %s };
@@ -51,7 +50,7 @@ N = 200
 
 
 def _run(name: str, parameters: list[list[Any]]) -> list[Any]:
-    script = mathematics(*FILES) + CALLS % name
+    script = mathematics("splats") + CALLS % name
     calls = json.dumps([[name, each] for each in parameters])
     done = subprocess.run([NODE or "", "-e", script], input=calls, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -534,7 +533,7 @@ def test_a_stack_tells_weights_and_gradients_with_a_wall_in_the_middle_and_in_fr
 def test_a_prior_ten_times_as_heavy_empties_the_middle_and_costs_quality() -> None:
     """Run the widget's worker as its page does, 150 steps with each weight."""
     assert "ten times as heavy" in WIDGETS["train"].prompt
-    worker = mathematics(*WIDGETS["train"].worker) + (FOLDER / "train_worker.js").read_text(encoding="utf-8")
+    worker = mathematics(WIDGETS["train"].worker) + (FOLDER / "train_worker.js").read_text(encoding="utf-8")
     page = (FOLDER / "train.js").read_text(encoding="utf-8")
     constants = re.search(r"const RATES = .*?;\n\s*const settings = .*?;\n", page, re.DOTALL)
     assert constants is not None

@@ -72,6 +72,11 @@ _TAG: Final = re.compile(r"<[^>]*>")
 # as many characters of code have room in the narrowest box of a page or a book; so few lines stay on one page of a book
 _LONG, _SHORT = 80, 12
 _WIDGET: Final = re.compile(r"<p>\{\{widget: (\w+)\}\}</p>")
+# the paper of a book
+_SHEET: Final = (
+    "@page { size: A4; margin: 18mm 17mm 20mm; "
+    "@bottom-center { content: counter(page); font: 9pt system-ui, sans-serif; color: #777; } }\n"
+)
 # two pictures of a page, or two chapters of a book, may use one id for different things
 _ID: Final = re.compile(r'(\bid="|\bfor="|href="#|url\(#)')
 
@@ -212,7 +217,7 @@ def book(told: Sequence[tuple[Chapter, Sequence[Outcome]]]) -> str:
         f'<main><header><h1>{TITLE}</h1><p>{escape(LEAD)}</p><ol class="lines">{lines}</ol></header>{articles}'
         f'<article id="answers"><h1>Answers</h1>{answers}</article></main>'
     )
-    return document(TITLE, body, asset("page.css") + asset("printed.css"), attributes=' class="book"')
+    return document(TITLE, body, asset("page.css") + _SHEET, attributes=' class="book"')
 
 
 def figure(chapter: Chapter, cell: Cell, name: str, picture: Picture) -> str:

@@ -24,42 +24,42 @@ PYODIDE: Final = "https://cdn.jsdelivr.net/pyodide/v0.27.7/full/"
 
 @dataclass(frozen=True)
 class Widget:
-    """What a widget is called, what to try with it, and the files of the mathematics that it, or its worker, needs."""
+    """What a widget is called, what to try with it, and the file of the mathematics that it, or its worker, needs."""
 
     title: str
     prompt: str
-    needs: tuple[str, ...] = ()
-    worker: tuple[str, ...] = ()
+    needs: str = ""
+    worker: str = ""
 
 
 WIDGETS: Final = {
     "splat2d": Widget(
         "One splat on the screen",
         "drag the splat over the pixels, then take its opacity down to 0.02: where does the orange edge go?",
-        ("splats",),
+        "splats",
     ),
     "stack": Widget(
         "A stack of splats at one pixel",
         "put a wall in the middle, then bring it to the front: which splats still have a weight, and which a gradient?",
-        ("splats",),
+        "splats",
     ),
     "orbit": Widget(
         "A Gaussian in space and its ellipse",
         "walk around it by dragging, then come as near as 2 world units: is the ellipse as wide as the points, and are "
         "its two sides theirs?",
-        ("projection",),
+        "splats",
     ),
     "harmonics": Widget(
         "Sixteen harmonics",
         "set all to zero, raise one slider at a time, and turn the globe by half a turn: which harmonics have the same "
         "value seen from opposite sides (even), which the negative (odd)?",
-        ("harmonics",),
+        "splats",
     ),
     "train": Widget(
         "Two trainings, without and with the prior",
         "train, and watch the histograms. Then make the prior ten times as heavy and start again: which opacities go, "
         "and what does the picture lose?",
-        worker=("training",),
+        worker="training",
     ),
     "python": Widget(
         "splat.py, in this page",
@@ -94,20 +94,15 @@ def html(name: str) -> str:
     )
 
 
-def mathematics(*files: str) -> str:
-    """Read the pure functions of files in `math/`, with the constants that they use in front."""
+def mathematics(file: str) -> str:
+    """Read the pure functions of a file in `math/`, with the constants that they use in front."""
     constants = {key: value for key, value in asdict(PAPER).items() if isinstance(value, float)}
-    return "\n".join(
-        [
-            f"const PAPER = {json.dumps(constants)};",
-            *(_text(f"math/{name}.js") for name in files),
-        ]
-    )
+    return f"const PAPER = {json.dumps(constants)};\n{_text(f'math/{file}.js')}"
 
 
 def _script(name: str, widget: Widget) -> str:
     # a worker begins from text, since a page that lies in a file may load nothing
-    text = mathematics(*widget.worker) if widget.worker else ""
+    text = mathematics(widget.worker) if widget.worker else ""
     file = f"{name}_worker.js"
     worker = (
         f"const WORKER = {json.dumps(text + _text(file))};" if (FOLDER / file).exists() else ""
@@ -123,7 +118,8 @@ def _script(name: str, widget: Widget) -> str:
         f"for (const root of document.querySelectorAll('.pop-widget[data-widget=\"{name}\"][hidden]')) "
         f"{{ root.hidden = false; {name}(root); }}"
     )
-    parts = (mathematics(*widget.needs), _text("kit.js"), worker, _text(f"{name}.js"), start)
+    needs = mathematics(widget.needs) if widget.needs else ""
+    parts = (needs, _text("kit.js"), worker, _text(f"{name}.js"), start)
     return "(() => {\n" + "\n".join(part for part in parts if part) + "\n})();"
 
 

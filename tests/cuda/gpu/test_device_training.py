@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,7 @@ from pop_fast.cuda import stages
 from pop_fast.density import GsplatStrategy, POPStrategy
 from pop_fast.train import TrainingRun, training_run
 from pop_ref.conformance.mutants.trial import every_law, law_named
-from tests.app.tiny import HEIGHT, WIDTH, last_checkpoint, run_until, tiny_capture, tiny_config
+from tests.app.tiny import HEIGHT, WIDTH, last_checkpoint, records, run_until, tiny_capture, tiny_config
 from tests.cuda.gpu.scene import FusedStep, assert_same_bits, skip_what_is_refused
 from tests.train.test_steps import climb, ladder_agree
 
@@ -56,10 +55,6 @@ CASES = {
     "batch, window": {"batch_size": 2, "strategy": WINDOW},
     "batch, visible": {"batch_size": 2, "sh_interval": 2, "strategy": {"pop_over": "visible"}, "edit": masked},
 }
-
-
-def records(folder):
-    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
 
 
 @pytest.mark.parametrize("case", CASES)
