@@ -6,8 +6,8 @@
 
 Every time is the median of `--repeats` runs in one process after warm-up, in which the backends take turns, so that the
 ratios hold on a noisy machine; threads, machine and load are noted. No speed is reported on a red gate.
-`python docs/tables.py --write` and `python benchmarks/results_table.py --write` put the results into README.md and
-NOTES.md.
+`python docs/tables.py --write` and `python benchmarks/results_table.py --write` put the results into
+docs/speed.md and NOTES.md.
 """
 
 from __future__ import annotations

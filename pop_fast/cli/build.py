@@ -28,7 +28,7 @@ _CUDA_EXAMPLES: Final = """
 class CpuArgs:
     """Compile the CPU kernels with g++, clang++ or the compiler that CXX names. Nothing else compiles them but `make`.
 
-    It takes some seconds and makes training about three times as fast. They are compiled for exactly this processor,
+    It takes some seconds and makes training about four times as fast. They are compiled for exactly this processor,
     and have to be compiled again after an update.
     """
 
@@ -38,7 +38,7 @@ class CpuArgs:
 
 @dataclass(frozen=True, kw_only=True)
 class CudaArgs:
-    """Compile the CUDA extension with nvcc, CMake and nanobind. Nothing else ever compiles it.
+    """Compile the CUDA extension with nvcc, CMake and nanobind. An import never compiles it.
 
     `pip install 'pop-splatting[cuda-build]'` brings all but nvcc, which comes from a CUDA toolkit or from NVIDIA's
     packages on PyPI; `pop doctor` says what is missing.

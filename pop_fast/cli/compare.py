@@ -17,7 +17,7 @@ from pop_fast.train.load_result import load_splat
 from pop_fast.train.results import read_config
 
 _EXAMPLES: Final = """
-    pop compare out/scene_pop out/scene_adc
+    pop compare out/scene_pop out/scene_gsplat
     pop compare out/scene_pop scene.sog scene.spz    files are measured as 'pop eval' does
 """
 

@@ -63,6 +63,7 @@ _PACKAGES: Final = (
     ("tyro", "tyro", "this command line", True),
     ("matplotlib", "matplotlib", "colours of the error maps", True),
     ("viser", "viser", "pop view: pip install 'pop-splatting[viewer]'", False),
+    ("pillow-heif", "pillow_heif", "HEIC photographs: pip install 'pop-splatting[heif]'", False),
     ("snakemake", "snakemake", "blocks on a cluster, or several at a time: pip install 'pop-splatting[blocks]'", False),
     ("hypothesis", "hypothesis", "the conformance kit: pip install 'pop-ref[conformance]'", False),
 )

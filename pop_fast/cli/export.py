@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 HTML: Final = "html"
 _EXAMPLES: Final = """
     pop export out/scene_pop --out scene.ply                 for any viewer, in the capture's own world frame
-    pop export out/scene_pop --to sog                        scene_pop.sog, a tenth of the PLY's size
+    pop export out/scene_pop --to sog                        scene_pop.sog, about an eighth of the PLY's size
     pop export out/scene_pop --to html                       scene_pop.html, one page that shows the splat in a browser
     pop export out/scene_pop --to spz --target-mb 5          at most five megabytes
     pop export out/scene_pop --out scene.splat --min-opacity 0.05 --crop -2 -2 -2 2 2 2

@@ -27,7 +27,7 @@ class Args:
     out: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """The folder to make; by default VIDEO's name with _frames."""
     count: int = 150
-    """Number of photographs."""
+    """Number of photographs, at most."""
     max_size: int = 0
     """Longest side of the photographs, px; 0 leaves them as they are."""
     overwrite: bool = False

@@ -64,8 +64,7 @@ _EXAMPLES: Final = """
     pop train scene --method 3dgs            Inria's constants, learning rates, SSIM and rasterizer
     pop train scene --method taming          or pup, mini-splatting, speedy-splat: the paper's other methods
     pop train scene --out out/a --resume     continue from the last checkpoint
-    torchrun --nproc-per-node 4 --no-python pop train scene --batch-size 4
-                                             four processes, each with one view of every step
+    torchrun --nproc-per-node 4 --no-python pop train scene --batch-size 4   four processes, a view of each step each
     pop train scene --backend fast           on the CPU, even with a GPU
     pop train scene --export sog html        also as a small file and as a page, in out/scene_pop/export
     pop train scene --view                   watch it in the browser while it runs
@@ -101,9 +100,9 @@ class _Run(BlocksOptions, FinishOptions):
     DATA is a folder with a COLMAP model (the largest in sparse), with transforms.json, with what Polycam, Metashape or
     RealityCapture export, or with photographs alone; or a video, or a ZIP archive of such a folder.
 
-    Without --preset, --steps-scaler or --max-steps the run chooses for itself: photographs are shrunk until their
-    longest side is at most 2,000 px on a GPU, 1,100 px on a CPU (550 px with --minutes under 15), and the schedule is
-    what --minutes allow on this machine.
+    Without --preset, --steps-scaler or --max-steps the run chooses for itself: photographs are shrunk by the whole
+    number that brings their longest side nearest to 2,000 px on a GPU, to 1,100 px on a CPU (to 550 px with --minutes
+    under 15), and the schedule is what --minutes allow on this machine.
 
     Attributes:
         minutes: train as much of the schedule as fits in so many, measuring and the report among them, the search for

@@ -186,7 +186,8 @@ def _about_blur(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     blurred = [one.name for one, median in zip(shown, around, strict=True) if one.sharpness < _BLURRED * median]
     if blurred:
         fix = "out of focus or shaken: leave them out"
-        what = f"{len(blurred)} {number(len(blurred), 'is', 'are')} far less sharp than their neighbours"
+        own = number(len(blurred), "is far less sharp than its", "are far less sharp than their")
+        what = f"{len(blurred)} {own} neighbours"
         yield warn("blur", f"{what}, {some(blurred)}; {fix}")
     else:
         yield ok("blur", "all about as sharp as their neighbours")

@@ -57,7 +57,7 @@ class TrainConfig:
         result_dir: where the run writes.
         max_steps: training steps, of `batch_size` views each.
         batch_size: views of a step; the loss is the mean over them of the loss that a step of each alone would have.
-            Rates and step numbers stay as they are. Backend "cuda" takes one view a step.
+            Rates and step numbers stay as they are.
         seed: of the view order, the initial rotations and the split noise.
         backend: what renders and trains: "fast" (CPU), "compiled" (CPU, with kernels in C++), "cuda", "ref" (the
             oracle, slow), one that another package registers, or "auto": "cuda" where a GPU and the build are there,
@@ -183,8 +183,8 @@ class TrainConfig:
         """Make the settings of a method and a preset, except for explicit ones.
 
         Args:
-            method: "pop", "gsplat" ("adc" is another name of it) or "3dgs".
-            preset: "paper" or "quick".
+            method: as `Given.method`; "adc" is another name of "gsplat".
+            preset: "paper", "quick" or "auto".
             overrides: `steps_scaler` and `scale_lambda_pop` (see `Given`), and settings by name, taken as they
                 are: those of the strategy and the learning rates with a dot, `**{"pop.lambda_pop": 0.002}`, as a dict,
                 `lr={"opacities": 0.01}`, or whole.

@@ -432,6 +432,9 @@ def test_a_whole_install_is_found_whole(pop: Pop) -> None:
     out = pop.done("doctor").out
     for name in ("numpy", "torch", "pycolmap", "opencv-contrib-python-headless", "backend fast", "processor", "memory"):
         assert name in out
+    # what is optional is named with the words that install it
+    for extra in ("viewer", "heif", "blocks"):
+        assert f"pip install 'pop-splatting[{extra}]'" in out
     assert "everything that pop needs is installed" in out
 
 
