@@ -236,7 +236,7 @@ def _name(axes: Axes, points: Sequence[_Point], joined: Sequence[str] = ()) -> N
         lines = point.text.split("\n")
         width = max(measure.get_text_width_height_descent(line, font, ismath=False)[0] for line in lines)
         x, y = at[point.row]
-        markers.append(Marker(x, y, (point.area / 3.1416) ** 0.5, width, len(lines) * size * 1.15))
+        markers.append(Marker(x, y, (point.area / 3.1416) ** 0.5, width, len(lines) * size * 1.3))
     # the axis itself is a line that names keep off
     frame = (float(x0) + 3.0, float(y0) + 1.0, float(x1), float(y1))
     found = places(markers, frame, along([at[row] for row in joined]))

@@ -84,7 +84,7 @@ def calls() -> dict[str, Call]:
 def _beyond_the_usual(seen: Callable[..., Call], reader: Adapter) -> dict[str, Call]:
     """Return calls of more cameras, farther away, of smaller numbers than scenes usually have."""
     return {
-        "nine_cameras": _thrice(seen(49, 3, degree=2, camera_colors=True)),
+        "fifteen_cameras": _five_times(seen(49, 3, degree=2, camera_colors=True)),
         "cameras_at_one_place": _at_one_place(seen(50, 2)),
         "short_quaternions": _told_in_units(seen(51, 2), quats=2.0**-24),
         "thousands_of_units_away": _told_in_units(seen(52, 2, "RGB+D"), lengths=2.0**12),
@@ -94,9 +94,9 @@ def _beyond_the_usual(seen: Callable[..., Call], reader: Adapter) -> dict[str, C
     }
 
 
-def _thrice(call: Call) -> Call:
-    """Return a call of every camera three times."""
-    return replace(call, frames=(3 * call.frames[0],))
+def _five_times(call: Call) -> Call:
+    """Return a call of every camera five times."""
+    return replace(call, frames=(5 * call.frames[0],))
 
 
 def _at_one_place(call: Call) -> Call:

@@ -122,6 +122,11 @@ _TERMS: Final = {**SHORT, "depth_lambda": 0.5, "opacity_reg": 0.25, "scale_reg":
 FEW: Final = ShortTraining("pop", STILL, _TERMS, ORDER[:2], seed=34, sparse=18, scene_scale=4.0)
 # scores of who goes and who stays are apart, and others would go by those of other photographs, bands or renders
 _SPEEDY: Final = {**STILL, "hard_prune_iters": (0, 1), "hard_prune_share": 0.4, "soft_prune_iters": ()}
+# sensitivities are of opacities before their reset, which comes after the same step
+_SOFTLY: Final = {
+    **STILL, "hard_prune_iters": (), "soft_prune_iters": (1,), "soft_prune_share": 0.4, "reset_every": 1,
+    "refine_start_iter": 0, "refine_stop_iter": 4, "refine_every": 50,
+}  # fmt: skip
 _MINI: Final = {**STILL, "reinit_iters": (), "sample_iter": 90, "prune_iter": 1, "prune_mass": 0.25, "sh_start_iter": 0}
 _PUP: Final = {**STILL, "rounds_start_iter": 1, "round_steps": 3, "prune_shares": (0.5,), "score_divisor": 2}
 
@@ -138,6 +143,7 @@ PRUNED: Final = [
                                     ("pup", (3, 24), _PUP))
     for seed in seeds
 ]  # fmt: skip
+SOFTLY: Final = _pruned("speedy-splat", _SOFTLY, 18)
 _PRUNED_INSIDE: Final = [
     replace(_pruned(method, settings, seed), held_out=0, masked=True, background=_BEHIND, antialiased=antialiased)
     for method, settings, seed, antialiased in (("speedy-splat", _SPEEDY, 100, True), ("pup", _PUP, 104, False))
@@ -253,10 +259,11 @@ def _cases() -> dict[str, ShortTraining]:
         "of_two_views_that_grow": BATCHES[1],
         "of_two_views_that_blur_inside_masks": replace(_BLURRED_INSIDE, batch=2, order=(1, 0) * 3),
         "of_all_bands": BANDS[0], "of_one_band": BANDS[1],
-        "waiting": WAITING, "rewound": REWOUND, "changed": CHANGED, "blurred": BLURRED,
+        "waiting": WAITING, "outlasted": OUTLASTED, "rewound": REWOUND, "changed": CHANGED, "blurred": BLURRED,
         "of_few_photographs": FEW, "of_few_masked_photographs": replace(FEW, masked=True, scene_scale=0.5),
     }  # fmt: skip
     found |= {f"pruned_by_{s.method}_{s.seed}": replace(s, held_out=0) for s in PRUNED}
+    found["pruned_before_a_reset"] = replace(SOFTLY, held_out=0)
     found |= {f"pruned_inside_masks_by_{s.method}": s for s in _PRUNED_INSIDE}
     found |= {"begun_anew": _ANEW_INSIDE} | {f"of_{s.method}": s for s in OF_METHODS}
     return {f"steps_{name.replace('-', '_')}": short for name, short in found.items()}

@@ -39,6 +39,7 @@ from pop_ref.conformance.vector_steps import (
     PRUNED,
     REWOUND,
     SHORT,
+    SOFTLY,
     STILL,
     UNSEEN,
     WAITING,
@@ -138,7 +139,7 @@ class _From(ShortTraining):
 
 @law("training", "taken_steps")
 def test_what_a_method_prunes_by_is_of_all_photographs(backend):
-    for short in PRUNED:
+    for short in (*PRUNED, SOFTLY):
         found = backend.stage("taken_steps")(short)
         assert "pruned" in assert_steps(backend, short, found, least=0.0), short.method
 

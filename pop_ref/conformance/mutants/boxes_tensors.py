@@ -18,6 +18,7 @@ from pop_ref.conformance.mutants.black_box import (
     Rasterization,
     Told,
     backwards,
+    batched,
     breaking,
     import_torch,
     one_view,
@@ -519,6 +520,20 @@ def _three_bits_of_cameras(given: Given, images: Any, alphas: Any, meta: Any) ->
     return images.index_select(-4, shown), alphas.index_select(-4, shown), meta
 
 
+def _unloaded_cameras(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
+    loaded = (import_torch().arange(given["viewmats"].shape[-3]) < 12)[:, None, None, None]
+    return images * loaded, alphas * loaded, meta
+
+
+def _first_of_shared_entries(given: Given) -> Given:
+    def of_first(v: Any) -> Any:
+        return import_torch().cat([v[:1], 0.0 * v[1:]])
+
+    named = {name: given[name] for name in ROWS if batched(given) and given[name] is not None}
+    shared = {name: x for name, x in named.items() if x.stride(0) == 0}
+    return {name: backwards(x, of_first) for name, x in shared.items()}
+
+
 def _one_channel_behind_depth(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
     behind = given["backgrounds"]
     if behind is None or behind.shape[-1] != 1 or given["render_mode"] not in ("D", "ED"):
@@ -725,6 +740,12 @@ _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("cameras_in_three_bits", "cameras from the ninth on show the first eight again: the key has three bits for them",
      telling(_three_bits_of_cameras),
      "test_signature_arguments:every_camera_has_the_colours_and_harmonics_that_were_given_for_it"),
+    ("cameras_from_the_thirteenth_on_are_black",
+     "poses from the thirteenth on do not fit the threads of a block that load them (fvdb-core #345)",
+     telling(_unloaded_cameras),
+     "test_signature_arguments:every_camera_has_the_colours_and_harmonics_that_were_given_for_it"),
+    ("entries_of_one_memory_learn_once", "entries of a batch that share memory have the first one's gradient alone",
+     breaking(_first_of_shared_entries), "test_signature_arguments:batch_entries_do_not_know_of_each_other"),
     ("one_channel_background_behind_depth",
      "where depth is drawn alone a background of one channel is blended behind it, as it has the shape for it",
      telling(_one_channel_behind_depth), "test_signature_arguments:depth_follows_plain_colours_of_several_cameras"),

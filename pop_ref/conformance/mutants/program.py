@@ -534,6 +534,11 @@ _LINES: Final[Lines] = {
          "test_autograd:a_second_backward_pass_adds_the_same_again"),
     ),
     "density/methods.py": (
+        ("sensitive_after_the_reset", "Speedy-Splat resets opacities before it asks how sensitive pixels are to them",
+         "        share = self.prune_share_at(context.step)\n        if share > 0.0:\n            from",
+         "        done = self.reset(context, done)\n        share = self.prune_share_at(context.step)\n"
+         "        if share > 0.0:\n            from",
+         "test_whole_steps:what_a_method_prunes_by_is_of_all_photographs"),
         ("opacities_set_anew_as_logits", "Mini-Splatting's new points have the activated opacity as a logit",
          "torch.logit(points.new_full((n,), opacity))", "points.new_full((n,), opacity)",
          "test_strategies:a_training_by_mini_splatting_is_the_oracles_at_every_step"),

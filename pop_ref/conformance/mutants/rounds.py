@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-# of "blind seventh" and "drawn" those alone that lived at first and are killed now
+# of "blind seventh" to "blind ninth" and "drawn" those alone that lived at first and are killed now
 _NAMES: Final = {
     "trainers": """
         depth_read_from_the_corner depth_by_row_and_column depth_of_the_nearest_pixel
@@ -156,8 +156,10 @@ _NAMES: Final = {
         factor_has_a_floor factor_of_covariances_is_constant short_quaternions_do_not_turn one_pose_one_lens
         depth_ends_at_a_thousand cameras_in_three_bits one_channel_background_behind_depth
         faint_cotangents_are_skipped isotropic_scales_read_densely equal_calls_share_a_picture
-        edits_through_data_are_not_seen context_of_the_first_thread
+        edits_through_data_are_not_seen context_of_the_first_thread entries_of_one_memory_learn_once
     """,
+    "blind eighth": "cameras_from_the_thirteenth_on_are_black",
+    "blind ninth": "sensitive_after_the_reset",
     "drawn": """
         extents_that_hardly_overlap_are_culled last_start_a_step_early passes_count_too_few_bands
         wide_turns_times_their_angle whole_background_in_passes others_have_no_term series_without_signs
