@@ -38,6 +38,7 @@ REASONS: Final[dict[str, str]] = {
     "margins.py: _reaches": "an opacity of 1 reaches 3.329 standard deviations, the limit is 3.33",
     "margins.py: safe_pixels": "read by reports of failures",
     "selection.py: lowest_share": "of nobody; a test of the oracle asks for it",
+    "short_training.py: _rows": "of a step that portable vectors begin with",
     "tight_tiles.py: accutile": "a box without an ellipse",
 }
 # by argument: why laws stop where they do
