@@ -28,8 +28,8 @@ BACKENDS
 keeps the laws of one stage; `--unordered-sums` is for a rasterizer that adds in another order on every run, as atomics
 do, and skips the laws that compare bits. `HYPOTHESIS_PROFILE` is `quick`, `dev`, `ci` or `thorough`, which draw the
 same examples on every machine, or `explore`, which draws anew (`--hypothesis-seed N`). What an implementation does not
-offer is skipped by name. A failing law prints the first stage, Gaussian, pixel or gradient that differs, the values on both
-sides, the nearest decision with its margin, and a scene to paste, which is also saved as npz (`--failures DIR`;
+offer is skipped by name. A failing law prints the first stage, Gaussian, pixel or gradient that differs, the values on
+both sides, the nearest decision with its margin, and a scene to paste, which is also saved as npz (`--failures DIR`;
 `scenes.load_scene` reads it). `--scorecard card.html`, or `.json`, sums up by stage.
 
 A rasterizer is asked once for every argument of gsplat's signature: several cameras, batches, packed rows, depth modes,
