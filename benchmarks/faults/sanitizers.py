@@ -30,6 +30,7 @@ from pop_fast.children import module_command
 from pop_fast.compiled import build, library
 from pop_fast.compiled.build import CUDA, HERE, SHARED, SOURCES, UNITS
 from pop_fast.compiled.native_step import NativeTrainer
+from pop_fast.data.capture import Capture
 from pop_fast.data.load import load_capture
 from pop_fast.stages.stage_set import PassInput
 from pop_fast.stages.types import Camera, Gaussians
@@ -226,7 +227,7 @@ def main() -> None:
 
 
 def _use(path: Path, threads: int, steps: int) -> None:
-    build.library_path = library.library_path = lambda: path  # type: ignore[assignment]
+    build.library_path = library.library_path = lambda: path
     # threads of torch's OpenMP wait for one another where no sanitizer sees it: those of the library are its own
     library._fork = lambda: None
     if pop_fast.compiled.why_not() is not None:
@@ -238,7 +239,7 @@ def _use(path: Path, threads: int, steps: int) -> None:
     print(f"{sum(_train(capture, method, threads, steps) for method in METHODS)} training steps in C++")
 
 
-def _train(capture: object, method: str, threads: int, steps: int) -> int:
+def _train(capture: Capture, method: str, threads: int, steps: int) -> int:
     plan = {"refine_start_iter": 2, "refine_every": 5, "grow_grad2d": 1e-6}
     config = TrainConfig.of(
         method=method,
@@ -251,7 +252,7 @@ def _train(capture: object, method: str, threads: int, steps: int) -> int:
         progress=False,
         **{f"{method}.{name}": value for name, value in plan.items()},
     )
-    run = TrainingRun(config, capture)  # type: ignore[arg-type]
+    run = TrainingRun(config, capture)
     while run.step < config.max_steps:
         run.take_steps(run.step + 1)
     fused = getattr(run.stepper, "fused", None)

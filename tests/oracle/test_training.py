@@ -103,6 +103,20 @@ def test_statistics_come_from_the_same_forward_pass_as_the_loss() -> None:
     assert np.any(state.statistics.grad_sum > 0.0)
 
 
+@pytest.mark.parametrize("reset_every", [0, 1])
+def test_gradients_that_wait_through_a_last_prune_are_of_those_that_are_left(reset_every: int) -> None:
+    base = RECIPES["POP"]
+    # a reset of the same step comes first, and makes all of them faint
+    config = replace(base.density, final_prune_iter=1, final_prune_opa=0.45, reset_every=reset_every, reset_opa=0.4)
+    recipe = replace(base, density=config, updates=replace(base.updates, sh_rest_every=4))
+    state, _ = trained(PARAMS, 2, recipe)
+    assert len(state.waiting["shN"]) == len(state.rows) < len(PARAMS["means"])
+    assert (len(state.rows) > 0) == (reset_every == 0)
+    kept, _ = trained(PARAMS, 2, replace(recipe, density=replace(config, final_prune_iter=-1)))
+    left = [int(np.argmin(np.abs(kept.rows.params["means"] - mean).sum(axis=1))) for mean in state.rows.params["means"]]
+    np.testing.assert_array_equal(state.waiting["shN"], kept.waiting["shN"][left])
+
+
 def test_l2_may_give_way_to_the_objective_of_3dgs() -> None:
     recipe = replace(RECIPES["L2"], l2_stop_iter=7)
     assert objective_at(6, recipe)[2][0] == objective_at(0, RECIPES["L2"])[2][0]
