@@ -47,8 +47,14 @@ class Args(LimitOptions):
 def run(argv: Sequence[str]) -> int:
     args = parse(Args, argv, "convert", examples=_EXAMPLES)
     args.check()
-    if args.score not in ("auto", "visibility"):
-        raise PopError(f"--score {args.score} needs the training views; 'pop export RESULT' knows them")
+    needs_views = {
+        f"--score {args.score}": args.score not in ("auto", "visibility"),
+        "--final-prune": args.final_prune is not None,
+        "--without-floaters": args.without_floaters,
+    }
+    for option, asked in needs_views.items():
+        if asked:
+            raise PopError(f"{option} needs the training views; 'pop export {args.source} --capture DIR' reads them")
     from pop_fast.io.formats import load_splat_file
 
     name = file_format(args.out, args.to)

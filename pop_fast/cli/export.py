@@ -81,8 +81,11 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _inria(args: Args) -> int:
-    if args.out is None or args.to is not None or args.any:
-        raise PopError("--layout inria writes all Gaussians into the folder --out; give --out, and no --to or limits")
+    if args.out is None or args.to is not None or args.any or args.drop_invisible or args.frame == "training":
+        raise PopError(
+            "--layout inria writes all Gaussians, in the capture's own frame, into the folder --out; give --out, and "
+            "no --to or limits, no --drop-invisible and no --frame training"
+        )
     from pop_fast.view.frames import exported_to, write_inria_folder
 
     keeps = [args.splat] if args.capture is None else [args.splat, args.capture]
@@ -149,7 +152,7 @@ def note_lost_frame(out: Path, name: str, frame: Frame | None) -> None:
     """Say on stderr that a file does not say its world, where what is taken for it is another one."""
     from pop_fast.io.formats import loses_frame
 
-    if loses_frame(name, frame):
+    if name != HTML and loses_frame(name, frame):
         what = f"{name} cannot record that it is in the training frame"
         print(f"note: {out}: {what}; commands that read it need --training-frame", file=sys.stderr)
 

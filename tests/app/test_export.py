@@ -147,6 +147,8 @@ def test_inria_s_layout_has_what_its_scripts_read(export: Said, psnr: Psnr, shar
         ("--out x.spz --target-mb 1 --fine-tune-steps -1", "--fine-tune-steps -1 must be 0 to 30,000"),
         ("--out x.spz --target-mb 1 --fine-tune-steps 30001", "--fine-tune-steps 30001 must be 0 to 30,000"),
         ("--out x --layout inria --max-gaussians 5", "no --to or limits"),
+        ("--out x --layout inria --drop-invisible", "no --drop-invisible"),
+        ("--out x --layout inria --frame training", "no --frame training"),
         ("--out x.obj", "must end in one of .compressed.ply, .glb, .ply, .sog, .splat, .spz"),
         ("--out there.ply", "exists; pass --overwrite"),
         ("--out full --layout inria", "full: holds what this command did not write (notes.txt)"),
@@ -250,6 +252,8 @@ def test_a_conversion_writes_a_page_and_what_its_name_promises(pop: Pop, export:
     said = pop.done("convert", "a.ply", "b.html").out
     assert f"Gaussians, {Path('b.html').stat().st_size / 1e6:.2f} MB -> b.html" in said
     assert Path("b.html").read_text().startswith("<!doctype html>")
+    save_ply("t.ply", load_ply("a.ply"), frame=Frame("training"))
+    assert "Gaussians, " in pop.done("convert", "t.ply", "t.html").out
     export("--out", "a.compressed.ply")
     header = Path("a.compressed.ply").read_bytes().partition(b"end_header")[0]
     assert b"packed_position" in header
@@ -268,7 +272,9 @@ def test_a_conversion_writes_a_page_and_what_its_name_promises(pop: Pop, export:
         ("a.ply b.ksplat", "b.ksplat: is of a format that is read and not written"),
         ("a.ply meta.json", "meta.json: is of a format that is read and not written"),
         ("t.ply b.spz --crop 0 0 0 1 1 1", "t.ply: is in a training frame"),
-        ("a.ply b.spz --score dominance", "needs the training views"),
+        ("a.ply b.spz --score dominance", "--score dominance needs the training views"),
+        ("a.ply b.spz --final-prune 0.01", "--final-prune needs the training views; 'pop export a.ply --capture DIR'"),
+        ("a.ply b.spz --without-floaters", "--without-floaters needs the training views"),
         ("empty.spz b.ply", "empty.spz: is cut off in its header"),
         ("empty.splat2 b.ply", "must end in one of"),
         (". b.ply", "is a folder without SOG's meta.json; 'pop export' reads the folder of a training"),
