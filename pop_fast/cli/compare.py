@@ -13,7 +13,7 @@ import tyro
 from pop_fast.cli import parse
 from pop_fast.cli.options import CaptureArguments
 from pop_fast.errors import PopError
-from pop_fast.train.load_result import load_splat
+from pop_fast.train.load_result import CaptureRecord, Splat, load_splat, read_record, unbundled
 from pop_fast.train.results import read_config
 
 _EXAMPLES: Final = """
@@ -21,13 +21,16 @@ _EXAMPLES: Final = """
     pop compare out/scene_pop scene.sog scene.spz    files are measured as 'pop eval' does
 """
 
+# settings of a run that say what its held-out views look like
+_PHOTOGRAPHS: Final = ("data", "factor", "test_every", "background", "resize")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Args(CaptureArguments):
     """Put several results side by side: quality, Gaussians, Gaussians per pixel, opacities, seconds.
 
     Of a result folder these are the numbers that its training left. The file of a splat is measured; the options say on
-    which photographs, by default those that the results beside it were trained on, at their size.
+    which photographs, by default those that the results beside it were trained on, in the same way.
     """
 
     results: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|FILE [RESULT|FILE ...]")]
@@ -42,8 +45,8 @@ def run(argv: Sequence[str]) -> int:
         raise PopError("nothing to compare; name one or more result folders")
     from pop_fast.view.report.source import markdown, plain, row
 
-    args = replace(args, **_of_results(args))
-    found = [_stats(path, args) for path in args.results]
+    runs = [path for path in args.results if not path.is_file() and unbundled(path) is None]
+    found = [_of_run(path) if path in runs else _of_file(path, runs, args) for path in args.results]
     unfinished = [path for path, stats in zip(args.results, found, strict=True) if "psnr" not in stats]
     why = "has no statistics yet; train to the first evaluation, or run pop eval"
     if len(unfinished) == len(found):
@@ -55,25 +58,31 @@ def run(argv: Sequence[str]) -> int:
     return 0
 
 
-def _of_results(args: Args) -> dict[str, Any]:
-    """Return by which photographs files are measured, as far as nothing is asked: those that all of the results had."""
-    configs = [read_config(path) for path in args.results if not path.is_file()]
-    had: dict[str, set[Any]] = {
-        "capture": {Path(config.data) for config in configs},
-        "factor": {config.factor for config in configs},
-        "test_every": {config.test_every for config in configs},
-    }
-    return {name: of.pop() for name, of in had.items() if len(of) == 1 and getattr(args, name) is None}
-
-
-def _stats(path: Path, args: Args) -> dict[str, Any]:
-    """Return what a result's training left of numbers, or measure the file of a splat."""
-    from pop_fast.cli.eval import measured
+def _of_run(path: Path) -> dict[str, Any]:
+    """Return what a result's training left of numbers."""
     from pop_fast.view.report.source import read_last_stats
 
-    if path.is_file():
-        capture, stats = measured(load_splat(path), args, [])
-        return {**stats, "capture": capture, "method": path.name}
     config = read_config(path)
     stats = read_last_stats(path) or {"capture": Path(config.data).name, "method": config.method}
     return {**stats, "max_steps": config.max_steps}
+
+
+def _of_file(path: Path, runs: Sequence[Path], args: Args) -> dict[str, Any]:
+    """Measure the file of a splat."""
+    from pop_fast.cli.eval import measured
+
+    capture, stats = measured(_photographed_as(load_splat(path), runs), args, [])
+    return {**stats, "capture": capture, "method": path.name}
+
+
+def _photographed_as(splat: Splat, runs: Sequence[Path]) -> Splat:
+    """Return a file's splat with what all runs beside it agree on about their photographs."""
+    configs = [read_config(run) for run in runs]
+    records = [replace(read_record(run) or CaptureRecord(), chosen=[]) for run in runs]
+    agreed = {name: getattr(configs[0], name) for name in _PHOTOGRAPHS if configs}
+    shared = {name: value for name, value in agreed.items() if all(getattr(c, name) == value for c in configs)}
+    changed = replace(splat, config=replace(splat.config, **shared))
+    if not runs or any(record != records[0] for record in records):
+        return changed
+    # without a step, the colours of a lone checkpoint are not taken to be those of this run's schedule
+    return replace(changed, folder=runs[0], step=None if splat.folder is None else splat.step)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -35,7 +35,8 @@ _EXAMPLES: Final = """
 class Args(CaptureArguments):
     """Measure a splat on the held-out views of a capture: PSNR, SSIM, LPIPS where weights are given.
 
-    For a result folder the numbers also go into its stats and its report.
+    For a result folder the numbers also go into its stats and its report, unless an option asks for another capture,
+    other photographs or another frame than those of its training.
     """
 
     splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|FILE")]
@@ -66,7 +67,8 @@ def run(argv: Sequence[str]) -> int:
     print("\n".join(_lines(stats)))
     if args.json is not None:
         write_json(args.json, stats)
-    if args.splat.is_dir() and splat.step is not None and args.capture is None:
+    as_trained = all(getattr(args, option.name) == option.default for option in fields(CaptureOptions))
+    if args.splat.is_dir() and splat.step is not None and as_trained:
         _record(args.splat, splat.step, stats)
     return 0
 

@@ -99,6 +99,9 @@ def read_record(folder: Path | None) -> CaptureRecord | None:
         record = CaptureRecord(**json.loads(path.read_text(encoding="utf-8")))
         if not isinstance(record.chosen, list) or not all(isinstance(line, str) for line in record.chosen):
             raise TypeError(f"chosen is {record.chosen!r}")
+        transform = np.array(record.world_transform, np.float64)
+        if transform.shape != (4, 4) or not np.isfinite(np.linalg.inv(transform)).all():
+            raise TypeError(f"world_transform is {str(record.world_transform)[:60]}")
         return record
     except (ValueError, TypeError, RecursionError) as error:
         fix = "remove it, and say again how to read the capture (--images, --missing)"
@@ -116,7 +119,7 @@ def load_splat(path: Path) -> Splat:
     from pop_fast.train.results import read_config
 
     if path.is_dir():
-        path = _unbundled(path) or path
+        path = unbundled(path) or path
     if path.is_dir():
         return _from_folder(path)
     if not path.exists():
@@ -138,7 +141,7 @@ def load_splat(path: Path) -> Splat:
     )
 
 
-def _unbundled(folder: Path) -> Path | None:
+def unbundled(folder: Path) -> Path | None:
     """Return the meta.json of a folder that is SOG and no result."""
     from pop_fast.io.formats.sog import META
 

@@ -14,6 +14,7 @@ import re
 import shutil
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from importlib.metadata import packages_distributions
@@ -175,6 +176,9 @@ def test_eval_of_a_result_updates_its_stats_and_report(pop: Pop, result: Path) -
     before = json.loads((result / STATS).read_text())
     (result / STATS).write_text(json.dumps({**before, "psnr": 1.0}))
     (result / "report.html").unlink()
+    for other in (("--factor", "2"), ("--test-every", "2"), ("--own-frame",)):
+        pop.done("eval", result, *other)
+        assert json.loads((result / STATS).read_text())["psnr"] == 1.0
     pop.done("eval", result)
     after = json.loads((result / STATS).read_text())
     assert (after["psnr"], after["seconds"]) == (before["psnr"], before["seconds"])
@@ -204,9 +208,14 @@ def test_compare_puts_results_side_by_side(pop: Pop, shared_result: Path) -> Non
 
 
 def test_a_file_is_measured_by_the_photographs_that_the_results_beside_it_were_trained_on(pop, capture, tmp_path):
-    run, lone = tmp_path / "run", tmp_path / "lone.ply"
-    pop.done("train", capture, "--out", run, "--factor", "2", "--max-steps", "2", "--skip-checks", "--skip-sizes")
+    run, lone, folder = tmp_path / "run", tmp_path / "lone.ply", tmp_path / "folder"
+    (capture / "images").rename(capture / "shots")
+    how = ("--images", "shots", "--factor", "2", "--background", "1", "1", "1")
+    pop.done("train", capture, "--out", run, *how, "--max-steps", "2", "--skip-checks", "--skip-sizes")
     pop.done("export", run, "--out", lone)
+    pop.done("export", run, "--out", tmp_path / "lone.sog")
+    with zipfile.ZipFile(tmp_path / "lone.sog") as archive:
+        archive.extractall(folder)
 
     def psnr(*words: str) -> list[str]:
         table = pop.done("compare", run, lone, "--markdown", *words).out.splitlines()
@@ -219,6 +228,8 @@ def test_a_file_is_measured_by_the_photographs_that_the_results_beside_it_were_t
     assert whole[0] != whole[1]
     assert psnr("--capture", str(capture)) == beside
     assert psnr("--capture", str(capture), "--test-every", "2") != beside
+    # SOG in a folder is the file of a splat too
+    assert "  folder  " in pop.done("compare", run, folder).out
 
 
 def test_sfm_says_how_well_it_went(pop: Pop, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -71,6 +71,10 @@ DAMAGED: list[tuple[str, Damage, str, tuple[str, ...]]] = [
     ),
     (SETTINGS, instead(b"[" * 5000), "report", ("{}",)),
     ("capture.json", instead(b"[" * 5000), "eval", ("{}",)),
+    *(
+        ("capture.json", under("world_transform", odd), "eval", ("{}", "is not what 'pop train' writes", "remove it"))
+        for odd in ("text", None, [[1.0, 2.0], [3.0]], [[0.0] * 4] * 4, [[1e400] * 4] * 4)
+    ),
 ]
 
 
