@@ -36,6 +36,7 @@ from pop_fast.io.formats import FORMATS, encoded, format_names, load_splat_file,
 from pop_fast.io.formats import decoded as from_bytes
 from pop_fast.io.formats.cloud import SH_C0, Cloud, morton_order
 from pop_fast.io.formats.compressed_ply import chunked
+from pop_fast.io.formats.gltf import NAME
 from pop_fast.io.formats.sog import codebook, nearest, row_palette
 from pop_fast.io.images import read_image
 from pop_fast.io.ply import Frame, save_ply
@@ -598,6 +599,10 @@ DAMAGED: list[tuple[str, bytes, str]] = [
     ("sog", sog(lambda meta: meta["means"].update(maxs=[1e30, 1, 1])), "x: means of Gaussian . is"),
     ("gltf", glb(lambda g: primitive(g)["extensions"].clear()), "holds no splat"),
     ("gltf", glb(lambda g: g["nodes"][0].update(translation=[1, 2, 3])), "a node moves its splat"),
+    ("gltf", glb(lambda g: g["nodes"].append({"children": [0], "scale": [2, 2, 2]})), "a node moves its splat"),
+    ("gltf", glb(lambda g: g["meshes"].append(g["meshes"][0])), "holds 2 splats; write each"),
+    ("gltf", glb(lambda g: primitive(g)["extensions"].update({NAME: {"colorSpace": "lin"}})), "the colorSpace 'lin'"),
+    ("gltf", glb(lambda g: primitive(g)["extensions"].update({NAME: {"kernel": "box"}})), "has the kernel 'box'; only"),
     ("gltf", glb(lambda g: primitive(g)["attributes"].pop("POSITION")), "no attribute POSITION"),
     ("gltf", glb(lambda g: g["accessors"][1].update(count=2**40)), "ROTATION is cut off"),
     ("gltf", glb(lambda g: g["accessors"][0].update(componentType=5123)), "POSITION is not stored as float32"),
@@ -619,8 +624,19 @@ def test_a_damaged_file_is_named_and_no_more_of_it_is_made_than_it_states(name: 
 
 
 def test_what_those_files_are_without_their_damage_is_read() -> None:
-    for name, data, n in (("spz", spz(), 1), ("spz", spz(flags=2), 1), ("spz-4", spz_4(id), 1), ("gltf", glb(id), 5)):
-        assert len(FORMATS[name].decode(data, Path("x"))) == n
+    # nodes without a transform in a circle, and extras of another program
+    odd = glb(lambda g: g.update(asset={"extras": "mine"}, nodes=[{"mesh": 0, "children": [1]}, {"children": [0]}]))
+    for name, data in (("spz", spz()), ("spz", spz(flags=2)), ("spz-4", spz_4(id)), ("gltf", glb(id)), ("gltf", odd)):
+        assert len(FORMATS[name].decode(data, Path("x"))) == (5 if name == "gltf" else 1)
+
+
+@pytest.mark.parametrize("n", [0, 30])
+def test_an_spz_file_whose_end_is_cut_off_is_refused_wherever_that_is(n: int) -> None:
+    whole = encoded("spz", many(n), frame=Frame("training"))
+    assert FORMATS["spz"].decode(whole, Path("x")).frame == Frame("training")
+    for end in range(len(whole)):
+        with pytest.raises(PopError, match=r"x: .*(cut off|ends after)"):
+            FORMATS["spz"].decode(whole[:end], Path("x"))
 
 
 def test_version_4_without_its_package_is_refused_by_the_package_s_name(monkeypatch: pytest.MonkeyPatch) -> None:

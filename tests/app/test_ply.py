@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from plyfile import PlyData, PlyElement
 
-from pop_fast.io.formats import save_as
+from pop_fast.errors import PopError
+from pop_fast.io.formats import decoded, encoded, save_as
 from pop_fast.io.ply import asks_for_antialiasing, load_ply, read_header, read_points, save_ply
 from tests.app.captures import assert_one_line, many
 from tests.app.conftest import pop_in_a_child
@@ -136,6 +137,15 @@ def test_splat_rows_hold_32_bytes_with_the_most_visible_first(tmp_path: Path) ->
     assert np.array_equal(rows["xyz"], params["means"].numpy()[[1, 2, 0]])
     assert rows["rgba"].tolist() == [[0, 128, 255, 128]] * 3
     assert rows["rot"].tolist() == [[128, 0, 128, 128], [192, 192, 192, 192], [255, 128, 128, 128]]
+
+
+def test_a_scale_too_small_for_a_float_is_read_back_from_splat_rows_and_one_below_0_is_refused() -> None:
+    params = many(3)
+    params["scales"][1] = torch.tensor([-3.0, -200.0, -300.0])
+    data = encoded("splat", params)
+    assert float(decoded("splat", data).params["scales"].min()) == pytest.approx(-150.0 * math.log(2.0))
+    with pytest.raises(PopError, match=r"scale of Gaussian 0 is \[-1.0, .*; it must be 0 or more"):
+        decoded("splat", data[:12] + struct.pack("<f", -1.0) + data[16:])
 
 
 @pytest.mark.parametrize(

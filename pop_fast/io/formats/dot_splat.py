@@ -52,18 +52,27 @@ def decode_splat(data: bytes, path: Path) -> Cloud:
     if len(data) % _SPLAT_ROW.itemsize:
         raise PopError(f"{path}: has {len(data)} bytes, no multiple of {_SPLAT_ROW.itemsize}; {WRITE_AGAIN}")
     rows = np.frombuffer(data, _SPLAT_ROW)
-    bad = np.flatnonzero(~(rows["scale"] > 0.0).all(axis=1))
-    if len(bad):
-        raise PopError(f"{path}: scale of Gaussian {bad[0]} is {rows['scale'][bad[0]].tolist()}; it must be over 0")
     cloud = Cloud(
         means=rows["xyz"].copy(),
-        log_scales=np.log(rows["scale"].astype(np.float64)).astype(np.float32),
+        log_scales=_logarithms(rows["scale"], _SMALLEST_FLOAT, path),
         quats=((rows["rot"] - 128.0) / 128.0).astype(np.float32),
         logits=logits_of_bytes(rows["rgba"][:, 3]),
         sh0=((rows["rgba"][:, :3] / 255.0 - 0.5) / SH_C0).astype(np.float32),
         rest=np.zeros((len(rows), 0, 3), np.float32),
     )
     return cloud.checked(path)
+
+
+# what becomes 0 as a float
+_SMALLEST_FLOAT: Final = 2.0**-150
+
+
+def _logarithms(scales: np.ndarray, least: float, path: Path) -> np.ndarray:
+    """Return logarithms of scales, where 0 stands for `least`; a PopError names one that is below. float32 [N, 3]"""
+    bad = np.flatnonzero(~(scales >= 0.0).all(axis=1))
+    if len(bad):
+        raise PopError(f"{path}: scale of Gaussian {bad[0]} is {scales[bad[0]].tolist()}; it must be 0 or more")
+    return np.log(np.maximum(scales.astype(np.float64), least)).astype(np.float32)
 
 
 _HEADER_SIZE, _SECTION_SIZE, _BUCKET_SIZE = 4096, 1024, 12
@@ -160,9 +169,6 @@ def _rows(data: bytes, section: _Section, ends: tuple[float, float], bands: int,
     """Return the columns of a `Cloud` of a section's Gaussians, with so many coefficients a channel."""
     n = section.used
     rows = np.frombuffer(data, section.row, n, section.rows_at)
-    bad = np.flatnonzero(~(rows["scale"] >= 0.0).all(axis=1))
-    if len(bad):
-        raise PopError(f"{path}: scale of Gaussian {bad[0]} is {rows['scale'][bad[0]].tolist()}; it must be 0 or more")
     centres = rows["centre"].astype(np.float64)
     if section.level and n:
         steps = section.steps or _LEVELS[section.level][3]
@@ -174,10 +180,9 @@ def _rows(data: bytes, section: _Section, ends: tuple[float, float], bands: int,
     for first, after in pairwise(COEFFICIENTS[: section.degree + 1]):
         of_degree = sh[:, 3 * first : 3 * after].reshape(n, 3, after - first)
         rest[:, first:after] = of_degree.transpose(0, 2, 1)
-    scales = np.maximum(rows["scale"].astype(np.float64), _SMALLEST_SCALE)
     return (
         centres.astype(np.float32),
-        np.log(scales).astype(np.float32),
+        _logarithms(rows["scale"], _SMALLEST_SCALE, path),
         rows["quat"].astype(np.float32),
         logits_of_bytes(rows["rgba"][:, 3]),
         ((rows["rgba"][:, :3] / 255.0 - 0.5) / SH_C0).astype(np.float32),

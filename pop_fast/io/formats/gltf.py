@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -31,6 +31,9 @@ _MAGIC: Final = b"glTF"
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _FLOAT, _BYTE = 5126, 5121
 _TYPES: Final = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+# what a splat's extension may say here, which is also taken where it says nothing
+_KNOWN: Final = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+_TRANSFORMS: Final = frozenset({"matrix", "rotation", "scale", "translation"})
 # an opacity of 1 has no finite logit; the largest float32 under it has
 _OPAQUE: Final = 1.0 - 2.0**-24
 
@@ -74,7 +77,7 @@ def _glb(turned: Cloud, data: Mapping[str, bytes], stream: bytes | None) -> byte
         return len(views) - 1
 
     accessors: list[dict[str, Any]] = []
-    extension: dict[str, Any] = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    extension: dict[str, Any] = dict(_KNOWN)
     used = [NAME]
     if stream is not None:
         extension["extensions"] = {SPZ_NAME: {"bufferView": view(stream)}}
@@ -113,7 +116,7 @@ def _glb(turned: Cloud, data: Mapping[str, bytes], stream: bytes | None) -> byte
 
 
 def decode(data: bytes, path: Path) -> Cloud:
-    """Read the first splat of a .glb file, with float32 attributes or an SPZ stream."""
+    """Read the splat of a .glb file, with float32 attributes or an SPZ stream."""
     content, body = _chunks(data, path)
     try:
         primitive = _splat(content, path)
@@ -151,18 +154,39 @@ def _chunks(data: bytes, path: Path) -> tuple[dict[str, Any], bytes]:
 
 
 def _splat(content: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    for index, mesh in enumerate(content.get("meshes", [])):
-        for primitive in mesh["primitives"]:
-            if NAME not in primitive.get("extensions", {}):
-                continue
-            kernel = primitive["extensions"][NAME].get("kernel", "ellipse")
-            if kernel != "ellipse":
-                raise PopError(f"{path}: its splat has the kernel {kernel!r}; only 'ellipse' is known here")
-            moved = {"matrix", "rotation", "scale", "translation"}
-            if any(node.get("mesh") == index and moved & set(node) for node in content.get("nodes", [])):
-                raise PopError(f"{path}: a node moves its splat; apply the node's transform to the splat first")
-            return primitive
-    raise PopError(f"{path}: holds no splat: no primitive has the extension {NAME}")
+    """Return the primitive that is the splat, whose numbers mean what they do in a PLY but for the frame."""
+    found = [
+        (index, primitive)
+        for index, mesh in enumerate(content.get("meshes", []))
+        for primitive in mesh["primitives"]
+        if NAME in primitive.get("extensions", {})
+    ]
+    if not found:
+        raise PopError(f"{path}: holds no splat: no primitive has the extension {NAME}")
+    if len(found) > 1:
+        raise PopError(f"{path}: holds {len(found)} splats; write each as a file of its own")
+    index, primitive = found[0]
+    for name, known in _KNOWN.items():
+        value = primitive["extensions"][NAME].get(name, known)
+        if value != known:
+            raise PopError(f"{path}: its splat has the {name} {value!r}; only {known!r} is known here")
+    if _moved(content.get("nodes", []), index):
+        raise PopError(f"{path}: a node moves its splat; apply the node's transform to the splat first")
+    return primitive
+
+
+def _moved(nodes: Sequence[Mapping[str, Any]], mesh: int) -> bool:
+    """Tell whether a node that shows a mesh, or one above it, has a transform."""
+    parents = {child: index for index, node in enumerate(nodes) for child in node.get("children", ())}
+    seen = set[int]()
+    for index, node in enumerate(nodes):
+        at = index if node.get("mesh") == mesh else None
+        while at is not None and at not in seen:
+            if _TRANSFORMS & set(nodes[at]):
+                return True
+            seen.add(at)
+            at = parents.get(at)
+    return False
 
 
 def _from_attributes(content: Mapping[str, Any], body: bytes, attributes: Mapping[str, int], path: Path) -> Cloud:
@@ -202,7 +226,9 @@ def _from_attributes(content: Mapping[str, Any], body: bytes, attributes: Mappin
     lengths = {name: len(column) for name, column in columns.items()}
     if len(set(lengths.values())) > 1:
         raise PopError(f"{path}: its attributes have different counts ({lengths}); {WRITE_AGAIN}")
-    antialiased = bool(content.get("asset", {}).get("extras", {}).get("antialiased", False))
+    extras = content.get("asset", {}).get("extras")
+    # another program's may be anything
+    antialiased = isinstance(extras, dict) and bool(extras.get("antialiased", False))
     assert columns["rest"].shape[1] in COEFFICIENTS
     return Cloud(**columns, antialiased=antialiased).turned("z").checked(path)
 

@@ -218,6 +218,9 @@ def _of_gzip(data: bytes, path: Path) -> tuple[_Head, list[bytes], bytes]:
         raise PopError(f"{path}: its gzip stream is damaged ({error}); {WRITE_AGAIN}") from error
     if len(body) < size:
         raise PopError(f"{path}: ends after {len(body)} of {size} bytes of its columns; {WRITE_AGAIN}")
+    if not stream.eof:
+        # its checksum and perhaps extensions, which say the frame, are behind the end of the file
+        raise PopError(f"{path}: its gzip stream is cut off behind its columns; {WRITE_AGAIN}")
     columns, at = list[bytes](), 0
     for width in head.widths:
         columns.append(body[at : at + head.n * width])
