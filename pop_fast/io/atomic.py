@@ -47,7 +47,15 @@ def check_file(path: str | os.PathLike[str]) -> None:
     path = Path(path)
     if path.is_dir():
         raise PopError(f"{path}: {_REASONS[errno.EISDIR]}")
+    _check_ordinary(path)
     check_place(path)
+
+
+def _check_ordinary(path: Path) -> None:
+    """Refuse a pipe or a device such as /dev/null, in whose place a file would be put, and all that lies in /dev."""
+    special = path.exists() and not path.is_file() and not path.is_dir()
+    if special or path.absolute().parent == Path("/dev"):
+        raise PopError(f"{path}: is a pipe or a device, which no file may replace; choose the name of a file")
 
 
 def check_folder(
@@ -212,6 +220,7 @@ def _files(folder: Path) -> Iterator[Path]:
 def _beside(path: Path) -> Iterator[Path]:
     """Name a partial beside `path` for the block to make and rename; nothing of it is left, whatever happens."""
     with _os_errors_name(path):
+        _check_ordinary(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         _sweep(path)
         partial = _partial(path)

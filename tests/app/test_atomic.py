@@ -16,7 +16,7 @@ import pytest
 
 from pop_fast.errors import PopError
 from pop_fast.io import atomic
-from pop_fast.io.atomic import FolderLock, file_atomically, folder_atomically, write_atomically
+from pop_fast.io.atomic import FolderLock, check_file, file_atomically, folder_atomically, write_atomically
 from pop_fast.train import TrainingRun
 from pop_fast.train.results import ResultFolder
 from tests.app.captures import assert_one_line
@@ -67,6 +67,18 @@ def test_a_failing_writer_leaves_the_old_file(old: Path, number: int, word: str)
     with pytest.raises(KeyError):
         write_atomically(old, failing(KeyError("in the middle")))
     assert_untouched(old)
+
+
+@needs_posix
+def test_a_pipe_or_a_device_is_never_replaced(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for write in (check_file, lambda path: write_atomically(path, lambda file: file.write(b"new"))):
+        assert_one_line(lambda write=write: write(pipe), str(pipe), "is a pipe or a device")
+    for device in ("/dev/null", "/dev/stdout"):
+        assert_one_line(lambda device=device: check_file(device), device, "is a pipe or a device")
+    assert os.listdir(tmp_path) == ["pipe"]
+    assert pipe.is_fifo()
 
 
 def test_a_file_in_place_of_a_parent_folder_is_named(old: Path) -> None:
