@@ -269,7 +269,7 @@ def _sweep(path: Path) -> None:
     prefix = f".{path.name}."
     for left in path.parent.iterdir():
         parts = left.name.removeprefix(prefix).split(".")
-        if not (left.name.startswith(prefix) and parts[0].isdigit() and parts[1:] in (["partial"], ["old"])):
+        if not (left.name.startswith(prefix) and parts[0].isdecimal() and parts[1:] in (["partial"], ["old"])):
             continue
         pid = int(parts[0])
         if pid != os.getpid() and _alive(pid):
@@ -284,7 +284,7 @@ def _sweep(path: Path) -> None:
 def is_left_behind(path: Path) -> bool:
     """Tell by its name whether a file is what a writer that is no longer alive began; the next write removes it."""
     parts = path.name.split(".")
-    if len(parts) < 4 or parts[0] or parts[-1] != "partial" or not parts[-2].isdigit():
+    if len(parts) < 4 or parts[0] or parts[-1] != "partial" or not parts[-2].isdecimal():
         return False
     pid = int(parts[-2])
     return pid == os.getpid() or not _alive(pid)
@@ -302,7 +302,7 @@ def _alive(pid: int) -> bool:
         return True
     try:
         os.kill(pid, 0)
-    except ProcessLookupError:
+    except (ProcessLookupError, OverflowError):  # no process has so large a number
         return False
     except OSError:
         return True

@@ -111,8 +111,12 @@ def test_a_killed_writer_leaves_the_old_file_and_the_next_write_sweeps_up(old: P
     # what a living writer has begun is not swept up
     theirs = old.with_name(f".x.bin.{os.getppid()}.partial")
     theirs.write_bytes(b"theirs")
+    # no process has this number, and what is none was written by nobody here
+    old.with_name(f".x.bin.{10**30}.partial").touch()
+    odd = old.with_name(".x.bin.\u00b2.partial")
+    odd.touch()
     write_atomically(old, lambda file: file.write(b"new"))
-    assert contents(old.parent) == {old: b"new", theirs: b"theirs"}
+    assert contents(old.parent) == {old: b"new", theirs: b"theirs", odd: b""}
 
 
 def test_a_file_that_a_library_writes_by_name_appears_when_its_block_ends(tmp_path: Path) -> None:

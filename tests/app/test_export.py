@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import json
+import os
 import re
 import shutil
 import typing
@@ -254,6 +255,10 @@ def test_a_conversion_writes_a_page_and_what_its_name_promises(pop: Pop, export:
     assert Path("b.html").read_text().startswith("<!doctype html>")
     save_ply("t.ply", load_ply("a.ply"), frame=Frame("training"))
     assert "Gaussians, " in pop.done("convert", "t.ply", "t.html").out
+    # a file name is bytes, and need be no text
+    odd = Path("t.ply").rename(os.fsdecode(b"t\xff.ply"))
+    pop.done("convert", odd, "odd.html")
+    assert r"<title>t\udcff.ply</title>" in Path("odd.html").read_text(encoding="utf-8")
     export("--out", "a.compressed.ply")
     header = Path("a.compressed.ply").read_bytes().partition(b"end_header")[0]
     assert b"packed_position" in header

@@ -242,7 +242,11 @@ def _unzipped(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
     size = archive.getinfo(name).file_size
     if name == META and size > _LARGEST_META:
         raise PopError(f"{path}: {META} has {size} bytes; {WRITE_AGAIN}")
-    return archive.read(name)
+    try:
+        return archive.read(name)
+    # a damaged member ends in errors of as many kinds as there are compressions
+    except Exception as error:
+        raise PopError(f"{path}: {name} in it is damaged ({error}); {WRITE_AGAIN}") from error
 
 
 def _file(folder: Path, name: str, path: Path) -> bytes:
