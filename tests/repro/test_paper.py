@@ -265,6 +265,10 @@ def test_a_new_result_changes_what_is_made_from_it() -> None:
     assert half.endswith("| abcdef1 |")
     assert any("small: 2 of 16" in line for line in lines if line.startswith("| table 3"))
     assert len(lines) == 2 + 12 + 5 + 1
+    # the runs of another reading are among those that the line rests on
+    other = [*told, *seeds("reset", 50_000, commit="abcdef2"), *seeds("pop_size_prune", 40_000, commit="abcdef3")]
+    against_reset = next(line for line in status_table(other).splitlines() if line.startswith("| POP is no worse"))
+    assert against_reset.endswith("| abcdef1, abcdef2, abcdef3 |")
     # a claim without its runs names the command that trains them
     blur = next(line for line in lines if line.startswith("| the blur rule multiplies"))
     assert "| `pop-repro queue --scale small --data DATA --rows l2 l2_pop --scenes fox` |" in blur
