@@ -262,6 +262,8 @@ def verify(words: Sequence[str]) -> int:
         print("confirmed" if made.kind else "confirmed: all of it is equal")
         return 0
     print(f"NOT confirmed: {len(made.differences)} values differ")
+    if made.begun is not None:
+        print(f"the first steps of the result were taken at another commit, {made.begun[:7]}, which may be why")
     print("\n".join(f"  {difference}" for difference in made.differences[:_SHOWN]))
     return EXIT_INCOMPLETE
 
