@@ -110,11 +110,11 @@ def main(words: list[str] | None = None) -> int:
     known = {} if args.json is None else read_json(args.json)
     for capture in args.captures:
         name = f"{capture.name}, {args.minutes:g}"
-        known.setdefault("machine", machine())
-        known[name] = measured(capture, args.minutes)
-        print(table_of({name: known[name]}).splitlines()[-1], flush=True)
+        row = {"machine": machine(), **measured(capture, args.minutes)}
+        print(table_of({name: row}).splitlines()[-1], flush=True)
         if args.json is not None:
-            write_json(args.json, {**read_json(args.json), **known})
+            # another call may have written meanwhile
+            write_json(args.json, {"machine": row["machine"], **read_json(args.json), name: row})
     if not args.captures:
         print(table_of(known))
     return 0

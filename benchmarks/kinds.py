@@ -331,11 +331,11 @@ def main(words: list[str] | None = None) -> int:
         if args.show is not None:
             print(write_kind(KINDS[name], args.show / name))
             continue
-        known = {**(known if args.json is None else read_json(args.json)), "machine": machine()}
-        known[name] = measured(KINDS[name])
-        print(f"{name}: {known[name]}", flush=True)
+        row = {"machine": machine(), **measured(KINDS[name])}
+        print(f"{name}: {row}", flush=True)
         if args.json is not None:
-            write_json(args.json, known)
+            # another call may have written meanwhile
+            write_json(args.json, {"machine": row["machine"], **read_json(args.json), name: row})
     if args.table:
         print(table_of(known))
     return 0

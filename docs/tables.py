@@ -313,8 +313,10 @@ def estimates() -> str:
 
 def _with_machine(name: str, table_of: Callable[[dict[str, Any]], str]) -> str:
     known = read_json(RESULTS / name)
-    machine = known["machine"]
-    return f"{table_of(known)}\n\n{machine['cpu']}, one thread, commit {machine['commit']}."
+    # a row that was measured again has its own
+    machines = [row.get("machine", known["machine"]) for what, row in known.items() if what != "machine"]
+    where = dict.fromkeys(f"{machine['cpu']}, one thread, commit {machine['commit']}" for machine in machines)
+    return f"{table_of(known)}\n\n{'; '.join(where)}."
 
 
 def speed() -> str:

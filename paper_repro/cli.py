@@ -63,10 +63,17 @@ def _add_scale(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scale", choices=SCALES, default="small", help=f"{about} (default: %(default)s)")
 
 
+def _positive(text: str) -> int:
+    if not text.isdecimal() or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"is '{text}'; it must be a whole number of at least 1")
+    return int(text)
+
+
 def _add_jobs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rows", nargs="+", metavar="ROW", help="only these rows (default: all)")
     parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="only these scenes (default: the scale's)")
-    parser.add_argument("--seeds", type=int, default=1, metavar="N", help=f"seeds of each: {SEED}, {SEED + 1}, ...")
+    note = f"seeds of each: {SEED}, {SEED + 1}, ..."
+    parser.add_argument("--seeds", type=_positive, default=1, metavar="N", help=note)
 
 
 def _jobs(args: argparse.Namespace) -> list[Job]:
@@ -255,14 +262,10 @@ def verify(words: Sequence[str]) -> int:
         print("confirmed" if made.kind else "confirmed: all of it is equal")
         return 0
     print(f"NOT confirmed: {len(made.differences)} values differ")
+    if made.begun is not None:
+        print(f"the first steps of the result were taken at another commit, {made.begun[:7]}, which may be why")
     print("\n".join(f"  {difference}" for difference in made.differences[:_SHOWN]))
     return EXIT_INCOMPLETE
-
-
-def _positive(text: str) -> int:
-    if not text.isdecimal() or int(text) == 0:
-        raise argparse.ArgumentTypeError(f"is '{text}'; it must be a whole number of at least 1")
-    return int(text)
 
 
 _STATUS: Final = """

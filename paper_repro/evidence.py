@@ -28,7 +28,7 @@ from paper_repro.paper import Paper
 from paper_repro.results import Result
 from paper_repro.tables import setting
 
-# the probability that any of the intervals of one claim at one scale misses, at most
+# the probability that any of the intervals that decide a claim at one scale and under one reading misses, at most
 ALPHA: Final = 0.05
 # with more seeds than these a difference is smaller than what anyone would train for
 MOST_SEEDS: Final = 99
@@ -136,7 +136,8 @@ class Noise:
             # times of two machines differ by more than their seeds
             apart = _by_machine(group.runs) if quantity is SECONDS else [group.runs]
             for values in (Group(tuple(runs)).values(quantity) for runs in apart):
-                if len(values) > 1:
+                # counts that no seed changes are set by a budget, and say nothing of those that grow
+                if len(values) > 1 and not (quantity is COUNT and min(values) == max(values)):
                     mean = fmean(values)
                     mine = sum((value - mean) ** 2 for value in values)
                     squares, df = squares + mine, df + len(values) - 1
@@ -191,16 +192,20 @@ class Comparison:
         off, half = self.margin, self.half_width(together)
         return None if off == 0.0 or abs(off) < half else off > 0.0
 
-    def seeds_needed(self, together: int) -> int:
-        """Say how many seeds of each group would decide it, if the difference that is measured is the true one."""
+    def seeds_needed(self, together: int) -> int | None:
+        """Say how many seeds of each group would decide it, if the difference that is measured is the true one.
+
+        Returns:
+            Their number, or None for more than `MOST_SEEDS`.
+        """
         if self.variance is None:
             return max(3, self.seeds[-1])
-        for n in range(max(self.seeds[0], 1) + 1, MOST_SEEDS):
+        for n in range(max(self.seeds[0], 1) + 1, MOST_SEEDS + 1):
             df = self.df + sum(max(n - have, 0) for have in self.seeds)
             half = _quantile(df, together) * sqrt(self.variance / n)
             if half <= abs(self.value - self.bound):
                 return n
-        return MOST_SEEDS
+        return None
 
     def text(self, together: int) -> str:
         """Write the value with its interval."""
@@ -274,7 +279,8 @@ def with_error(
         shown_as: how it is written.
     """
     spreads = [noise.of(quantity) for quantity, _, _ in parts]
-    seeds = tuple(sorted(n for _, _, n in parts))
+    # a group has a mean of each quantity
+    seeds = tuple(sorted(n for quantity, _, n in parts if quantity is parts[0][0]))
     known = [spread for spread in spreads if spread is not None]
     if len(known) < len(spreads):
         return Comparison(says, value, asked, bound, None, None, 0, seeds, shown_as)

@@ -292,7 +292,9 @@ def jobs_of(
         PopError: a name is unknown, or the scale does not have a scene.
     """
     chosen = list(scale_named(scale).factors if scenes is None else scenes)
-    jobs = [job_named(row, scene, scale, seed) for seed in seeds for scene in chosen for row in rows]
+    # what is named twice is one job
+    asked = dict.fromkeys((row, scene, seed) for seed in seeds for scene in chosen for row in rows)
+    jobs = [job_named(row, scene, scale, seed) for row, scene, seed in asked]
     return sorted(jobs, key=lambda job: job.cost)
 
 

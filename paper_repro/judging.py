@@ -9,6 +9,7 @@ from typing import Final
 from paper_repro.evidence import (
     DATASETS,
     JUDGE,
+    MOST_SEEDS,
     PSNR,
     Claim,
     Comparison,
@@ -179,7 +180,14 @@ def _verdict(question: Question, at: _At, together: int) -> tuple[Verdict, str]:
         return "holds", ""
     if any(c.error is None for c in at.made):
         return "not decided", "no row has two seeds at this scale, and one seed decides nothing by itself"
-    return "not decided", "within the noise of the seeds"
+    few = "" if _seeds_to_decide(at, together) else f", and {MOST_SEEDS} of each row would not decide it"
+    return "not decided", f"within the noise of the seeds{few}"
+
+
+def _seeds_to_decide(at: _At, together: int) -> int | None:
+    """Say how many seeds of each row would decide what is open on a scene; None for more than `MOST_SEEDS`."""
+    found = [c.seeds_needed(together) for c in at.made if c.asked != "nothing" and c.holds(together) is None]
+    return None if None in found else max(n for n in found if n is not None)
 
 
 def _nearest(at: _At, together: int) -> str:
@@ -195,8 +203,9 @@ def _decide(deciders: _Deciders, question: Question, at: _At, names: tuple[str, 
     elif at.missing:
         deciders.add(at.missing, at.scene, at.seeds)
     elif len(at.made) == len(at.asked):
-        left = [c for c in at.made if c.asked != "nothing" and c.holds(together) is None]
-        deciders.add(names, at.scene, max(c.seeds_needed(together) for c in left))
+        seeds = _seeds_to_decide(at, together)
+        if seeds is not None:
+            deciders.add(names, at.scene, seeds)
 
 
 class _Deciders:

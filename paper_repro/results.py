@@ -51,10 +51,10 @@ _PROTOCOL: Final = {
     "timing": str,
     "checkpoint_bytes_per_gaussian": int,
 }
-# and of one that took its first steps from another run: that run's id
-_BASE: Final = "base"
 _RUN: Final = (r"[0-9a-f]{12}", "twelve hex digits")
 COMMIT: Final = r"[0-9a-f]{7,40}(?:-dirty)?"
+# and of one whose first steps are another run's, that run's id, or were taken by another commit, that commit
+_OF_FIRST_STEPS: Final = {"base": _RUN, "begun": (COMMIT, "a git commit")}
 _HASH: Final = (r"[0-9a-f]{64}", "a SHA-256 in hex digits")
 _AGAIN: Final = "train the row again with pop-repro run --again"
 
@@ -69,7 +69,7 @@ class Result:
         scene: the capture, by its name here ("fox", "bonsai_800", "kitchen", ...).
         seed: of every random number of the run.
         run: twelve hex digits of the hash of configuration, data and seed.
-        commit: the git commit that ran, or None outside a clone.
+        commit: the git commit that ran, to the end; None outside a clone.
         config_hash: of the configuration.
         data_hash: of the capture as it was loaded: names, photographs, masks, cameras, points.
         machine: the processor, and after ", " the GPU where one was used.
@@ -79,7 +79,7 @@ class Result:
         threads: CPU threads.
         versions: of Python and the packages that compute.
         protocol: split, images, size, metrics, timing, and the bytes of a Gaussian in a checkpoint; "base" is the id of
-            the run that its first steps are from, whose time is in its own.
+            the run that its first steps are from, whose time is in its own, "begun" another commit that took them.
         schedule: the settings as they were run, by dotted name.
         seconds: by the clock, of "load", "train" and "evaluate"; "cpu" is the processor time of "train" over all
             threads, where a CPU trained and it was counted.
@@ -384,9 +384,10 @@ def _agree(result: Result, take: _Fields) -> None:
 
 
 def _protocol(take: _Fields) -> dict[str, Any]:
-    _known(take.found, [*_PROTOCOL, *([_BASE] if _BASE in take.found else [])], take.where)
-    if _BASE in take.found:
-        take.text(_BASE, *_RUN)
+    further = [name for name in _OF_FIRST_STEPS if name in take.found]
+    _known(take.found, [*_PROTOCOL, *further], take.where)
+    for name in further:
+        take.text(name, *_OF_FIRST_STEPS[name])
     for name, kind in _PROTOCOL.items():
         _ = take.text(name) if kind is str else take.whole(name, 1)
     return dict(take.found)

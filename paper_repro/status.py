@@ -60,17 +60,18 @@ def telling() -> list[str]:
 def method() -> str:
     """Say how a claim is decided."""
     return (
-        "A claim holds on a scene if all of its conditions hold beyond the noise of the seeds. It does not hold if one "
-        "of them fails beyond that noise. Otherwise it is not decided. Over all scenes that have its runs, it does not "
-        "hold if it does not hold on one of them. Noise is the standard deviation over seeds, pooled over all rows and "
-        "scenes of the scale that have several seeds. Intervals are L ± t s √(Σ cᵢ²/nᵢ) for a combination L of means "
-        "over nᵢ seeds, with Student's t at the degrees of freedom of the pooled deviation s (contrasts in a one-way "
-        "analysis of variance, NIST/SEMATECH e-Handbook of Statistical Methods, 7.4.3.6). The intervals of one claim "
-        f"at one scale hold together with a probability of {1.0 - ALPHA:.0%} (Bonferroni, 7.4.7.3 there). Counts and "
-        "times are compared by their logarithms. If no row has two seeds there is no interval, and one seed decides "
-        "nothing. Only the whole schedule decides questions about the length of the schedule. [protocol.md]"
-        "(protocol.md), part 3, lists the default readings of the paper. A claim is judged under another reading if "
-        "all rows that it changes are trained under it."
+        "A claim holds on a scene if all of its conditions hold beyond the noise of the seeds. It does not hold if "
+        "one of them fails beyond that noise. Otherwise it is not decided. Over all scenes that have its runs, it "
+        "does not hold if it does not hold on one of them. Noise is the standard deviation over seeds, pooled over "
+        "all rows and scenes of the scale that have several seeds. Intervals are L ± t s √(Σ cᵢ²/nᵢ) for a "
+        "combination L of means over nᵢ seeds, with Student's t at the degrees of freedom of the pooled deviation s "
+        "(contrasts in a one-way analysis of variance, NIST/SEMATECH e-Handbook of Statistical Methods, 7.4.3.6). "
+        "The intervals that decide a claim at one scale and under one reading hold together with a probability of "
+        f"{1.0 - ALPHA:.0%} (Bonferroni, 7.4.7.3 there). Counts and times are compared by their logarithms. A count "
+        "that is the same with every seed is set by a budget, and does not enter the noise of counts. If no row has "
+        "two seeds there is no interval, and one seed decides nothing. Only the whole schedule decides questions "
+        "about the length of the schedule. [protocol.md](protocol.md), part 3, lists the default readings of the "
+        "paper. A claim is judged under another reading if all rows that it changes are trained under it."
     )
 
 
@@ -318,9 +319,11 @@ def _says(reading: Reading, votes: Sequence[tuple[tuple[str, ...], int]]) -> str
         f"{reading.other}, {of_each[2]} alike"
     )
     lead = of_each[0] - of_each[1]
+    if lead == 0:
+        return f"Not decided: {counted}."
     pairs = {frozenset(rows) for rows, _ in votes}
     without = [sum(vote for rows, vote in votes if set(rows) != pair) for pair in pairs]
-    if lead == 0 or any(left * lead <= 0 for left in without):
+    if any(left * lead <= 0 for left in without):
         return f"Not decided: {counted}, and the lead is gone without one pair of rows."
     return f"The runs favour {'the default' if lead > 0 else reading.other}: {counted}, also without any one pair."
 
@@ -465,7 +468,8 @@ def _claim_row(by_scale: Sequence[Claim], found: Sequence[Result]) -> list[str]:
     ours = "; ".join(f"{c.verdict} at scale {scale}: {c.line}" for scale, c in judged)
     scale, told = deciding(named)
     command = f"pop-repro claims --scale {scale}" if judged else next(iter(told.told.deciders), "none")
-    runs = {run for _, c in judged or [(scale, told)] for e in c.told.evidence for run in e.runs}
+    readings = [reading for _, c in judged or [(scale, told)] for reading in (c.told, *c.others)]
+    runs = {run for reading in readings for e in reading.evidence for run in e.runs}
     used = [r for r in found if r.run in runs]
     return [told.says, told.paper, ours or f"not decided: {told.line}", f"`{command}`", _commits(used)]
 

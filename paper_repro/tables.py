@@ -14,7 +14,7 @@ from typing import Final
 
 from paper_repro.jobs import added_rows
 from paper_repro.paper import Metric, NotComparable, Paper, PaperTable, paper, places
-from paper_repro.results import Result
+from paper_repro.results import Result, most_timed_on
 from paper_repro.scenes import SCALES
 from pop_fast.errors import PopError
 
@@ -33,6 +33,7 @@ NOT_RUN: Final = "not run"
 NO_DATA: Final = "no data"
 NO_WEIGHTS: Final = "no weights"
 BY_THE_CLOCK: Final = " (clock)"
+ELSEWHERE: Final = " (elsewhere)"
 NOT_IN_PAPER: Final = "not in the paper"
 SEE_MAIN: Final = "see tables 1 and 2"
 
@@ -139,7 +140,8 @@ def table(number: int, scale: str, results: Iterable[Result], absent: Iterable[s
     groups = _groups(scale, found, {name: published.datasets[name] for name in printed.datasets})
     blocks = []
     for title, scenes in groups.items():
-        make = _Maker(published, printed, scale, title, scenes, frozenset(absent))
+        where = most_timed_on((r.row, r) for r in found if r.scene in scenes)
+        make = _Maker(published, printed, scale, title, scenes, frozenset(absent), where)
         lines = [make.line(row, name, found) for row, name in rows.items()]
         # places among values of different LPIPS networks would mean nothing
         mixed = scale == "paper" and len({published.lpips[title, row] for row in rows}) > 1
@@ -170,7 +172,8 @@ def beyond(scale: str, results: Iterable[Result], absent: Iterable[str] = ()) ->
     groups = _groups(scale, found, published.datasets)
     blocks = []
     for title, scenes in groups.items():
-        make = _Maker(published, None, scale, title, scenes, frozenset(absent))
+        where = most_timed_on((r.row, r) for r in found if r.scene in scenes)
+        make = _Maker(published, None, scale, title, scenes, frozenset(absent), where)
         lines = [make.line(row, name, found) for row, name in rows.items()]
         blocks.append(Block(_titled(title, scale, found), _placed(lines, metrics, 1)))
     return Table("beyond", scale, "Beyond the paper", _header(scale, found), metrics, tuple(blocks), None, {})
@@ -215,7 +218,7 @@ _GET: Final[Mapping[str, Callable[[Result], float]]] = {
 
 @dataclass(frozen=True)
 class _Maker:
-    """Makes the lines of one block."""
+    """Makes the lines of one block, with times of one machine."""
 
     published: Paper
     printed: PaperTable | None
@@ -223,6 +226,7 @@ class _Maker:
     title: str
     scenes: tuple[str, ...]
     absent: frozenset[str]
+    machine: str | None
 
     def line(self, row: str, name: str, found: Sequence[Result]) -> Line:
         mine = [r for r in found if r.row == row and r.scene in self.scenes]
@@ -240,23 +244,28 @@ class _Maker:
         if not mine:
             why = NO_DATA if missing and set(missing) <= self.absent else NOT_RUN
             return Cell(None, None, why, shown, why, 0, place)
+        mine, mark = self._comparable(mine) if metric == "time_s" else (mine, "")
         values = [self._value(row, metric, r) for r in mine]
         known = [value for value in values if value is not None]
         if len(known) < len(values):
             return Cell(None, None, NO_WEIGHTS, shown, NO_WEIGHTS, 0, place)
         mean, spread = _mean_and_spread(mine, known)
         digits = self._digits(metric)
-        ours = f"{mean:,.{digits}f}" + (f" ± {spread:.{digits}f}" if spread is not None else "")
-        by_the_clock = metric == "time_s" and not all(r.is_timed for r in mine)
-        if by_the_clock:
-            ours += BY_THE_CLOCK
+        ours = f"{mean:,.{digits}f}" + (f" ± {spread:.{digits}f}" if spread is not None else "") + mark
         if missing:
             ours += f" ({len(self.scenes) - len(missing)} of {len(self.scenes)} scenes)"
         against = self._against(row, metric, mine, missing)
         if against is None and printed is not None:
             # rounded first, so that no difference is "-0"
             against = f"{round(mean - printed, digits) + 0.0:+,.{digits}f}"
-        return Cell(mean, spread, ours, shown, against or shown, 0, place, not by_the_clock)
+        return Cell(mean, spread, ours, shown, against or shown, 0, place, not mark)
+
+    def _comparable(self, mine: Sequence[Result]) -> tuple[Sequence[Result], str]:
+        """Choose the runs whose times compare within the block; all of them, with a mark, where a scene has none."""
+        here = [r for r in mine if r.is_timed and r.trained_on == self.machine]
+        if {r.scene for r in here} == {r.scene for r in mine}:
+            return here, ""
+        return mine, ELSEWHERE if all(r.is_timed for r in mine) else BY_THE_CLOCK
 
     def _printed(self, row: str, metric: str) -> tuple[float | None, str, int]:
         """Give the paper's number of a cell, how it is shown, and its colour."""
@@ -367,6 +376,11 @@ def _header(scale: str, found: Sequence[Result]) -> tuple[str, ...]:
     about += f" LPIPS is {lpips}."
     clock = "(clock) is by the clock of a processor that may have had other work, so that it has no place. "
     timing = "" if all(r.is_timed for r in found) else clock
+    if len(machines) > 1:
+        timing += (
+            "Those of a block are of the runs on the machine that timed most of its methods; (elsewhere) is of others, "
+            "so that it has no place. "
+        )
     cpu = ", those of a CPU its processor time a thread" if any("cpu" in r.seconds for r in found) else ""
     return first, about, f"Seconds are of training alone{cpu}. {timing}Machines: {'; '.join(machines)}."
 

@@ -24,9 +24,10 @@ from typing import TYPE_CHECKING, Any, Final
 from paper_repro import prepared, results
 from paper_repro.collect import BESIDE, PROBE, collect, first_change, publish, spacing, state_of_data
 from paper_repro.jobs import WORK, Job, load_row, load_rows
-from paper_repro.results import COMMIT, Result
+from paper_repro.results import COMMIT, UNTIMED, Result
 from paper_repro.scenes import MADE, PaperScene, find_folder
 from pop_fast.errors import PopError
+from pop_fast.machine import processor_kind
 
 if TYPE_CHECKING:
     from pop_fast.data import Capture
@@ -234,13 +235,13 @@ def _train(job: Job, options: Options, config: TrainConfig) -> None:
     check_backend(config)
     capture, seconds = load_capture_of(job, config)
     check_capture(job, config, capture)
-    base = _begin(job, options, config, capture)
+    was = _begin(job, options, config, capture, program)
     from paper_repro.probe import ProbedRun
     from pop_fast.train.environment import keep_freed_memory
 
     keep_freed_memory()
     print(f"{job}: {capture.source}; {config.max_steps:,} steps; {chosen}", flush=True)
-    said = {"commit": program, **state_of_data(job, config, capture), **({} if base is None else {"base": base})}
+    said = {"commit": program, **state_of_data(job, config, capture), **was}
     said |= {"untimed": True} if options.untimed else {}
     beside = {BESIDE: json.dumps(said, indent=2) + "\n"}
     more = {"resume": True, "loading_seconds": seconds, "beside": beside}
@@ -261,18 +262,25 @@ def load_capture_of(job: Job, config: TrainConfig) -> tuple[Capture, float]:
     return capture, time.perf_counter() - start
 
 
-def _begin(job: Job, options: Options, config: TrainConfig, capture: Capture) -> str | None:
-    """Prepare the result folder of a training, and return the run id of what it begins or began from."""
+def _begin(job: Job, options: Options, config: TrainConfig, capture: Capture, program: str | None) -> dict[str, Any]:
+    """Prepare the result folder of a training, and return what its result says of the steps that it has already."""
     from pop_fast.io.read_back import read_json
     from pop_fast.train.checkpoint import list_checkpoints
 
     folder = Path(config.result_dir)
     taken = max((step + 1 for step, _ in list_checkpoints(folder)), default=0)
     if 0 < taken < config.max_steps or (taken and not options.again):
-        return read_json(folder / BESIDE, "train the row again in an empty folder").get("base")
+        was = read_json(folder / BESIDE, "train the row again in an empty folder")
+        kept, first = {name: was[name] for name in ("base", "begun", "untimed") if name in was}, was.get("commit")
+        if taken == config.max_steps:
+            return {**kept, "commit": first}
+        return {**({} if first in (None, program) else {"begun": first}), **kept}
     # what a finished row has left, whose result was removed since or is to be replaced
     shutil.rmtree(folder, ignore_errors=True)
-    return begin_from_base(job, options.results, options.work, config, capture)
+    base = begin_from_base(job, options.results, options.work, config, capture)
+    if base is None:
+        return {}
+    return {"base": base.run, **({"untimed": True} if base.protocol["timing"].endswith(UNTIMED) else {})}
 
 
 def _remove_bulk(job: Job, options: Options) -> None:
@@ -320,7 +328,7 @@ def remove_what_was_kept(job: Job, folder: Path, work: Path) -> None:
         shutil.rmtree(base.work(work) / _KEPT, ignore_errors=True)
 
 
-def begin_from_base(job: Job, folder: Path, work: Path, config: TrainConfig, capture: Capture) -> str | None:
+def begin_from_base(job: Job, folder: Path, work: Path, config: TrainConfig, capture: Capture) -> Result | None:
     """Make a job's result folder from its base's: the records, and the checkpoint as one of the job's own.
 
     Args:
@@ -331,8 +339,8 @@ def begin_from_base(job: Job, folder: Path, work: Path, config: TrainConfig, cap
         capture: that it trains on.
 
     Returns:
-        The run id of the base, or None where nothing was made: the job has no base, that is not finished or does not
-        have the checkpoint, or was trained with other settings, threads or photographs.
+        The base's result, or None where nothing was made: the job has no base, that is not finished or does not have
+        the checkpoint, or was trained with other settings, threads or photographs, or on another kind of processor.
 
     Raises:
         PopError: the base's result or checkpoint is damaged.
@@ -355,6 +363,8 @@ def begin_from_base(job: Job, folder: Path, work: Path, config: TrainConfig, cap
         _shared(content["config"], config.binding()) != steps
         or content["threads"] != (config.threads or torch.get_num_threads())
         or content["capture"] != capture_fingerprint(capture, config.test_every)
+        # the time of the shared steps is in the row's own; beside a GPU a processor matters little
+        or (", " not in result.machine and result.cpu != processor_kind())
     ):
         return None
     # a folder without its checkpoint would be taken for that of a run which has none yet
@@ -364,7 +374,7 @@ def begin_from_base(job: Job, folder: Path, work: Path, config: TrainConfig, cap
         shutil.copy2(record, _ready(made / record.relative_to(of_base)))
     save_checkpoint(checkpoint_path(made, steps - 1), {**content, "config": config.binding()})
     made.rename(ours)
-    return result.run
+    return result
 
 
 def _followers(job: Job) -> list[Job]:

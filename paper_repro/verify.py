@@ -56,6 +56,7 @@ class Verification:
         steps: that were trained.
         finished: whether those are all, so that the end was compared too.
         differences: what came out otherwise, each with the result's value; empty where the result is confirmed.
+        begun: another commit, which took the result's first steps; None where its own took all.
     """
 
     kind: tuple[str, ...]
@@ -63,6 +64,7 @@ class Verification:
     steps: int
     finished: bool
     differences: tuple[str, ...]
+    begun: str | None = None
 
 
 def verify(job: Job, options: Options, steps: int | None = None) -> Verification:
@@ -223,7 +225,8 @@ def _compare(result: Result, work: Path, taken: int, kind: tuple[str, ...]) -> V
     ]
     if finished:
         found += _differences_at_the_end(result, work, last - 1, bool(kind))
-    return Verification(kind, len(common), last if finished else taken, finished, tuple(found))
+    begun = result.protocol.get("begun")
+    return Verification(kind, len(common), last if finished else taken, finished, tuple(found), begun)
 
 
 def _differences_at_the_end(result: Result, work: Path, last: int, within: bool) -> list[str]:

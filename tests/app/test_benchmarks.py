@@ -22,6 +22,7 @@ import torch
 
 from benchmarks import conditions, estimates
 from benchmarks.few_photographs import left_of, table_of
+from benchmarks.record import read_json, write_json
 from paper_repro.results import read_all
 from pop_fast import compiled
 from pop_fast.io.heartbeat import duration
@@ -261,6 +262,9 @@ def test_each_repeat_gives_one_ratio_whatever_the_machine_does_between_repeats(a
     assert found["ratio"] == pytest.approx(2.0)
     assert found["ratio_quartiles"] == pytest.approx([2.0, 2.0])
     assert found["this_ms"] == pytest.approx(2.0 * found["other_ms"])
+    # a single ratio is its own quartiles
+    once = ab_benchmark.compare(timed([2.0] * 4, []), timed([1.0] * 4, []), ("step",), 1)["step"]
+    assert (once["ratio"], once["ratio_quartiles"]) == (2.0, [2.0, 2.0])
     # the order changes from repeat to repeat
     assert log[6:10] == [its, mine, mine, its] or log[6:10] == [mine, its, its, mine]
 
@@ -374,6 +378,25 @@ def test_the_line_before_the_first_step_is_read_back_for_the_table_of_estimates(
     assert table.splitlines()[2:] == ["| toy, 60 | 256x512, 300 | 3720 s, 1860 s | 0.50 | 35,000, 40,000 | 1.3, 1.2 |"]
     with pytest.raises(ValueError, match="no line says"):
         estimates.foretold("trained")
+
+
+def test_a_row_that_is_measured_again_has_its_own_machine_and_leaves_what_others_wrote(tmp_path, monkeypatch):
+    path, row = tmp_path / "estimates.json", {"size": "8x8", "steps": 1, "minutes": 1.0}
+    numbers = {"gaussians": 1, "seconds": 1.0, "memory": 1.0}
+    row |= {"foretold": numbers, "came": numbers}
+    write_json(path, {"machine": {"cpu": "old", "commit": "a"}, "one, 1": row, "two, 1": row})
+
+    def measured(capture: Path, minutes: float) -> dict[str, Any]:
+        # another call, meanwhile
+        write_json(path, {**read_json(path), "two, 1": {**row, "steps": 2}})
+        return row
+
+    monkeypatch.setattr(estimates, "measured", measured)
+    monkeypatch.setattr(estimates, "machine", lambda: {"cpu": "new", "commit": "b"})
+    assert estimates.main(["one", "--json", str(path)]) == 0
+    known = read_json(path)
+    assert known["one, 1"] == {"machine": {"cpu": "new", "commit": "b"}, **row}
+    assert (known["machine"]["commit"], known["two, 1"]["steps"]) == ("a", 2)
 
 
 def test_what_was_foretold_of_four_captures_came_within_thirty_percent() -> None:

@@ -265,6 +265,10 @@ def test_a_new_result_changes_what_is_made_from_it() -> None:
     assert half.endswith("| abcdef1 |")
     assert any("small: 2 of 16" in line for line in lines if line.startswith("| table 3"))
     assert len(lines) == 2 + 12 + 5 + 1
+    # the runs of another reading are among those that the line rests on
+    other = [*told, *seeds("reset", 50_000, commit="abcdef2"), *seeds("pop_size_prune", 40_000, commit="abcdef3")]
+    against_reset = next(line for line in status_table(other).splitlines() if line.startswith("| POP is no worse"))
+    assert against_reset.endswith("| abcdef1, abcdef2, abcdef3 |")
     # a claim without its runs names the command that trains them
     blur = next(line for line in lines if line.startswith("| the blur rule multiplies"))
     assert "| `pop-repro queue --scale small --data DATA --rows l2 l2_pop --scenes fox` |" in blur
@@ -460,19 +464,24 @@ def test_a_ratio_without_its_base_says_so_and_every_base_is_in_its_table() -> No
     assert set(REFERENCES) == {1, 2, 3, 4, 5}
 
 
-def test_seconds_are_of_the_processor_and_those_by_the_clock_have_no_place() -> None:
+def test_seconds_are_of_the_processor_on_one_machine_and_others_have_no_place() -> None:
     clock = {"load": 1.0, "train": 50.0, "evaluate": 2.0}
     found = [
         result("gsplat", seconds={**clock, "cpu": 240.0}, threads=2),
         result("pop", seconds={**clock, "cpu": 200.0}, threads=2),
+        result("pop", seed=43, seconds={**clock, "cpu": 220.0}, threads=2),
+        # neither the machine of another seed nor a faster one changes what is told of this one
+        result("pop", seed=44, seconds={**clock, "cpu": 900.0}, threads=2, cpu="another kind"),
         result("3dgs", seconds=clock),
         result("taming", seconds=clock, machine="a machine, a GPU"),
     ]
     made = table(1, "small", found)
     cells = {row: line_of(made, 0, row).cells["time_s"] for row in ("gsplat", "pop", "3dgs", "taming")}
-    assert [cell.ours for cell in cells.values()] == ["120", "100", "50 (clock)", "50"]
-    assert [cell.place for cell in cells.values()] == [3, 2, 0, 1]
+    assert [cell.ours for cell in cells.values()] == ["120", "105 ± 7", "50 (clock)", "50 (elsewhere)"]
+    assert [cell.place for cell in cells.values()] == [2, 1, 0, 0]
     assert "(clock) is by the clock of a processor that may have had other work" in markdown(made)
+    assert "(elsewhere) is of others, so that it has no place." in markdown(made)
+    assert "(elsewhere) is" not in markdown(table(1, "small", found[:3]))
 
 
 def test_the_best_three_are_marked_and_ties_alike() -> None:

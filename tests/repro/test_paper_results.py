@@ -115,6 +115,7 @@ DAMAGE = [
     (_set("cpu", ""), "cpu is .*a text"),
     (_set("protocol/width", 0), "protocol: width is 0; it must be a whole number of at least 1"),
     (_set("protocol/base", "pup"), 'protocol: base is "pup"; it must be twelve hex digits'),
+    (_set("protocol/begun", "main"), 'protocol: begun is "main"; it must be a git commit'),
     (_set("protocol/extra", 0), "protocol: extra is not a field"),
     (_set("seconds/train", -1.0), "seconds: train is -1.0"),
     (_set("seconds/cpu", -1.0), "seconds: cpu is -1.0"),
@@ -252,10 +253,12 @@ def test_a_result_that_was_altered_and_agrees_with_itself_is_not_confirmed(train
     curve = list(find("toy", "pop", "demo", 42, trained / "results").curve)
     was = curve[1]["psnr"]
     curve[1] = {**curve[1], "psnr": was + 0.1}
-    altered(trained, tmp_path, curve=tuple(curve))
+    protocol = {**find("toy", "pop", "demo", 42, trained / "results").protocol, "begun": "c0ffee1"}
+    altered(trained, tmp_path, curve=tuple(curve), protocol=protocol)
     assert verify(tmp_path, tmp_path / "work", "--steps", "40") == 1
     told = capsys.readouterr().out
     assert "NOT confirmed: 1 values differ" in told
+    assert "the first steps of the result were taken at another commit, c0ffee1, which may be why" in told
     assert f"step 10: psnr is {was}, and the result has {was + 0.1}" in told
 
 

@@ -91,6 +91,28 @@ def test_seconds_of_a_machine_with_other_work_are_kept_and_not_compared(made, tm
         commit()
 
 
+def refuse(*_) -> None:
+    raise PopError("the disk is full")
+
+
+def test_a_row_that_goes_on_at_another_commit_or_alone_says_how_it_began(tmp_path, monkeypatch):
+    how, job = options(tmp_path, untimed=True, checkpoint_every=10), toy("l1_div_100", steps_scaler=0.001)
+    monkeypatch.setenv("POP_COMMIT", "c0ffee1")
+    with interrupted(at=20):
+        train_row(job, how)
+    alone = replace(how, untimed=False)
+    monkeypatch.setenv("POP_COMMIT", "c0ffee2")
+    with monkeypatch.context() as patch:
+        patch.setattr(module.results, "write", refuse)
+        with pytest.raises(PopError, match="the disk is full"):
+            train_row(job, alone)
+    # no step is left to this one
+    monkeypatch.setenv("POP_COMMIT", "c0ffee3")
+    result = train_row(job, alone)
+    assert (result.commit, result.protocol["begun"], result.is_timed) == ("c0ffee2", "c0ffee1", False)
+    assert read(job.file(how.results)) == (result,)
+
+
 def test_a_curve_has_every_densification_step_and_the_held_out_views_of_every_fifteenth(made):
     curve = made[1].curve
     steps = [point["step"] for point in curve]
@@ -341,23 +363,30 @@ def test_a_row_that_begins_from_its_base_comes_to_what_it_comes_to_alone(
 def test_a_checkpoint_stays_as_long_as_a_row_waits_for_it(tmp_path):
     how, job = options(tmp_path), toy("pup", steps_scaler=0.001)
     of_base = base_of(job)
-    train_row(of_base, how)
+    train_row(of_base, replace(how, untimed=True))
     kept = of_base.work(how.work) / "base"
     done = train_row(job, how)
     assert kept.is_dir()
+    # the time of the base's steps is in its own
+    assert (done.protocol["base"], done.is_timed) == (of_base.result(how.results).run, False)
     write(replace(done, row="pup_star"), how.results)
     module._remove_bulk(job, how)
     assert not kept.exists()
 
 
 @pytest.mark.slow  # it trains
-def test_a_base_of_another_kind_is_not_begun_from(tmp_path):
+def test_a_base_of_another_kind_is_not_begun_from(tmp_path, monkeypatch):
     how, job = options(tmp_path, keep_checkpoints=True), toy("pup", steps_scaler=0.001)
     train_row(base_of(job), how)
     for change in ({"threads": 2}, {"log_every": 7}):
         assert "base" not in train_row(job, replace(how, **change)).protocol, change
         job.file(how.results).unlink()
         shutil.rmtree(job.work(how.work))
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "processor_kind", lambda: "another kind")
+        assert "base" not in train_row(job, how).protocol
+    job.file(how.results).unlink()
+    shutil.rmtree(job.work(how.work))
     assert "base" in train_row(job, how).protocol
 
 
