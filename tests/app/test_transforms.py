@@ -227,6 +227,26 @@ def test_masks_named_by_a_frame_are_read(root: Path) -> None:
     assert_one_line(lambda: raw(root), "absent.png")
 
 
+def test_every_name_of_a_list_from_windows_may_have_backslashes(root: Path) -> None:
+    write_photograph(root / "masks of it" / "m.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    (root / "points").mkdir()
+    write_points(root / "points" / "all.ply")
+
+    def from_windows(listing: dict[str, Any]) -> None:
+        for frame in listing["frames"]:
+            frame |= {"file_path": frame["file_path"].replace("/", "\\"), "mask_path": "masks of it\\m.png"}
+        listing["train_filenames"] = [frame["file_path"] for frame in listing["frames"][1:]]
+        listing["ply_file_path"] = ".\\points\\all.ply"
+
+    edit_transforms(root, from_windows)
+    capture = raw(root)
+    assert [(view.name, view.split) for view in capture.views] == [
+        ("images/00.png", "test"),
+        *((f"images/0{i}.png", "train") for i in (1, 2, 3)),
+    ]
+    assert all(view.mask is not None for view in capture.views)
+
+
 def test_colmap_is_preferred_unless_the_other_is_asked_for(root: Path) -> None:
     colmap_capture(root)
     for options, source in (({}, "COLMAP model"), ({"source": "colmap"}, "COLMAP model")):
