@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from pop_fast.data.capture import FAR_APART, Listing, PosedImage, SparsePoints, nearest_cameras
@@ -48,7 +47,6 @@ class Photo:
     path: Path | None
     size: tuple[int, int] = (0, 0)
     alpha: bool = False
-    rotated: bool = False
     problem: str = ""
     shown: Shown | None = None
     # brightness at the points that the shot sees, stops; None where that is not known
@@ -80,15 +78,7 @@ def read_photo(shot: PosedImage, path: Path | None, cloud: SparsePoints | None =
         places[front] = shot.camera.img_from_cam(points[front]) if front.any() else 0.0
         levels = levels_at(image, places * (np.array(size) / (shot.camera.width, shot.camera.height)))
     shown = measure(path, image, shot.name)
-    return Photo(shot, path, size, alpha, _is_rotated(path), shown=shown, levels=levels)
-
-
-def _is_rotated(path: Path) -> bool:
-    """Tell whether EXIF asks viewers to turn the picture: decoded small with and without obeying, is it another one."""
-    data = np.frombuffer(path.read_bytes(), np.uint8)
-    as_stored = cv2.imdecode(data, cv2.IMREAD_REDUCED_GRAYSCALE_8 | cv2.IMREAD_IGNORE_ORIENTATION)
-    as_shown = cv2.imdecode(data, cv2.IMREAD_REDUCED_GRAYSCALE_8)
-    return as_stored is not None and as_shown is not None and not np.array_equal(as_stored, as_shown)
+    return Photo(shot, path, size, alpha, shown=shown, levels=levels)
 
 
 def about_cameras(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:
@@ -143,7 +133,8 @@ def about_photos(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding
     turned = sum(photo.shot.turns > 0 for photo in photos)
     if turned:
         yield ok("EXIF", f"{turned} are stored rotated and shown upright, as pop sfm noted")
-    rotated = [photo.shot.name for photo in photos if photo.rotated and not photo.shot.turns]
+    asking = [photo for photo in photos if photo.shown is not None and photo.shown.exif.orientation != 1]
+    rotated = [photo.shot.name for photo in asking if not photo.shot.turns]
     if rotated:
         note = "the pixels are used as stored, as COLMAP does; poses must have been made so too"
         yield warn("EXIF", f"{len(rotated)} ask to be rotated, first {rotated[0]}: {note}")

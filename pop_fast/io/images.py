@@ -35,6 +35,7 @@ from pop_fast.io.image_header import (
     HEIF_SUFFIXES,
     INSTALL,
     LARGEST,
+    as_stored,
     bytes_per_pixel,
     can_read_heif,
     decode_heif,
@@ -242,9 +243,9 @@ def _decode(path: Path) -> np.ndarray:
         # a size that nobody has seen is nobody's to judge, and OpenCV also decodes what no camera writes
         raise CaptureError(f"{path}: is not a PNG, JPEG, WebP, TIFF, BMP or HEIC image; {FIX}")
     try:
-        # IMREAD_UNCHANGED keeps alpha and 16 bit, and leaves the EXIF orientation alone
+        # IMREAD_UNCHANGED keeps alpha and 16 bit, and leaves the EXIF orientation alone, but for a TIFF's
         with QUIET:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            image = cv2.imdecode(np.frombuffer(as_stored(data), np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     if image is None or image.size == 0:

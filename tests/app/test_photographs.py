@@ -175,14 +175,18 @@ def save(path: Path, orientation: int | None = None) -> Path:
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_the_size_and_exif_are_read_of_every_format_and_any_damage_is_no_error(tmp_path: Path, name: str) -> None:
+def test_size_and_exif_are_read_of_every_format_no_orientation_is_obeyed_and_damage_is_no_error(
+    tmp_path: Path, name: str
+) -> None:
     plain = save(tmp_path / name)
     assert read_size(plain) == (61, 37)
     assert read_exif(plain) == Exif()
+    stored = read_image(plain)
     exposure = () if name.endswith("tif") else (0.008, 400.0, 4.25)
     for orientation in range(1, 9):
         found = read_exif(save(tmp_path / name, orientation))
         assert found == Exif(orientation, "Maker X", *exposure) or name.endswith("bmp")
+        assert np.array_equal(read_image(tmp_path / name), stored)
     whole, random = save(tmp_path / name, 6).read_bytes(), np.random.default_rng(5)
     for _ in range(300):
         data = bytearray(whole[: int(random.integers(0, len(whole)))])
