@@ -44,7 +44,7 @@ from pop_fast.data.exports import photographs_of_polycam
 from pop_fast.data.photo_quality import FIX, Shown, about_mixed_sizes, about_use, measure, number
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import check_folder, folder_atomically
-from pop_fast.io.image_header import HEIF_SUFFIXES, read_exif
+from pop_fast.io.image_header import HEIF_SUFFIXES, is_heif, read_exif
 from pop_fast.io.images import in_threads, list_images, read_image, sound_jpegs, unreadable_photographs, write_png
 
 
@@ -183,10 +183,13 @@ def _stage(photos: Path, names: list[Path], work: Path) -> list[str]:
     staged: list[str] = []
     for i, name in enumerate(names):
         suffix = name.suffix.lower()
-        # HEIC is not read by COLMAP
-        plain = work / "images" / f"{i:06d}{'.png' if suffix in HEIF_SUFFIXES else suffix}"
+        with open(photos / name, "rb") as file:
+            head = file.read(12)
+        # COLMAP reads neither HEIC, which may be named .jpg, nor WebP
+        foreign = suffix in HEIF_SUFFIXES or is_heif(head) or head[8:] == b"WEBP"
+        plain = work / "images" / f"{i:06d}{'.png' if foreign else suffix}"
         staged.append(plain.name)
-        if suffix in HEIF_SUFFIXES:
+        if foreign:
             write_png(plain, read_image(photos / name)[:, :, :3])
             continue
         try:

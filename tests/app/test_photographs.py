@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -284,15 +285,32 @@ def test_a_capture_of_heic_photographs_loads(shared_capture: Path, capture: Path
     assert pop("data", "check", capture).status == 0
 
 
-@needs_heif
+def staged_for_colmap(photos: Path, work: Path) -> list[str]:
+    """Give photographs to COLMAP, and return the names that they have there."""
+    work.mkdir()
+    names = [path.relative_to(photos) for path in list_images(photos)]
+    staged = sfm._stage(photos, names, work)
+    for plain, name in zip(staged, names, strict=True):
+        found = pycolmap.Bitmap.read(work / "images" / plain, True)
+        assert found is not None, name
+        np.testing.assert_array_equal(found.to_array(), read_image(photos / name)[..., :3])
+    return staged
+
+
 def test_structure_from_motion_is_given_what_colmap_can_read(tmp_path: Path) -> None:
-    (tmp_path / "work").mkdir()
-    write_photograph(tmp_path / "photos" / "b.png", photograph(3, 128, 96))
+    for name in ("a.webp", "b.png", "c.bmp", "d.tif", "e.jpg"):
+        write_photograph(tmp_path / "photos" / name, photograph(3, 128, 96, 4 if name == "a.webp" else 3))
+    (tmp_path / "photos" / "b.png").rename(tmp_path / "photos" / "b.jpg")
+    staged = staged_for_colmap(tmp_path / "photos", tmp_path / "work")
+    assert staged == ["000000.png", "000001.jpg", "000002.bmp", "000003.tif", "000004.jpg"]
+
+
+@needs_heif
+def test_structure_from_motion_is_given_heic_as_png_whatever_it_is_named(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
     write_heic(tmp_path / "photos" / "a.heic", photograph(3, 128, 96))
-    staged = sfm._stage(tmp_path / "photos", [Path("a.heic"), Path("b.png")], tmp_path / "work")
-    assert staged == ["000000.png", "000001.png"]
-    found = cv2.imread(str(tmp_path / "work" / "images" / staged[0]))
-    np.testing.assert_array_equal(found[..., ::-1], read_image(tmp_path / "photos" / "a.heic"))
+    shutil.copy(tmp_path / "photos" / "a.heic", tmp_path / "photos" / "b.jpg")
+    assert staged_for_colmap(tmp_path / "photos", tmp_path / "work") == ["000000.png", "000001.png"]
 
 
 # JPEG files with damaged coded pixels, which OpenCV decodes without an error.
