@@ -490,5 +490,10 @@ def test_what_is_no_video_is_one_line_and_leaves_nothing(clip: Path, tmp_path: P
     for wrong, message in (({"count": 1}, "count is 1"), ({"max_size": 8}, "max_size is 8")):
         with pytest.raises(PopError, match=message):
             take_frames(clip, out, **wrong)
+    # of one that was cut short, what is there is spread over what is wanted, whatever its header states
+    (tmp_path / "half.avi").write_bytes(clip.read_bytes()[: clip.stat().st_size // 2])
+    taken = take_frames(tmp_path / "half.avi", out, count=8)
+    assert 35 <= taken.of <= 45
+    assert len(taken.frames) + taken.alike == 8
     # training on one says how to take photographs out of it
     assert_one_line(lambda: load_capture(clip), "walk.avi: is a video; ", " pop frames")
