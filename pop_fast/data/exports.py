@@ -60,7 +60,7 @@ def find_polycam(root: Path) -> Path | None:
     for keyframes in (root / "keyframes", root):
         for cameras, images in _FOLDERS:
             folder = keyframes / cameras
-            if (keyframes / images).is_dir() and folder.is_dir() and any(folder.glob("*.json")):
+            if (keyframes / images).is_dir() and folder.is_dir() and any(folder.glob("[!.]*.json")):
                 return folder
     return None
 
@@ -76,7 +76,8 @@ def read_polycam(folder: Path, root: Path, images: str) -> tuple[list[PosedImage
     del images
     photos = folder.parent / dict(_FOLDERS)[folder.name]
     relative = photos.relative_to(root).as_posix()
-    files = enumerate(sorted(folder.glob("*.json")), start=1)
+    # hidden are what a Mac puts beside every file on a disk of another system
+    files = enumerate(sorted(folder.glob("[!.]*.json")), start=1)
     return [_shot(path, photos, relative, number) for number, path in files], []
 
 

@@ -449,6 +449,12 @@ def test_polycams_first_cameras_are_read_where_it_has_not_corrected_them(origina
     ]
 
 
+def test_what_a_mac_leaves_beside_polycams_cameras_is_none_of_them(original: Capture, write: Callable) -> None:
+    folder = write("polycam")
+    (folder / "keyframes" / "corrected_cameras" / "._view_000.json").write_bytes(b"\0\5\x16\7")
+    assert_same_cameras(raw(folder, points=20), original)
+
+
 def test_points_in_the_folder_of_an_export_are_read(write: Callable[..., Path]) -> None:
     folder = write("realitycapture")
     write_points(folder / "points3D.ply")
