@@ -9,7 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from pop_fast.data.capture import FAR_APART, Listing, PosedImage, SparsePoints, nearest_cameras
+from pop_fast.data.capture import (
+    FAR_APART,
+    Listing,
+    PosedImage,
+    SparsePoints,
+    nearest_cameras,
+    normalizing_transform,
+)
 from pop_fast.data.colmap import find_model
 from pop_fast.data.load import find_listing
 from pop_fast.data.photo_quality import (
@@ -28,7 +35,7 @@ from pop_fast.data.photo_quality import (
     ok,
     warn,
 )
-from pop_fast.data.read_images import fix_of_absent
+from pop_fast.data.read_images import fix_of_absent, read_fitting_mask, undistortion
 from pop_fast.data.sfm import photo_folder
 from pop_fast.errors import CaptureError
 from pop_fast.io.images import find_image, list_images, read_image, read_mask, unreadable_photographs
@@ -37,6 +44,8 @@ from pop_fast.io.images import find_image, list_images, read_image, read_mask, u
 BYTES_IN_TRAINING = 59 * 4 * 4
 # pairs of neighbouring cameras far apart that are named
 _GAPS = 3
+# px of a picture that a lens is tried on
+_SIDE = 64
 
 
 @dataclass(frozen=True)
@@ -93,6 +102,22 @@ def about_cameras(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:
         yield ok("cameras", f"{count} x {kind}")
     if len(kinds) > 8:
         yield ok("cameras", f"and {len(kinds) - 8} more kinds")
+    lenses = {(c.model_name, tuple(c.params), c.width, c.height): shot for shot in shots if (c := shot.camera)}
+    for shot in lenses.values():
+        try:
+            # whether it folds the image does not depend on the size
+            undistortion(shot.camera, _SIDE, _SIDE)
+        except ValueError as error:
+            yield bad("cameras", f"{shot.name}: its camera {shot.camera.camera_id} {error}")
+
+
+def about_places(shots: Sequence[PosedImage], cloud: SparsePoints | None) -> Iterator[CaptureFinding]:
+    """Tell what stands against a frame to train in."""
+    try:
+        if len(shots) > 1:
+            normalizing_transform(np.stack([shot.viewmat for shot in shots]), cloud.xyz if cloud else None)
+    except CaptureError as error:
+        yield bad("poses", str(error))
 
 
 def about_spacing(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:
@@ -193,7 +218,9 @@ def about_masks(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding]
             lone.append(photo.shot.name)
             continue
         try:
-            kept.append(float(read_mask(path).mean()))
+            fits = photo.size != (0, 0)
+            mask = read_fitting_mask(path, photo.size, photo.shot.turns) if fits else read_mask(path)
+            kept.append(float(mask.mean()))
         except CaptureError as error:
             yield bad("masks", str(error))
     if not kept:
@@ -239,7 +266,11 @@ def about_reprojection(root: Path) -> Iterator[CaptureFinding]:
     model = find_model(root)
     if model is None:
         return
-    colmap = require_colmap()
+    try:
+        colmap = require_colmap()
+    except CaptureError as error:
+        yield warn("reprojection", f"not computed: {error}")
+        return
     try:
         with quiet_colmap():
             reconstruction = colmap.Reconstruction(model)
