@@ -443,6 +443,8 @@ def _load_transforms(path: Path) -> dict[str, Any]:
 
 def _read_listing(path: Path, listing: dict[str, Any], split: Split | None) -> list[PosedImage]:
     splits = _named_splits(path, listing)
+    named = [split for split in ("train", "val", "test") if listing.get(f"{split}_filenames")]
+    rest: Split | None = "test" if named == ["train"] else None if "train" in named else "train"
     shots: list[PosedImage] = []
     for index, frame in enumerate(listing["frames"]):
         where = f"{path}: frames[{index}]"
@@ -451,9 +453,9 @@ def _read_listing(path: Path, listing: dict[str, Any], split: Split | None) -> l
         name = _name(frame["file_path"])
         own = split
         if splits:
-            if name not in splits and set(splits.values()) != {"train"}:  # named by no list
+            own = splits.get(name, rest)
+            if own is None:  # named by no list
                 continue
-            own = splits.get(name, "test")
         mask = path.parent / _name(frame["mask_path"]) if frame.get("mask_path") else None
         fields = _fields(listing, frame)
         angle = _angle(where, fields)
@@ -471,7 +473,9 @@ def _fields(listing: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
 
 
 def _named_splits(path: Path, listing: dict[str, Any]) -> dict[str, Split]:
-    """Read nerfstudio's `train_filenames`, `val_filenames`, `test_filenames`; with the first alone, the rest is test.
+    """Read nerfstudio's `train_filenames`, `val_filenames`, `test_filenames`.
+
+    With the first alone, the rest is test; without the first, the rest is train.
 
     A photograph in several lists belongs to the last of train, val, test: what is tested is never trained on.
     """

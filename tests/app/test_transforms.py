@@ -181,6 +181,8 @@ def numbers(views) -> str:
         # validation views are tested on where no test views are named, and else the rest
         ({"train": (0, 1), "val": (2,)}, "0 1", "2"),
         ({"train": (0, 3)}, "0 3", "1 2 4 5"),
+        # and what is not tested on is trained on
+        ({"test": (0, 3)}, "1 2 4 5", "0 3"),
         # a photograph in both lists is never trained on
         ({"train": range(6), "test": (0,)}, "1 2 3 4 5", "0"),
     ],
@@ -190,7 +192,9 @@ def test_the_files_own_split_is_kept(tmp_path: Path, listed: dict[str, Any], tra
     capture = raw(transforms_capture(tmp_path, count=6, **split))
     assert numbers(capture.train_views()) == train
     assert numbers(capture.test_views()) == test
-    assert len(capture.views) == len({i for of in listed.values() for i in of} | set(map(int, test.split())))
+    assert len(capture.views) == len(
+        {i for of in listed.values() for i in of} | set(map(int, f"{train} {test}".split()))
+    )
 
 
 def test_blender_captures_have_their_own_split_field_of_view_and_transparency(tmp_path: Path) -> None:
