@@ -75,6 +75,8 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
         shown, damage = _each(files, lambda path: measure_file(path, path.relative_to(folder).as_posix()), lambda p: p)
         damaged = [bad("photographs", problem) for problem in damage]
         return [*check_dataset.about_bare(root, shown), *damaged, *about_quality(shown)]
+    if listing.root != root:
+        return [CaptureFinding("ok", "poses", f"a block of {listing.root}"), *look_over(listing.root, images)]
     shots, cloud = listing.shots, listing.cloud
     where = listing.path.relative_to(root).as_posix()
     inside = "" if listing.made_from == where else f" in {where}"
@@ -82,6 +84,7 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
     findings = [CaptureFinding("ok" if len(shots) > 1 else "bad", "poses", what)]
     findings += [warn("poses", note) for note in listing.notes]
     findings += check_dataset.about_cameras(shots)
+    findings += check_dataset.about_places(shots, cloud)
     findings += check_dataset.about_spacing(shots)
     paths = {id(shot): find_image(root / shot.folder, shot.file) for shot in shots}
     photos, damage = _each(

@@ -7,10 +7,16 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
-from pop_fast.data.capture import FAR_APART, Listing, PosedImage, SparsePoints, nearest_cameras
+from pop_fast.data.capture import (
+    FAR_APART,
+    Listing,
+    PosedImage,
+    SparsePoints,
+    nearest_cameras,
+    normalizing_transform,
+)
 from pop_fast.data.colmap import find_model
 from pop_fast.data.load import find_listing
 from pop_fast.data.photo_quality import (
@@ -29,7 +35,7 @@ from pop_fast.data.photo_quality import (
     ok,
     warn,
 )
-from pop_fast.data.read_images import fix_of_absent
+from pop_fast.data.read_images import fix_of_absent, read_fitting_mask, undistortion
 from pop_fast.data.sfm import photo_folder
 from pop_fast.errors import CaptureError
 from pop_fast.io.images import find_image, list_images, read_image, read_mask, unreadable_photographs
@@ -38,6 +44,8 @@ from pop_fast.io.images import find_image, list_images, read_image, read_mask, u
 BYTES_IN_TRAINING = 59 * 4 * 4
 # pairs of neighbouring cameras far apart that are named
 _GAPS = 3
+# px of a picture that a lens is tried on
+_SIDE = 64
 
 
 @dataclass(frozen=True)
@@ -48,7 +56,6 @@ class Photo:
     path: Path | None
     size: tuple[int, int] = (0, 0)
     alpha: bool = False
-    rotated: bool = False
     problem: str = ""
     shown: Shown | None = None
     # brightness at the points that the shot sees, stops; None where that is not known
@@ -80,15 +87,7 @@ def read_photo(shot: PosedImage, path: Path | None, cloud: SparsePoints | None =
         places[front] = shot.camera.img_from_cam(points[front]) if front.any() else 0.0
         levels = levels_at(image, places * (np.array(size) / (shot.camera.width, shot.camera.height)))
     shown = measure(path, image, shot.name)
-    return Photo(shot, path, size, alpha, _is_rotated(path), shown=shown, levels=levels)
-
-
-def _is_rotated(path: Path) -> bool:
-    """Tell whether EXIF asks viewers to turn the picture: decoded small with and without obeying, is it another one."""
-    data = np.frombuffer(path.read_bytes(), np.uint8)
-    as_stored = cv2.imdecode(data, cv2.IMREAD_REDUCED_GRAYSCALE_8 | cv2.IMREAD_IGNORE_ORIENTATION)
-    as_shown = cv2.imdecode(data, cv2.IMREAD_REDUCED_GRAYSCALE_8)
-    return as_stored is not None and as_shown is not None and not np.array_equal(as_stored, as_shown)
+    return Photo(shot, path, size, alpha, shown=shown, levels=levels)
 
 
 def about_cameras(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:
@@ -103,6 +102,22 @@ def about_cameras(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:
         yield ok("cameras", f"{count} x {kind}")
     if len(kinds) > 8:
         yield ok("cameras", f"and {len(kinds) - 8} more kinds")
+    lenses = {(c.model_name, tuple(c.params), c.width, c.height): shot for shot in shots if (c := shot.camera)}
+    for shot in lenses.values():
+        try:
+            # whether it folds the image does not depend on the size
+            undistortion(shot.camera, _SIDE, _SIDE)
+        except ValueError as error:
+            yield bad("cameras", f"{shot.name}: its camera {shot.camera.camera_id} {error}")
+
+
+def about_places(shots: Sequence[PosedImage], cloud: SparsePoints | None) -> Iterator[CaptureFinding]:
+    """Tell what stands against a frame to train in."""
+    try:
+        if len(shots) > 1:
+            normalizing_transform(np.stack([shot.viewmat for shot in shots]), cloud.xyz if cloud else None)
+    except CaptureError as error:
+        yield bad("poses", str(error))
 
 
 def about_spacing(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:
@@ -143,7 +158,8 @@ def about_photos(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding
     turned = sum(photo.shot.turns > 0 for photo in photos)
     if turned:
         yield ok("EXIF", f"{turned} are stored rotated and shown upright, as pop sfm noted")
-    rotated = [photo.shot.name for photo in photos if photo.rotated and not photo.shot.turns]
+    asking = [photo for photo in photos if photo.shown is not None and photo.shown.exif.orientation != 1]
+    rotated = [photo.shot.name for photo in asking if not photo.shot.turns]
     if rotated:
         note = "the pixels are used as stored, as COLMAP does; poses must have been made so too"
         yield warn("EXIF", f"{len(rotated)} ask to be rotated, first {rotated[0]}: {note}")
@@ -202,7 +218,9 @@ def about_masks(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding]
             lone.append(photo.shot.name)
             continue
         try:
-            kept.append(float(read_mask(path).mean()))
+            fits = photo.size != (0, 0)
+            mask = read_fitting_mask(path, photo.size, photo.shot.turns) if fits else read_mask(path)
+            kept.append(float(mask.mean()))
         except CaptureError as error:
             yield bad("masks", str(error))
     if not kept:
@@ -248,7 +266,11 @@ def about_reprojection(root: Path) -> Iterator[CaptureFinding]:
     model = find_model(root)
     if model is None:
         return
-    colmap = require_colmap()
+    try:
+        colmap = require_colmap()
+    except CaptureError as error:
+        yield warn("reprojection", f"not computed: {error}")
+        return
     try:
         with quiet_colmap():
             reconstruction = colmap.Reconstruction(model)

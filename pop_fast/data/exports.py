@@ -60,7 +60,7 @@ def find_polycam(root: Path) -> Path | None:
     for keyframes in (root / "keyframes", root):
         for cameras, images in _FOLDERS:
             folder = keyframes / cameras
-            if (keyframes / images).is_dir() and folder.is_dir() and any(folder.glob("*.json")):
+            if (keyframes / images).is_dir() and folder.is_dir() and any(folder.glob("[!.]*.json")):
                 return folder
     return None
 
@@ -76,7 +76,8 @@ def read_polycam(folder: Path, root: Path, images: str) -> tuple[list[PosedImage
     del images
     photos = folder.parent / dict(_FOLDERS)[folder.name]
     relative = photos.relative_to(root).as_posix()
-    files = enumerate(sorted(folder.glob("*.json")), start=1)
+    # hidden are what a Mac puts beside every file on a disk of another system
+    files = enumerate(sorted(folder.glob("[!.]*.json")), start=1)
     return [_shot(path, photos, relative, number) for number, path in files], []
 
 
@@ -115,6 +116,11 @@ def _load(path: Path) -> dict[str, Any]:
     if not isinstance(given, dict):
         raise CaptureError(f"{path}: is no object of a camera's fields (fx, t_00, ...); {fix}")
     return given
+
+
+def _name(written: object) -> str:
+    """Return the name of a file as a list has it, which on Windows may have been written with backslashes."""
+    return Path(str(written).replace("\\", "/")).as_posix()
 
 
 _HEAD = 4096
@@ -308,7 +314,7 @@ def _rows(path: Path) -> list[tuple[str, dict[str, Any]]]:
     absent = [name for name in _NEEDED if name not in table[0]]
     if absent:
         raise CaptureError(f"{path}: has no column {absent[0]}; {_EXPORT_CSV}")
-    named = [(Path(row["#name"].strip().replace("\\", "/")).as_posix(), row) for row in table]
+    named = [(_name(row["#name"].strip()), row) for row in table]
     names = [name for name, _ in named]
     twice = next((name for name, count in Counter(names).items() if count > 1), None)
     if twice is not None:
@@ -411,7 +417,7 @@ def read_transforms(paths: list[Path]) -> tuple[list[PosedImage], SparsePoints |
             raise CaptureError(
                 f"{path}: ply_file_path is {shortened(points)}; it must be the relative name of a PLY file"
             )
-        named = path.parent / points if points else named
+        named = path.parent / _name(points) if points else named
     names = sorted(shot.name for shot in shots)
     twice = [a for a, b in itertools.pairwise(names) if a == b]
     if twice:
@@ -437,18 +443,20 @@ def _load_transforms(path: Path) -> dict[str, Any]:
 
 def _read_listing(path: Path, listing: dict[str, Any], split: Split | None) -> list[PosedImage]:
     splits = _named_splits(path, listing)
+    named = [split for split in ("train", "val", "test") if listing.get(f"{split}_filenames")]
+    rest: Split | None = "test" if named == ["train"] else None if "train" in named else "train"
     shots: list[PosedImage] = []
     for index, frame in enumerate(listing["frames"]):
         where = f"{path}: frames[{index}]"
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise CaptureError(f"{where}: file_path is absent; every frame must name its photograph")
-        name = Path(frame["file_path"].replace("\\", "/")).as_posix()
+        name = _name(frame["file_path"])
         own = split
         if splits:
-            if name not in splits and set(splits.values()) != {"train"}:  # named by no list
+            own = splits.get(name, rest)
+            if own is None:  # named by no list
                 continue
-            own = splits.get(name, "test")
-        mask = path.parent / str(frame["mask_path"]) if frame.get("mask_path") else None
+        mask = path.parent / _name(frame["mask_path"]) if frame.get("mask_path") else None
         fields = _fields(listing, frame)
         angle = _angle(where, fields)
         camera = None if angle is not None else _camera(where, fields, index + 1)
@@ -465,12 +473,14 @@ def _fields(listing: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
 
 
 def _named_splits(path: Path, listing: dict[str, Any]) -> dict[str, Split]:
-    """Read nerfstudio's `train_filenames`, `val_filenames`, `test_filenames`; with the first alone, the rest is test.
+    """Read nerfstudio's `train_filenames`, `val_filenames`, `test_filenames`.
+
+    With the first alone, the rest is test; without the first, the rest is train.
 
     A photograph in several lists belongs to the last of train, val, test: what is tested is never trained on.
     """
     splits: dict[str, Split] = {}
-    listed = {Path(str(f.get("file_path"))).as_posix() for f in listing["frames"] if isinstance(f, dict)}
+    listed = {_name(f.get("file_path")) for f in listing["frames"] if isinstance(f, dict)}
     in_turn: tuple[Split, ...] = ("train", "val", "test")
     for split in in_turn:
         names = listing.get(f"{split}_filenames")
@@ -479,7 +489,7 @@ def _named_splits(path: Path, listing: dict[str, Any]) -> dict[str, Split]:
                 f"{path}: {split}_filenames is {shortened(names)}; it must be a list of file_path entries"
             )
         for name in names or []:
-            name = Path(str(name)).as_posix()
+            name = _name(name)
             if name not in listed:
                 raise CaptureError(f"{path}: {split}_filenames names {name}, which no frame has as its file_path")
             splits[name] = split

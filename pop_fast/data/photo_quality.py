@@ -139,7 +139,11 @@ def look_the_same(thumb: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 def _shrunk(gray: np.ndarray) -> np.ndarray:
     scale = _SIDE / max(gray.shape)
-    return gray if scale >= 1.0 else cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    if scale >= 1.0:
+        return gray
+    # one pixel at least of a strip
+    height, width = gray.shape
+    return cv2.resize(gray, None, fx=max(scale, 1 / width), fy=max(scale, 1 / height), interpolation=cv2.INTER_AREA)
 
 
 def about_quality(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:

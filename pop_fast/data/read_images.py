@@ -200,7 +200,8 @@ def _read(photo: _Photo, options: PhotoOptions, rectify: Any) -> View:
     image = rectification.image(image)
     mask = None
     if photo.mask is not None:
-        mask = _read_mask(photo.mask, (width, height), rectification, size, photo.shot.turns)
+        mask = rectification.mask(read_fitting_mask(photo.mask, (width, height), photo.shot.turns))
+        mask = _check_mask(photo.mask, _resize_mask(mask, size))
     if size != (width, height):
         image = _shrunk(image, size, options.resize)
         alpha = None if alpha is None else _shrunk(alpha, size, options.resize)
@@ -295,17 +296,18 @@ def _over(rgba: np.ndarray, background: tuple[float, float, float]) -> np.ndarra
     return np.rint(mixed).astype(np.uint8)
 
 
-def _read_mask(
-    path: Path, stored: tuple[int, int], rectification: Undistortion, size: tuple[int, int], turns: int
-) -> np.ndarray:
+def read_fitting_mask(path: Path, stored: tuple[int, int], turns: int) -> np.ndarray:
+    """Read the mask of a photograph of a stored size; a CaptureError says that it does not fit, or hides everything."""
     mask = read_mask(path)
     height, width = mask.shape
     if turns % 2 and not _same_shape((width, height), stored) and _same_shape((height, width), stored):
         # drawn over the photograph as viewers show it
         mask = np.ascontiguousarray(np.rot90(mask, turns))
     _check_shape(path, "the mask", (mask.shape[1], mask.shape[0]), "its photograph", stored)
-    mask = rectification.mask(_resize_mask(mask, stored))
-    mask = _resize_mask(mask, size)
+    return _check_mask(path, _resize_mask(mask, stored))
+
+
+def _check_mask(path: Path, mask: np.ndarray) -> np.ndarray:
     if not mask.any():
         raise CaptureError(f"{path}: the mask hides the whole photograph; white means keep: invert it or remove it")
     return mask
@@ -398,8 +400,8 @@ def undistortion(camera: Any, width: int, height: int) -> Undistortion:
     zoom = _smallest_zoom(lambda z: _fits(source(fan.reshape(-1, 2), z).reshape(fan.shape), K[:2, 2], width, height))
     if zoom is None:
         raise ValueError(
-            f"({camera.model_name}) has distortion {camera.params.tolist()} that folds the {width}x{height} image over "
-            "itself; calibrate it again, or undistort the photographs first"
+            f"({camera.model_name}) has distortion {camera.params.tolist()} that folds the image over itself; "
+            "calibrate it again, or undistort the photographs first"
         )
     maps = np.empty((2, height, width), np.float32)
     points = np.empty((width, 2))

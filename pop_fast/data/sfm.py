@@ -44,7 +44,7 @@ from pop_fast.data.exports import photographs_of_polycam
 from pop_fast.data.photo_quality import FIX, Shown, about_mixed_sizes, about_use, measure, number
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import check_folder, folder_atomically
-from pop_fast.io.image_header import HEIF_SUFFIXES, read_exif
+from pop_fast.io.image_header import HEIF_SUFFIXES, is_heif, read_exif
 from pop_fast.io.images import in_threads, list_images, read_image, sound_jpegs, unreadable_photographs, write_png
 
 
@@ -97,7 +97,7 @@ def run_sfm(
     """Find cameras and sparse points, and write them as a COLMAP capture, whole or not at all.
 
     Args:
-        photo_dir: the photographs, in subfolders too.
+        photo_dir: the photographs, in subfolders too; of a capture that has a folder `images`, those in there.
         out_dir: the capture to make, with copies of the photographs in `images`. Without it, `sparse/0` is written
             beside the photographs: in the parent of a folder named `images`, else in `photo_dir` itself; and there too
             where `photo_dir` is given as `out_dir`.
@@ -119,6 +119,7 @@ def run_sfm(
     )
     if not photos.is_dir():
         raise CaptureError(f"{photos}: no such folder; give the folder with the photographs")
+    photos = photo_folder(photos)
     check_camera_model(camera_model)
     capture, target = _place(photos, out_dir)
     names = [path.relative_to(photos) for path in photographs(photos) if not path.resolve().is_relative_to(target)]
@@ -165,7 +166,9 @@ def run_sfm(
 def _place(photos: Path, out_dir: str | Path | None) -> tuple[Path, Path]:
     """Say where the capture is made, and which folder is replaced for it: `sparse` in place, else the whole capture."""
     given = photos.resolve()
-    beside = given.parent if given.name == "images" else given
+    # `images` may be a link to where the photographs are
+    linked = photos if photos.name == "images" else given
+    beside = linked.parent.resolve() if linked.name == "images" else given
     capture = Path(out_dir) if out_dir is not None else beside
     in_place = capture.resolve() in (beside, given)
     if not in_place and given.is_relative_to(capture.resolve()):
@@ -183,10 +186,13 @@ def _stage(photos: Path, names: list[Path], work: Path) -> list[str]:
     staged: list[str] = []
     for i, name in enumerate(names):
         suffix = name.suffix.lower()
-        # HEIC is not read by COLMAP
-        plain = work / "images" / f"{i:06d}{'.png' if suffix in HEIF_SUFFIXES else suffix}"
+        with open(photos / name, "rb") as file:
+            head = file.read(12)
+        # COLMAP reads neither HEIC, which may be named .jpg, nor WebP
+        foreign = suffix in HEIF_SUFFIXES or is_heif(head) or head[8:] == b"WEBP"
+        plain = work / "images" / f"{i:06d}{'.png' if foreign else suffix}"
         staged.append(plain.name)
-        if suffix in HEIF_SUFFIXES:
+        if foreign:
             write_png(plain, read_image(photos / name)[:, :, :3])
             continue
         try:

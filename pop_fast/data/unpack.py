@@ -195,11 +195,11 @@ def _is_ours(file: Path, pattern: str) -> bool:
     return file.suffix == ".jpg" and file.name.startswith(pattern) and file.stem[len(pattern) :].isdigit()
 
 
-def _open(path: Path) -> Any:
+def _open(path: Path, *settings: int) -> Any:
     if not path.is_file():
         raise CaptureError(f"{path}: no such file; give a video")
     with QUIET:
-        video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+        video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, settings)
     if not video.isOpened():
         raise CaptureError(f"{path}: is not a video that OpenCV can read; {_CONVERT}")
     width, height = (int(video.get(size)) for size in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
@@ -215,12 +215,14 @@ def _open(path: Path) -> Any:
 
 
 def _frame_count(path: Path) -> int:
-    """Count by the file's header, or one by one where that tells nothing."""
-    video = _open(path)
+    """Count the frames that are there: the header of a file that was cut short still states them all."""
+    # undecoded, which takes no time, where OpenCV can hand them over so
+    return _count(path, cv2.CAP_PROP_FORMAT, -1) or _count(path)
+
+
+def _count(path: Path, *settings: int) -> int:
+    video = _open(path, *settings)
     try:
-        n_frames = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-        if n_frames > 0:
-            return n_frames
         counted = 0
         while video.grab():
             counted += 1

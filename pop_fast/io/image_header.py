@@ -142,6 +142,21 @@ def bytes_per_pixel(data: bytes) -> int:
     return 4
 
 
+def as_stored(data: bytes) -> bytes:
+    """Return a TIFF file without its orientation, which OpenCV obeys in this format whatever it is told; others as is.
+
+    What is damaged stays so, for the decoder to judge.
+    """
+    order = _TIFF.get(data[:4])
+    try:
+        for entry in _entries(data, 0) if order else ():
+            if struct.unpack_from(f"{order}H", data, entry)[0] == _ORIENTATION:
+                return data[:entry] + struct.pack(f"{order}HHIHH", _ORIENTATION, 3, 1, 1, 0) + data[entry + 12 :]
+    except struct.error:
+        pass
+    return data
+
+
 def read_exif(path: Path) -> Exif:
     """Read the EXIF tags of a photograph; those of a file without any, or a damaged one, are absent."""
     try:
@@ -230,13 +245,19 @@ def _chunk(data: bytes, at: int, name: bytes, form: str, name_at: int, length_at
     return None
 
 
-def _tags(data: bytes, base: int, offset: int | None = None) -> dict[int, Any]:
-    """Read one TIFF directory: by tag, a text or the first of its numbers; struct.error, KeyError where none is."""
+def _entries(data: bytes, base: int, offset: int | None = None) -> range:
+    """Find where the entries of one TIFF directory begin, of 12 bytes each; struct.error, KeyError where none is."""
     order = _TIFF[data[base : base + 4]]
     start = base + (struct.unpack_from(f"{order}I", data, base + 4)[0] if offset is None else offset)
     (count,) = struct.unpack_from(f"{order}H", data, start)
+    return range(start + 2, start + 2 + 12 * count, 12)
+
+
+def _tags(data: bytes, base: int, offset: int | None = None) -> dict[int, Any]:
+    """Read one TIFF directory: by tag, a text or the first of its numbers; struct.error, KeyError where none is."""
+    order = _TIFF[data[base : base + 4]]
     found: dict[int, Any] = {}
-    for entry in range(start + 2, start + 2 + 12 * count, 12):
+    for entry in _entries(data, base, offset):
         tag, kind, length = struct.unpack_from(f"{order}HHI", data, entry)
         if kind not in _WIDTHS:
             continue

@@ -35,6 +35,7 @@ from pop_fast.io.image_header import (
     HEIF_SUFFIXES,
     INSTALL,
     LARGEST,
+    as_stored,
     bytes_per_pixel,
     can_read_heif,
     decode_heif,
@@ -112,9 +113,10 @@ def find_image(folder: Path, name: str) -> Path | None:
         return exact
     if not exact.parent.is_dir():
         return None
-    # nerfstudio and blender name frames with and without their extension
+    # nerfstudio and blender name frames with and without their extension, and raw photographs have been developed
     suffixes = readable_suffixes()
-    stems = {exact.stem, exact.name} if exact.suffix.lower() in suffixes else {exact.name}
+    named = exact.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES, *_UNREADABLE)
+    stems = {exact.stem, exact.name} if named else {exact.name}
     found = sorted(
         path
         for path in exact.parent.iterdir()
@@ -185,9 +187,7 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> None:
 
 def inline_png(image: np.ndarray, longest: int) -> str:
     """Return uint8 [H, W, 3] as an HTML picture that holds its own data, shrunk to sides of at most `longest` px."""
-    scale = longest / max(image.shape[:2])
-    small = image if scale >= 1.0 else cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    _, data = cv2.imencode(".png", cv2.cvtColor(small, cv2.COLOR_RGB2BGR))
+    _, data = cv2.imencode(".png", cv2.cvtColor(fit(image, max_side=longest), cv2.COLOR_RGB2BGR))
     return f'<img src="data:image/png;base64,{base64.b64encode(data.tobytes()).decode()}">'
 
 
@@ -242,9 +242,9 @@ def _decode(path: Path) -> np.ndarray:
         # a size that nobody has seen is nobody's to judge, and OpenCV also decodes what no camera writes
         raise CaptureError(f"{path}: is not a PNG, JPEG, WebP, TIFF, BMP or HEIC image; {FIX}")
     try:
-        # IMREAD_UNCHANGED keeps alpha and 16 bit, and leaves the EXIF orientation alone
+        # IMREAD_UNCHANGED keeps alpha and 16 bit, and leaves the EXIF orientation alone, but for a TIFF's
         with QUIET:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+            image = cv2.imdecode(np.frombuffer(as_stored(data), np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     if image is None or image.size == 0:

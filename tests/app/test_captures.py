@@ -20,6 +20,8 @@ from pop_fast.data import Capture, CaptureError, View, initialize_params, load_c
 from pop_fast.data.cameras import PINHOLES, make_camera
 from pop_fast.data.colmap import model_name, parameter_count, read_model
 from pop_fast.errors import PopError
+from pop_fast.io import images
+from pop_fast.io.images import find_image
 from tests.app.captures import (
     HEIGHT,
     PINHOLE,
@@ -151,13 +153,19 @@ def test_what_else_lies_in_the_folder_and_images_that_are_not_registered_are_lef
     assert names(raw(text)) == ["00.png", "01.png", "02.png"]
 
 
-def test_photographs_that_were_converted_are_found_unless_two_could_be_meant(tmp_path: Path) -> None:
-    root = colmap_capture(tmp_path, names=["a.JPG", "b.jpeg"])
+def test_photographs_that_were_converted_are_found_unless_two_could_be_meant(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(images, "can_read_heif", lambda: False)
+    root = colmap_capture(tmp_path, names=["a.JPG", "b.jpeg", "c.png", "d.png"])
+    for name in ("c.HEIC", "d.ARW"):
+        # developed or converted since
+        assert find_image(root / "images", name) == (root / "images" / name).with_suffix(".png")
     for old, new in (("a.JPG", "a.png"), ("b.jpeg", "b.PNG")):
         (root / "images" / old).unlink()
         cv2.imwrite(str(root / "images" / new.lower()), photograph(3)[..., ::-1])
         (root / "images" / new.lower()).rename(root / "images" / new)
-    assert shows(raw(root), 3, 3)
+    assert shows(raw(root), 3, 3, 2, 3)
     write_photograph(root / "images" / "b.tif", photograph(1))
     assert_one_line(lambda: raw(root), "b.jpeg", "b.PNG", "b.tif", "remove one")
 

@@ -6,6 +6,7 @@ import importlib
 import math
 import re
 import shutil
+import sys
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -21,6 +22,7 @@ from PIL.TiffImagePlugin import IFDRational
 from benchmarks.faults.corpus import HERE
 from cuda_ext import build, toolkit
 from pop_fast.data import Capture, load_capture, sfm
+from pop_fast.data.load import list_capture, write_block
 from pop_fast.data.photo_quality import GAMMA, UNEVEN, Exposures, exposures, exposures_of, levels_at
 from pop_fast.demo import make_demo
 from pop_fast.demo.make import render_view
@@ -28,7 +30,16 @@ from pop_fast.demo.scene import make_scene
 from pop_fast.io import images
 from pop_fast.train import TrainConfig
 from pop_fast.train.automatic import choose_terms
-from tests.app.captures import colmap_capture, look_at, photograph, ring, write_model, write_photograph
+from tests.app.captures import (
+    assert_one_line,
+    camera,
+    colmap_capture,
+    look_at,
+    photograph,
+    ring,
+    write_model,
+    write_photograph,
+)
 from tests.app.conftest import Pop
 from tests.app.damage import says
 
@@ -177,6 +188,46 @@ def test_masks_that_look_inverted_are_pointed_out(check: Check, capture: Path, k
     assert "7 masks keep" in about
     assert ("inverted" in about) == (mark == "LOOK")
     assert said(lines, "1 photographs have none, first view_007.png")
+
+
+def test_what_training_refuses_stands_against_it_in_the_same_words(check: Check, pop: Pop, tmp_path: Path) -> None:
+    def masked(name: str, mask: np.ndarray) -> Path:
+        root = colmap_capture(tmp_path / name)
+        write_photograph(root / "masks" / "00.png", mask)
+        return root
+
+    folded = [camera("SIMPLE_RADIAL", (2.0, 20.0, 15.0, -0.9)), *(camera() for _ in range(3))]
+    one_place = colmap_capture(tmp_path / "one place")
+    write_model(one_place / "sparse" / "0", [f"{i:02d}.png" for i in range(4)], ring(4)[[0, 0, 0, 0]])
+    for root, mark in (
+        (masked("of another shape", np.full((30, 20), 255, np.uint8)), "masks"),
+        (masked("hides everything", np.zeros((30, 40), np.uint8)), "masks"),
+        (colmap_capture(tmp_path / "folded", cameras=folded), "cameras"),
+        (one_place, "poses"),
+    ):
+        message = assert_one_line(lambda root=root: load_capture(root))
+        problem = finding(check(root, 1), "BAD", mark).split(maxsplit=2)[2]
+        # a check names a photograph by its name, and its folder not at all
+        assert message.endswith(problem.removeprefix("00.png: ")), (message, problem)
+
+
+def test_of_a_block_the_whole_capture_is_looked_over(check: Check, root: Path, tmp_path: Path) -> None:
+    listing = list_capture(root)
+    shots = [replace(shot, split="train") for shot in listing.shots[:3]]
+    write_block(tmp_path, replace(listing, shots=shots, transform=np.eye(4)))
+    assert check(tmp_path)[0].endswith(f"a block of {root}")
+    assert check(tmp_path)[1:] == check(root)
+
+
+def test_a_capture_of_pinholes_and_one_with_a_strip_are_looked_over_without_pycolmap(
+    check: Check, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    assert "not computed: pycolmap" in finding(check(root), "LOOK", "reprojection")
+    write_photograph(root / "images" / "panorama.png", np.zeros((2, 4000, 3), np.uint8))
+    for path in (root / "sparse" / "0").iterdir():
+        path.unlink()
+    assert "1 of 4000x2 px" in finding(check(root), "ok", "photographs")
 
 
 def test_photographs_without_a_camera_are_named(check: Check, root: Path) -> None:

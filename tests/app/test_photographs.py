@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -175,14 +176,18 @@ def save(path: Path, orientation: int | None = None) -> Path:
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_the_size_and_exif_are_read_of_every_format_and_any_damage_is_no_error(tmp_path: Path, name: str) -> None:
+def test_size_and_exif_are_read_of_every_format_no_orientation_is_obeyed_and_damage_is_no_error(
+    tmp_path: Path, name: str
+) -> None:
     plain = save(tmp_path / name)
     assert read_size(plain) == (61, 37)
     assert read_exif(plain) == Exif()
+    stored = read_image(plain)
     exposure = () if name.endswith("tif") else (0.008, 400.0, 4.25)
     for orientation in range(1, 9):
         found = read_exif(save(tmp_path / name, orientation))
         assert found == Exif(orientation, "Maker X", *exposure) or name.endswith("bmp")
+        assert np.array_equal(read_image(tmp_path / name), stored)
     whole, random = save(tmp_path / name, 6).read_bytes(), np.random.default_rng(5)
     for _ in range(300):
         data = bytearray(whole[: int(random.integers(0, len(whole)))])
@@ -280,15 +285,32 @@ def test_a_capture_of_heic_photographs_loads(shared_capture: Path, capture: Path
     assert pop("data", "check", capture).status == 0
 
 
-@needs_heif
+def staged_for_colmap(photos: Path, work: Path) -> list[str]:
+    """Give photographs to COLMAP, and return the names that they have there."""
+    work.mkdir()
+    names = [path.relative_to(photos) for path in list_images(photos)]
+    staged = sfm._stage(photos, names, work)
+    for plain, name in zip(staged, names, strict=True):
+        found = pycolmap.Bitmap.read(work / "images" / plain, True)
+        assert found is not None, name
+        np.testing.assert_array_equal(found.to_array(), read_image(photos / name)[..., :3])
+    return staged
+
+
 def test_structure_from_motion_is_given_what_colmap_can_read(tmp_path: Path) -> None:
-    (tmp_path / "work").mkdir()
-    write_photograph(tmp_path / "photos" / "b.png", photograph(3, 128, 96))
+    for name in ("a.webp", "b.png", "c.bmp", "d.tif", "e.jpg"):
+        write_photograph(tmp_path / "photos" / name, photograph(3, 128, 96, 4 if name == "a.webp" else 3))
+    (tmp_path / "photos" / "b.png").rename(tmp_path / "photos" / "b.jpg")
+    staged = staged_for_colmap(tmp_path / "photos", tmp_path / "work")
+    assert staged == ["000000.png", "000001.jpg", "000002.bmp", "000003.tif", "000004.jpg"]
+
+
+@needs_heif
+def test_structure_from_motion_is_given_heic_as_png_whatever_it_is_named(tmp_path: Path) -> None:
+    (tmp_path / "photos").mkdir()
     write_heic(tmp_path / "photos" / "a.heic", photograph(3, 128, 96))
-    staged = sfm._stage(tmp_path / "photos", [Path("a.heic"), Path("b.png")], tmp_path / "work")
-    assert staged == ["000000.png", "000001.png"]
-    found = cv2.imread(str(tmp_path / "work" / "images" / staged[0]))
-    np.testing.assert_array_equal(found[..., ::-1], read_image(tmp_path / "photos" / "a.heic"))
+    shutil.copy(tmp_path / "photos" / "a.heic", tmp_path / "photos" / "b.jpg")
+    assert staged_for_colmap(tmp_path / "photos", tmp_path / "work") == ["000000.png", "000001.png"]
 
 
 # JPEG files with damaged coded pixels, which OpenCV decodes without an error.
@@ -468,5 +490,10 @@ def test_what_is_no_video_is_one_line_and_leaves_nothing(clip: Path, tmp_path: P
     for wrong, message in (({"count": 1}, "count is 1"), ({"max_size": 8}, "max_size is 8")):
         with pytest.raises(PopError, match=message):
             take_frames(clip, out, **wrong)
+    # of one that was cut short, what is there is spread over what is wanted, whatever its header states
+    (tmp_path / "half.avi").write_bytes(clip.read_bytes()[: clip.stat().st_size // 2])
+    taken = take_frames(tmp_path / "half.avi", out, count=8)
+    assert 35 <= taken.of <= 45
+    assert len(taken.frames) + taken.alike == 8
     # training on one says how to take photographs out of it
     assert_one_line(lambda: load_capture(clip), "walk.avi: is a video; ", " pop frames")

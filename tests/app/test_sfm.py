@@ -305,6 +305,23 @@ def test_folders_called_images_and_subfolders_alone_are_loaded(known: None, tmp_
     assert capture.notes == ()
 
 
+def test_a_capture_with_a_folder_images_is_searched_there_and_that_may_be_a_link(known: None, tmp_path: Path) -> None:
+    (tmp_path / "link").mkdir()
+    (tmp_path / "link" / "images").symlink_to(fill(tmp_path / "scene" / "images"))
+    fill(tmp_path / "scene" / "masks")
+    for name in ("0.png", "1.png", "2.png"):
+        write_photograph(tmp_path / "scene" / "images_2" / name, photograph(3, WIDTH // 2, HEIGHT // 2))
+    shutil.copytree(tmp_path / "scene" / "masks", tmp_path / "link" / "masks")
+    for root in (tmp_path / "scene", tmp_path / "link"):
+        result = run_sfm(root)
+        assert (result.capture, result.photographs) == (root, 3)
+        (root / "sparse").rename(root / "before")
+        views = load_capture(root, factor=2, sfm=True).views
+        assert [view.name for view in views] == ["0.png", "1.png", "2.png"]
+        assert (root / "sparse" / "0").is_dir()
+        assert all(view.mask is not None for view in views)
+
+
 def test_the_search_for_cameras_is_told_apart_from_loading(known: None, pop: Pop, tmp_path: Path, monkeypatch) -> None:
     fill(tmp_path / "photos", *(f"{i}.png" for i in range(5)))
     searched = sfm.find_cameras

@@ -181,6 +181,8 @@ def numbers(views) -> str:
         # validation views are tested on where no test views are named, and else the rest
         ({"train": (0, 1), "val": (2,)}, "0 1", "2"),
         ({"train": (0, 3)}, "0 3", "1 2 4 5"),
+        # and what is not tested on is trained on
+        ({"test": (0, 3)}, "1 2 4 5", "0 3"),
         # a photograph in both lists is never trained on
         ({"train": range(6), "test": (0,)}, "1 2 3 4 5", "0"),
     ],
@@ -190,7 +192,9 @@ def test_the_files_own_split_is_kept(tmp_path: Path, listed: dict[str, Any], tra
     capture = raw(transforms_capture(tmp_path, count=6, **split))
     assert numbers(capture.train_views()) == train
     assert numbers(capture.test_views()) == test
-    assert len(capture.views) == len({i for of in listed.values() for i in of} | set(map(int, test.split())))
+    assert len(capture.views) == len(
+        {i for of in listed.values() for i in of} | set(map(int, f"{train} {test}".split()))
+    )
 
 
 def test_blender_captures_have_their_own_split_field_of_view_and_transparency(tmp_path: Path) -> None:
@@ -225,6 +229,26 @@ def test_masks_named_by_a_frame_are_read(root: Path) -> None:
     assert np.array_equal(second.mask, mask == 0)
     edit_transforms(root, lambda listing: listing["frames"][0].update(mask_path="elsewhere/absent.png"))
     assert_one_line(lambda: raw(root), "absent.png")
+
+
+def test_every_name_of_a_list_from_windows_may_have_backslashes(root: Path) -> None:
+    write_photograph(root / "masks of it" / "m.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    (root / "points").mkdir()
+    write_points(root / "points" / "all.ply")
+
+    def from_windows(listing: dict[str, Any]) -> None:
+        for frame in listing["frames"]:
+            frame |= {"file_path": frame["file_path"].replace("/", "\\"), "mask_path": "masks of it\\m.png"}
+        listing["train_filenames"] = [frame["file_path"] for frame in listing["frames"][1:]]
+        listing["ply_file_path"] = ".\\points\\all.ply"
+
+    edit_transforms(root, from_windows)
+    capture = raw(root)
+    assert [(view.name, view.split) for view in capture.views] == [
+        ("images/00.png", "test"),
+        *((f"images/0{i}.png", "train") for i in (1, 2, 3)),
+    ]
+    assert all(view.mask is not None for view in capture.views)
 
 
 def test_colmap_is_preferred_unless_the_other_is_asked_for(root: Path) -> None:
@@ -427,6 +451,12 @@ def test_polycams_first_cameras_are_read_where_it_has_not_corrected_them(origina
     assert [path.relative_to(folder).as_posix() for path in photographs(folder)] == [
         f"keyframes/corrected_images/view_{i:03d}.png" for i in range(8)
     ]
+
+
+def test_what_a_mac_leaves_beside_polycams_cameras_is_none_of_them(original: Capture, write: Callable) -> None:
+    folder = write("polycam")
+    (folder / "keyframes" / "corrected_cameras" / "._view_000.json").write_bytes(b"\0\5\x16\7")
+    assert_same_cameras(raw(folder, points=20), original)
 
 
 def test_points_in_the_folder_of_an_export_are_read(write: Callable[..., Path]) -> None:
