@@ -16,6 +16,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 import numpy as np
 import pycolmap
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -42,6 +43,7 @@ from pop_fast.train.automatic import (
     factor_for,
 )
 from pop_fast.train.config import first_difference
+from pop_fast.train.load_result import Splat
 from pop_fast.train.presets import (
     METHODS,
     QUICK_BETA2_UNTIL,
@@ -281,6 +283,12 @@ def test_colour_bands_open_one_every_interval():
     assert [active_sh_degree(s, 1000, 3) for s in (0, 999, 1000, 2999, 3000, 29_999)] == [0, 0, 1, 2, 3, 3]
     assert active_sh_degree(5000, 1000, 1) == 1
     assert [active_sh_degree(s, 1000, 3, 15_000) for s in (0, 15_999, 16_000, 18_000)] == [0, 0, 1, 3]
+    # a checkpoint has room for all bands, also where a run opens fewer
+    rows = {"shN": torch.zeros(1, 15, 3)}
+    drawn = {
+        n: Splat(path=Path(), params=rows, config=TrainConfig(sh_degree=n), step=9000, folder=Path()) for n in (0, 1, 3)
+    }
+    assert [splat.sh_degree for splat in drawn.values()] == [0, 1, 3]
 
 
 def test_every_epoch_shows_every_view_once_and_goes_on_where_it_was_saved():
