@@ -251,8 +251,8 @@ class Driven:
         method = self.script.method
         if step in self.recipe.adam_restarts:
             return self._round(step) if method == "pup" else self._mini_splatting(step)
-        done: dict[str, int] = {}
         full = method == "mini-splatting" and self.n >= self.extras.max_gaussians
+        done: dict[str, int] = {}
         if density.densifies_at(step, self.recipe.density) and not full:
             done = self._refine(step)
         if method == "speedy-splat":
