@@ -242,20 +242,22 @@ class Driven:
 
     def change(self, step: int) -> dict[str, int]:
         """Do what is due after a step, and return what was done by its kind."""
-        method, config = self.script.method, self.recipe.density
-        if step in self.recipe.adam_restarts:
-            return self._round(step) if method == "pup" else self._mini_splatting(step)
-        done: dict[str, int] = {}
-        if density.densifies_at(step, config):
-            if method == "mini-splatting" and self.n >= self.extras.max_gaussians:
-                return done
-            done = self._refine(step)
-        if method == "speedy-splat":
-            return self._reset(step, self._prune_by_sensitivity(step, done))
-        done = self._reset(step, done)
+        done, config = self._edited(step), self.recipe.density
         if step == config.final_prune_iter:
             done = self._prune(1.0 / (1.0 + np.exp(-self.rows.params["opacities"])) < config.final_prune_opa, done)
         return done
+
+    def _edited(self, step: int) -> dict[str, int]:
+        method = self.script.method
+        if step in self.recipe.adam_restarts:
+            return self._round(step) if method == "pup" else self._mini_splatting(step)
+        full = method == "mini-splatting" and self.n >= self.extras.max_gaussians
+        done: dict[str, int] = {}
+        if density.densifies_at(step, self.recipe.density) and not full:
+            done = self._refine(step)
+        if method == "speedy-splat":
+            return self._reset(step, self._prune_by_sensitivity(step, done))
+        return self._reset(step, done)
 
     def _reset(self, step: int, done: dict[str, int]) -> dict[str, int]:
         if not density.resets_at(step, self.recipe.density):
@@ -313,8 +315,8 @@ class Driven:
             photometric = losses.photometric_3dgs(view.image, photo / 255.0, padding="same")
             o, scales = 1.0 / (1.0 + np.exp(-params["opacities"])), np.exp(params["scales"])
             scores += taming.view_score(photometric, grads, o, scales, view.depths, view.radii, found)
-        n = (config.refine_stop_iter - config.refine_start_iter) // config.refine_every
-        nth = (step - config.refine_start_iter) // config.refine_every
+        before = config.refine_start_iter // config.refine_every
+        n, nth = (at // config.refine_every - before for at in (config.refine_stop_iter, step))
         target = extras.final_count or int(extras.budget_multiplier * self.first_count)
         budget = taming.budget_at(nth, n, self.first_count, target)
         quotas = taming.quotas(budget, self.n, int(np.sum(clone)), int(np.sum(split)))

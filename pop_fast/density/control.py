@@ -301,12 +301,16 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
 
         draws = draws or Draws.of(state["generator"])
         with torch.no_grad():
-            return self.edit(DensificationContext(params, optimizers, state, step, draws, passes, sh_degree))
+            context = DensificationContext(params, optimizers, state, step, draws, passes, sh_degree)
+            done = self.prune_finally(context, self.edit(context))
+        if self.verbose:
+            print(f"step {step}: {done}, {len(context)} Gaussians")
+        return done
 
     def edit(self, context: DensificationContext) -> DensificationStep:
-        """Do what is due after a step after which the Gaussians change: refine, reset, prune for the last time."""
+        """Do what is due after a step after which the Gaussians change, before the last prune: refine, reset."""
         done = self.refine(context) if self.is_refine_step(context.step) else DensificationStep()
-        return self.prune_finally(context, self.reset(context, done))
+        return self.reset(context, done)
 
     def refine(self, context: DensificationContext) -> DensificationStep:
         """Clone, split and prune by the window's statistics."""
@@ -336,8 +340,6 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
             rows.split(*edited, padded, context.draws.normals(n_splits), self.revised_opacity)
         done = DensificationStep(n_clones, n_splits, rows.prune_marked(context, prunes()))
         rows.clear(context.state)
-        if self.verbose:
-            print(f"step {context.step}: {done}, {len(context)} Gaussians")
         return done
 
     def planned_growth(self, context: DensificationContext) -> tuple[Tensor, Tensor]:

@@ -139,14 +139,16 @@ class MiniSplattingStrategy(InriaStrategy):
 
     def edit(self, context: DensificationContext) -> DensificationStep:
         """Do what is due after this step."""
-        if context.step in self.adam_restarts:
-            if context.step in self.reinit_iters:
-                return self._set_anew_from_depth(context)
-            is_draw = context.step == self.sample_iter
-            return self._draw_by_importance(context) if is_draw else self._prune_by_importance(context)
-        if self.is_refine_step(context.step) and len(context) >= self.max_gaussians:
-            return DensificationStep()
-        return super().edit(context)
+        if context.step not in self.adam_restarts:
+            return super().edit(context)
+        if context.step in self.reinit_iters:
+            return self._set_anew_from_depth(context)
+        is_draw = context.step == self.sample_iter
+        return self._draw_by_importance(context) if is_draw else self._prune_by_importance(context)
+
+    def refine(self, context: DensificationContext) -> DensificationStep:
+        """Clone, split and prune as 3DGS, unless there are too many Gaussians."""
+        return DensificationStep() if len(context) >= self.max_gaussians else super().refine(context)
 
     def _set_anew_from_depth(self, context: DensificationContext) -> DensificationStep:
         """Replace all Gaussians by points of the training views, with their pixels' colours."""
@@ -375,11 +377,11 @@ class TamingStrategy(InriaStrategy):
     @property
     def n_densifications(self) -> int:
         """Return in how many steps of the parabola the budget is reached."""
-        return (self.refine_stop_iter - self.refine_start_iter) // self.refine_every
+        return self.densification_at(self.refine_stop_iter)
 
     def densification_at(self, step: int) -> int:
         """Return which step of the parabola this is, from 1."""
-        return (step - self.refine_start_iter) // self.refine_every
+        return step // self.refine_every - self.refine_start_iter // self.refine_every
 
     def refine(self, context: DensificationContext) -> DensificationStep:
         """Clone, split and prune the Gaussians that are drawn."""

@@ -23,7 +23,7 @@ from pop_fast.errors import PopError
 from pop_fast.io.heartbeat import duration
 from pop_fast.train.choose import on_gpu
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.presets import AUTOMATIC, QUICK_SCALER
+from pop_fast.train.presets import AUTOMATIC, QUICK_SCALER, Given
 from pop_fast.train.steps import why_not_trained
 
 if TYPE_CHECKING:
@@ -357,9 +357,16 @@ def check_minutes(minutes: float | None, config: TrainConfig, automatic: bool) -
         return
     if not 0.0 < minutes < math.inf:
         raise PopError(f"--minutes is {minutes}; it must be > 0 and finite")
-    if not automatic:
-        said = f"--preset {config.preset}" if config.preset != "paper" else "--preset, --steps-scaler or --max-steps"
-        raise PopError(f"--minutes chooses the schedule, but {said} sets another; leave one of them out")
+    given = config.given or Given()
+    said = {
+        "--max-steps": "max_steps" in given.settings,
+        "--steps-scaler": given.steps_scaler is not None,
+        f"--preset {given.preset}": given.preset not in (Given.preset, AUTOMATIC),
+        f"--preset {Given.preset}, --blocks, torchrun or the run that is resumed": not automatic,
+    }
+    for option, has_another in said.items():
+        if has_another:
+            raise PopError(f"--minutes chooses the schedule, but {option} has another; leave one of them out")
 
 
 def line_of(choice: Choice, config: TrainConfig, size: tuple[int, int]) -> str:

@@ -42,6 +42,19 @@ _FREE: Final = frozenset(
         *("max_renders", "progress", "lpips_vgg", "lpips_alex", "target_cache_mb"),
     }
 )
+# a batch of one, a profile's own near plane and low-pass, photographs at their size, rates that stay, Adam's usual
+# decay and no regularizers are what every run had before there were others: its checkpoints say nothing of them
+_USUAL: Final = {
+    "batch_size": 1,
+    "near_plane": None,
+    "eps2d": None,
+    "coarse_stop_iters": [],
+    "lr.others_decay": 1.0,
+    "lr.beta2": BETAS[1],
+    "depth_lambda": 0.0,
+    "opacity_reg": 0.0,
+    "scale_reg": 0.0,
+}
 # settings of density control that are gone, with the value at which they did nothing: results with it still open
 _GONE: Final = {"blur_stop_gain": 0.0, "blur_stop_span": 5}
 # the two parts of cfg.json
@@ -206,9 +219,13 @@ class TrainConfig:
         Raises:
             PopError: an unknown option, or a value that it cannot have; names it.
         """
-        usual, said = cls.of(method=method, preset=preset).flat(), dict[str, Any]()
+        options, plan = dict(_options_of(words)), {"method": method, "preset": preset}
+        for name in ("method", "preset", "steps_scaler", "scale_lambda_pop"):
+            if name in options:
+                plan[name] = (options.pop(name) or [True])[0]
+        usual, said = cls.of(**plan).flat(), dict[str, Any]()
         dashed = {name.replace("-", "_"): name for name in usual}
-        for option, values in _options_of(words):
+        for option, values in options.items():
             group, dot, last = option.rpartition(".")
             name, positive = (dashed.get(n, n) for n in (option, f"{group}{dot}{last.removeprefix('no_')}"))
             if not values and name not in usual:
@@ -218,8 +235,8 @@ class TrainConfig:
             else:
                 said[name] = values[0] if len(values) == 1 else " ".join(map(str, values)) or True
         # as the settings have them, in their order: a whole number where a real one is meant is one
-        resolved = cls.of(method=method, preset=preset, **said).flat()
-        return cls.of(method=method, preset=preset, **{name: resolved[name] for name in resolved if name in said})
+        resolved = cls.of(**plan, **said).flat()
+        return cls.of(**plan, **{name: resolved[name] for name in resolved if name in said})
 
     def with_overrides(self, **overrides: Any) -> Self:
         """Return these settings with some said anew; those not given stay the defaults they are."""
@@ -227,9 +244,9 @@ class TrainConfig:
             return replace(self, **overrides)
         again = Given.of(overrides, method=self.given.method)
         given = replace(self.given, settings={**self.given.settings, **again.settings})
-        bound = (*defaults(given), *overrides)
-        free = {name: value for name, value in _as_dict(self).items() if name not in bound}
-        return replace(self._promised(given), **free, given=given)
+        free = {name: value for name, value in _as_dict(self).items() if name not in defaults(given)}
+        plain = to_plain({**_as_dict(self._promised(given)), **free})
+        return replace(self._from_values(laid_over(plain, again), given.method), given=given)
 
     @classmethod
     def _promised(cls, given: Given) -> Self:
@@ -322,19 +339,8 @@ class TrainConfig:
 
     def binding(self) -> dict[str, Any]:
         """Return the settings that a resumed run must share, flat."""
-        # a batch of one, a profile's own near plane and low-pass, photographs at their size, rates that stay, Adam's
-        # usual decay and no regularizers are what every run had before there were others: its checkpoints say nothing
-        # of them
-        usual = {
-            "batch_size": self.batch_size == 1,
-            **{name: getattr(self, name) is None for name in ("near_plane", "eps2d")},
-            "coarse_stop_iters": not self.coarse_stop_iters,
-            "lr.others_decay": self.lr.others_decay == 1.0,
-            "lr.beta2": self.lr.beta2 == BETAS[1],
-            **{name: getattr(self, name) == 0.0 for name in ("depth_lambda", "opacity_reg", "scale_reg")},
-        }
-        free = _FREE | {name for name, is_usual in usual.items() if is_usual}
-        return {name: value for name, value in self.flat().items() if name not in free}
+        found = {name: value for name, value in self.flat().items() if name not in _FREE}
+        return {name: value for name, value in found.items() if name not in _USUAL or value != _USUAL[name]}
 
     def flat(self) -> dict[str, Any]:
         """Return all settings as they are run, as plain values by dotted name."""
@@ -379,8 +385,9 @@ def _as_dict(config: TrainConfig) -> dict[str, Any]:
 def first_difference(ours: dict[str, Any], theirs: dict[str, Any]) -> tuple[str, Any, Any] | None:
     """Return the first setting in which two `binding()`s differ, with both values, or None."""
     for name in [*ours, *(name for name in theirs if name not in ours)]:
-        if ours.get(name) != theirs.get(name):
-            return name, ours.get(name), theirs.get(name)
+        mine, other = (values.get(name, _USUAL.get(name)) for values in (ours, theirs))
+        if mine != other:
+            return name, mine, other
     return None
 
 
@@ -405,11 +412,11 @@ _AT_LEAST_OF_STRATEGY: Final = {
     **dict.fromkeys(("reset_every", "pause_refine_after_reset", "final_count", "sampled_prunes"), 0),
 }
 _SHARES_OF_STRATEGY: Final = (
-    *("prune_opa", "theta_blur", "reset_opa", "final_prune_opa", "soft_prune_share", "hard_prune_share"),
+    *("prune_opa", "theta_blur", "final_prune_opa", "soft_prune_share", "hard_prune_share"),
     *("prune_shares", "sampling_factor", "prune_mass"),
 )
 # of which a logarithm is taken from both sides
-_BETWEEN_OF_STRATEGY: Final = ("reinit_opacity",)
+_BETWEEN_OF_STRATEGY: Final = ("reset_opa", "reinit_opacity")
 
 
 def check_values(config: TrainConfig) -> None:

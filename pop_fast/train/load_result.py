@@ -43,7 +43,9 @@ class Splat:
             return degree
         from pop_fast.train.schedule import active_sh_degree
 
-        return active_sh_degree(self.step, self.config.sh_interval, degree, self.config.strategy.sh_start_iter)
+        config = self.config
+        degree = min(degree, config.sh_degree)
+        return active_sh_degree(self.step, config.sh_interval, degree, config.strategy.sh_start_iter)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -212,10 +212,9 @@ def method_of(strategy: DensityControl) -> str:
 
 def defaults(given: Given) -> dict[str, Any]:
     """Return every setting that method, preset and scaler decide, without overrides, by its name in `TrainConfig`."""
-    kind, recipe, _ = METHODS[given.method]
-    by = given.scaler
+    recipe, by = METHODS[given.method].recipe, given.scaler
     values = values_of(recipe)
-    strategy = kind().scaled(by)
+    strategy = METHODS[given.method].strategy().scaled(by)
     if given.scale_lambda_pop:
         strategy = replace(strategy, lambda_pop=strategy.lambda_pop / by)
     if given.preset in ("quick", AUTOMATIC):
@@ -291,7 +290,7 @@ def words_of(given: Given, without: Collection[str] = ()) -> list[str]:
     """Return the options of `pop train` that ask for a run as it was asked for, without some settings."""
     words = [] if given.method == Given.method else ["--method", given.method]
     words += ["--preset", given.preset] if given.preset != Given.preset else []
-    words += [] if given.steps_scaler is None else ["--steps-scaler", f"{given.steps_scaler:g}"]
+    words += [] if given.steps_scaler is None else ["--steps-scaler", _number(given.steps_scaler)]
     words += ["--scale-lambda-pop"] if given.scale_lambda_pop else []
     for name, value in given.settings.items():
         if name not in without and value is not None:
@@ -305,7 +304,12 @@ def _words(name: str, value: Any) -> list[str]:
         return [f"--{group}{dot}{'' if value else 'no-'}{rest}"]
     if isinstance(value, list | tuple):
         return [f"--{group}{dot}{rest}", *map(str, value)]
-    return [f"--{group}{dot}{rest}", f"{value:g}" if isinstance(value, float) else str(value)]
+    return [f"--{group}{dot}{rest}", _number(value) if isinstance(value, float) else str(value)]
+
+
+def _number(value: float) -> str:
+    """Write a number in few digits where these read back as the same number."""
+    return f"{value:g}" if float(f"{value:g}") == value else str(value)
 
 
 def laid_over(plain: dict[str, Any], given: Given) -> dict[str, Any]:

@@ -56,7 +56,7 @@ def updates_of(
         moved[rules.opacities_stop_iter :, PARAMETERS.index("opacities")] = False
     moved[:, PARAMETERS.index("shN")] &= (steps + 1) % rules.sh_rest_every == 0
     numbers = moved.cumsum(0)
-    for step in sorted(restarts):
+    for step in sorted(set(restarts)):
         numbers[step + 1 :] -= numbers[step].clone()
     return Updates(rates, (numbers * moved).to(torch.int32), rules.sh_rest_every, (BETAS[0], lr.beta2))
 

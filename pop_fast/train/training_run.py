@@ -200,7 +200,7 @@ class TrainingRun:
         self._watched = self._ranks.any(self._watch is not None)
         with bars as bar, Heartbeat(shown, draw=bar.refresh) as beat:
             beat.say(f"step {self.step:,} of {config.max_steps:,}, {len(self.params['means']):,} Gaussians")
-            while self.step < config.max_steps:
+            while self.step < config.max_steps and not self._ranks.any(self._stop.asked):
                 longest = min(self.stepper.longest, _WATCHED_STEPS if self._watched else config.max_steps)
                 segment = self.take_steps(segment_end(config, self.strategy, self.step, longest))
                 if segment.stats:
@@ -216,10 +216,11 @@ class TrainingRun:
                     self._milestones(self.step - 1)
                     if self._watch is not None:
                         self._watch(self)
-                if self._ranks.any(self._stop.asked) and self.step < config.max_steps:
-                    if self._unwritten is None:
-                        self._save()
-                    raise KeyboardInterrupt
+            if self._ranks.any(self._stop.asked):
+                # after the last step there is a checkpoint
+                if self._unwritten is None and self.step < config.max_steps:
+                    self._save()
+                raise KeyboardInterrupt
         last = config.max_steps - 1
         return (self._results.read_stats("val", last) or self._evaluate(last)) if self._ranks.writes else {}
 

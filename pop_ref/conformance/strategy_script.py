@@ -217,7 +217,7 @@ _READINGS: Final[tuple[tuple[str, dict[str, Any], dict[str, Any]], ...]] = (
     ("gsplat", {**SCREEN, "inclusive": True, "pause_refine_after_reset": 3}, {"cameras": 2, "packed": True}),
     ("gsplat", {"sh_rest_every": 3, "edits_replace_update": True, "revised_opacity": True}, {}),
     ("gsplat", {"prune_opa": 0.3, "prune_too_big": False}, {"steps": EVERY_STEP[:14]}),
-    ("mini-splatting", {"importance": "outdoor", "max_gaussians": 40}, {"cameras": 2}),
+    ("mini-splatting", {**RESETS, "importance": "outdoor", "max_gaussians": 40}, {"cameras": 2}),
     ("taming", {"final_count": 30, "misaligned_prune_weights": False}, {"packed": True}),
     # bounds that extents come up to, 3 and 4 of 16 px
     (

@@ -10,11 +10,13 @@ import os
 import zipfile
 from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pycolmap
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -41,7 +43,17 @@ from pop_fast.train.automatic import (
     factor_for,
 )
 from pop_fast.train.config import first_difference
-from pop_fast.train.presets import METHODS, QUICK_BETA2_UNTIL, QUICK_RATES, QUICK_SCALER, Given, options_for, to_plain
+from pop_fast.train.load_result import Splat
+from pop_fast.train.presets import (
+    METHODS,
+    QUICK_BETA2_UNTIL,
+    QUICK_RATES,
+    QUICK_SCALER,
+    Given,
+    options_for,
+    to_plain,
+    words_of,
+)
 from pop_fast.train.results import read_config
 from pop_fast.train.schedule import ViewOrder, active_sh_degree, updates_of
 from pop_fast.view.paths import VideoFile
@@ -220,6 +232,9 @@ def test_a_label_cannot_be_carried_by_settings_that_do_not_follow_it():
     # where it runs and where it writes is not part of a preset
     assert replace(quick, result_dir="x", backend="fast").with_overrides(seed=1).result_dir == "x"
     assert TrainConfig().preset is None
+    exposed = replace(quick, appearance_lr=AppearanceRates(exposures=0.5))
+    learned = exposed.with_overrides(**{"appearance_lr.cameras": 0.1})
+    assert learned.appearance_lr == AppearanceRates(exposures=0.5, cameras=0.1)
     # what was run is read back also where the preset has other values now
     written = json.loads(quick.to_json())
     written["resolved"]["max_steps"] = 2500
@@ -256,10 +271,10 @@ def test_a_run_moves_whom_the_oracle_moves_when_and_as_far(recipe):
         assert found.numbers[step].tolist() == [numbers.get(name, 0) for name in PARAMETERS]
 
 
-def test_restarts_outside_the_run_change_no_update():
+def test_restarts_outside_the_run_and_twice_at_a_step_change_no_update():
     rules = UpdateRules(edits_replace_update=True)
     some = updates_of(LearningRates(), 1.0, 12, rules, [3], [7])
-    more = updates_of(LearningRates(), 1.0, 12, rules, [-1, 3, 40], [-1, 7, 12])
+    more = updates_of(LearningRates(), 1.0, 12, rules, [-1, 3, 40], [-1, 7, 7, 12])
     assert some.numbers.equal(more.numbers)
     assert some.numbers[:, 0].tolist() == [1, 2, 3, 0, 4, 5, 6, 0, 1, 2, 3, 4]
 
@@ -268,6 +283,12 @@ def test_colour_bands_open_one_every_interval():
     assert [active_sh_degree(s, 1000, 3) for s in (0, 999, 1000, 2999, 3000, 29_999)] == [0, 0, 1, 2, 3, 3]
     assert active_sh_degree(5000, 1000, 1) == 1
     assert [active_sh_degree(s, 1000, 3, 15_000) for s in (0, 15_999, 16_000, 18_000)] == [0, 0, 1, 3]
+    # a checkpoint has room for all bands, also where a run opens fewer
+    rows = {"shN": torch.zeros(1, 15, 3)}
+    drawn = {
+        n: Splat(path=Path(), params=rows, config=TrainConfig(sh_degree=n), step=9000, folder=Path()) for n in (0, 1, 3)
+    }
+    assert [splat.sh_degree for splat in drawn.values()] == [0, 1, 3]
 
 
 def test_every_epoch_shows_every_view_once_and_goes_on_where_it_was_saved():
@@ -306,6 +327,8 @@ def test_every_epoch_shows_every_view_once_and_goes_on_where_it_was_saved():
         ({"strategy": {"prune_opa": 2}}, r"pop\.prune_opa is 2\.0; it must lie in \[0, 1\]"),
         ({"method": "gsplat", "strategy": {"grow_grad2d": float("inf")}}, r"gsplat\.grow_grad2d is inf"),
         ({"strategy": {"refine_every": 0}}, r"pop\.refine_every is 0; it must be at least 1"),
+        ({"strategy": {"reset_opa": 0}}, r"pop\.reset_opa is 0\.0; it must lie between 0 and 1"),
+        ({"strategy": {"reset_opa": 1}}, r"pop\.reset_opa is 1\.0; it must lie between 0 and 1"),
     ],
 )
 def test_bad_settings_are_named(change, message):
@@ -367,6 +390,10 @@ def test_a_resumed_run_must_share_what_reaches_the_bits_and_only_that():
     assert first_difference(config.binding(), other.binding()) == ("pop.theta_blur", 2e-5, 1e-4)
     assert other.digest() != config.digest()
     assert first_difference(config.binding(), TrainConfig.of(method="gsplat").binding()) == ("method", "pop", "gsplat")
+    # what checkpoints leave out as every run had it is said as it was
+    four = replace(config, batch_size=4)
+    assert first_difference(config.binding(), four.binding()) == ("batch_size", 1, 4)
+    assert first_difference(four.binding(), config.binding()) == ("batch_size", 4, 1)
 
 
 def test_two_ways_to_say_the_same_schedule_are_the_same_run():
@@ -408,6 +435,22 @@ def assert_trains(config, recipe):
 @pytest.mark.parametrize("name", ROWS)
 def test_a_row_can_be_trained_from_the_command_line(name):
     assert_trains(arguments(["scene", *options_for(ROWS[name])])[0], ROWS[name])
+    assert_trains(TrainConfig.from_options(options_for(ROWS[name])), ROWS[name])
+
+
+def test_the_options_of_a_run_say_its_numbers_to_the_last_digit():
+    asked = TrainConfig.of(steps_scaler=0.123456789, init_scale=2.0, **{"lr.means": 1.23456789e-4}).given
+    words = ["--steps-scaler", "0.123456789", "--init-scale", "2", "--lr.means", "0.000123456789"]
+    assert words_of(asked) == words
+    assert arguments(["scene", *words])[0].given.settings == {"data": "scene", **asked.settings}
+    assert TrainConfig.from_options([*words, "--preset", "quick"]).given == replace(asked, preset="quick")
+
+
+def test_a_method_may_be_any_object_that_has_what_one_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = SimpleNamespace(**METHODS["gsplat"]._asdict())
+    monkeypatch.setitem(METHODS._given, "mine", plain)
+    assert TrainConfig.of(method="mine").strategy == GsplatStrategy()
+    METHODS.look_again()
 
 
 def test_rows_differ_and_their_options_are_few():
@@ -647,7 +690,11 @@ def test_depth_that_no_track_tells_is_warned_of(pop: Pop, capture: Path, tmp_pat
 def test_minutes_and_a_schedule_exclude_each_other(pop: Pop, shared_capture: Path, tmp_path: Path) -> None:
     words = ("train", shared_capture, "--out", tmp_path / "r", "--minutes")
     for schedule in (("--preset", "quick"), ("--max-steps", "9"), ("--steps-scaler", "0.1")):
-        says(pop(*words, "5", *schedule), "--minutes", "leave one of them out")
+        says(pop(*words, "5", *schedule), f"--minutes chooses the schedule, but {schedule[0]}", "leave one of them out")
+    for schedule in (("--max-steps", "9"), ("--steps-scaler", "0.1")):
+        said = f"--minutes chooses the schedule, but {schedule[0]} has another"
+        says(pop(*words, "5", "--preset", "auto", *schedule), said)
+    says(pop(*words, "5", "--blocks", "2x1"), "--minutes chooses the schedule, but --preset paper, --blocks, torchrun")
     says(pop(*words, "-1"), "--minutes is -1.0")
 
 

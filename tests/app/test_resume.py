@@ -112,6 +112,21 @@ def test_ctrl_c_writes_a_checkpoint_of_the_step_it_came_at(tmp_path):
     assert [number for number, _ in ckpt.list_checkpoints(tmp_path)] == [6]
 
 
+def test_a_request_to_stop_is_heard_while_the_last_checkpoint_is_written(tmp_path, monkeypatch):
+    saved = ckpt.save_checkpoint
+
+    def asked(path, content):
+        if content["step"] == 29:
+            os.kill(os.getpid(), signal.SIGTERM)
+        saved(path, content)
+
+    monkeypatch.setattr(ckpt, "save_checkpoint", asked)
+    with pytest.raises(KeyboardInterrupt):
+        run_to(tmp_path)
+    assert ckpt.list_checkpoints(tmp_path)[-1][0] == 29
+    assert TrainingRun(tiny_config(tmp_path), tiny_capture(), resume=True).run()["step"] == 29
+
+
 def test_a_second_ctrl_c_is_obeyed_at_once_and_handlers_are_put_back():
     # a session in the background may have been started with it ignored
     inherited = signal.signal(signal.SIGINT, signal.default_int_handler)

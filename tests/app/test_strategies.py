@@ -131,6 +131,20 @@ def test_missing_dominant_counts_are_explained():
     densified_at(GsplatStrategy(), params, optimizers, info, 600)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_prunes_for_the_last_time_and_resets_when_it_is_asked_to(method, capsys):
+    own = {"max_gaussians": 1} if method == "mini-splatting" else {"refine_every": 7}
+    when = {"refine_start_iter": 0, "reset_every": 6, "final_prune_iter": 6, "final_prune_opa": 0.4}
+    plan = replace(METHODS[method].strategy(), **own, **when, reset_opa=0.3, verbose=True)
+    params, optimizers = make(3)
+    with torch.no_grad():
+        params["opacities"][0] = -1.0
+    done = plan.change(params, optimizers, plan.initialize_state(1.0), 6)
+    # the reset brings all of them under what survives
+    assert (done.reset, done.pruned, len(params["means"])) == (True, 3, 0)
+    assert "step 6: " in capsys.readouterr().out
+
+
 def test_sanity_checks_name_the_key():
     params, optimizers = make(2)
     strategy = POPStrategy()
@@ -259,6 +273,12 @@ def test_every_method_densifies_resets_and_prunes_when_its_paper_says() -> None:
     assert [plan.densification_at(step) for step in densified] == list(range(1, 29))
     assert plan.n_densifications == 29
     assert taming.budget_at(29, plan.n_densifications, 1000, plan.target(1000)) == 2000
+    # from the first change on, also of a schedule that starts between two
+    for scaler in (0.01, 0.05, 0.3, 0.77):
+        short = plan.scaled(scaler)
+        nths = [short.densification_at(step) for step in steps(short.is_refine_step)]
+        assert nths == list(range(1, len(nths) + 1))
+        assert 1 <= len(nths) <= short.n_densifications <= len(nths) + 1
     # two rounds after the training
     config = TrainConfig.of(method="pup")
     assert config.max_steps == 40_000
