@@ -177,7 +177,7 @@ def page_of(
         f'<div id="panel"><span class="buttons">{buttons}</span><span id="name"></span>'
         f'<span id="help">{keys}</span></div>'
         f"{held}<script>{asset('html', 'viewer.js')}</script></body></html>\n"
-    ).encode()
+    ).encode("utf-8", "backslashreplace")
 
 
 def _scene(means: Tensor, cameras: Sequence[PageCamera], config: TrainConfig) -> dict[str, Any]:
