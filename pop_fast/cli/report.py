@@ -36,5 +36,5 @@ def run(argv: Sequence[str]) -> int:
         checked(args.result, splat, *open_with_bars(splat, args))
     from pop_fast.view.report import write_report
 
-    print(write_report(args.result))
+    print(write_report(args.result, args.capture))
     return 0
