@@ -18,7 +18,8 @@ from pop_fast.train.load_result import load_splat
 class Args(CaptureArguments):
     """Write report.html into a result folder, from the files in it; also for a run that was stopped.
 
-    --check renders first what older and stopped runs lack, with the capture: depth, the orbit, floaters, exposure.
+    --check renders first what older and stopped runs lack, with the capture: depth, the orbit, floaters, exposure. The
+    report's commands name --capture, where the capture has moved.
     """
 
     result: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT")]

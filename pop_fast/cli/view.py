@@ -81,17 +81,17 @@ def make_viewer(args: Args, splat: Splat) -> LiveViewer:
         capture, config = open_with_bars(splat, args)
         scene = SplatScene(splat.params, config, splat.sh_degree, backend, capture.world_transform)
         stands = stands_of_capture(capture, config.test_every, splat.params["means"])
-    path = splat.folder or splat.path
-    return LiveViewer(scene, stands, path.resolve().stem, args.host, args.port)
+    title = splat.folder.resolve().name if splat.folder else splat.path.resolve().stem
+    return LiveViewer(scene, stands, title, args.host, args.port)
 
 
 def stands_of_capture(capture: Capture, test_every: int, means: Any) -> list[Any]:
-    """Make places to look from of the training views, at most sixty."""
+    """Make places to look from of the training views, or where there are none of all, at most sixty."""
     from pop_fast.io.images import fit
     from pop_fast.view.html import cameras_of
     from pop_fast.view.live.server import stands_of
 
-    views = capture.train_views(test_every)
+    views = capture.train_views(test_every) or capture.views
     cameras, by_name = cameras_of(views), {view.name: view for view in views}
     photos = [fit(by_name[camera.name].image, max_side=_PHOTO_SIDE) for camera in cameras]
     return stands_of(cameras, photos, means.detach().cpu())

@@ -191,6 +191,11 @@ def test_a_result_whose_capture_is_missing_is_still_shown_in_the_frame_of_the_ca
         np.testing.assert_allclose(scene.world_transform, transform)
 
 
+def test_where_every_view_is_held_out_one_looks_from_all(shown: Shown) -> None:
+    scene, _, capture = shown
+    assert len(stands_of_capture(capture, 1, scene.params["means"])) == len(capture.views)
+
+
 @pytest.mark.parametrize("box", [(448210.1, 5411850.3, 120.0, 448290.9, 5411930.2, 180.0), (-1e-5,) * 3 + (2e-5,) * 3])
 def test_a_crop_is_said_exactly_in_any_unit_and_far_from_the_origin(box: Box) -> None:
     client = MagicMock()

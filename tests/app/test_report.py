@@ -529,6 +529,10 @@ def test_checks_of_a_run_that_went_on_are_not_shown_as_its_last(looked: Looked) 
     assert all(view.depth is None for view in data.views)
 
 
+def test_checks_without_a_training_view_are_refused_in_one_line(pop: Pop, looked: Looked) -> None:
+    says(pop("report", looked.folder, "--check", "--test-every", "1"), "every view is held out")
+
+
 def test_a_run_without_checks_says_how_to_get_them(pop: Pop, looked: Looked) -> None:
     (looked.folder / "report_data" / "checks_step29.json").unlink()
     (looked.folder / "videos" / "orbit_step29.webm").unlink()

@@ -221,7 +221,7 @@ class RecordedPath:
         return json.dumps({"kind": _KIND, "frame": "capture", "cameras": entries}, indent=2) + "\n"
 
     def along(self, n_frames: int, world_transform: np.ndarray) -> list[KeyCamera]:
-        """Glide through the cameras: cubic splines through places, rotations and the logarithm of the focal length.
+        """Glide through the cameras: cubic splines through places and rotations, the focal length in even ratios.
 
         The first and the last are the recorded ones, in the world; a single camera stays.
         """
