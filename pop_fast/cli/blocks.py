@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import tyro
@@ -208,5 +209,5 @@ def _merge(folder: Path, config: TrainConfig, record: CaptureRecord, job: Job, p
     status = finish(folder, capture, options) or report(folder)
     if status == 0:
         write_file(part.marker(folder), b"")
-        print(f"pop report {folder} --check adds the parts that need all photographs", file=sys.stderr)
+        print(f"pop report {quote(str(folder))} --check adds the parts that need all photographs", file=sys.stderr)
     return status

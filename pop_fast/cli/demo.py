@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Final
 
 import tyro
@@ -44,5 +45,5 @@ def run(argv: Sequence[str]) -> int:
             args.out, args.seed, args.views, args.width, args.height, progress=progress, overwrite=args.overwrite
         )
     print(f"{args.views} photographs of {args.width} x {args.height} px -> {folder}")
-    print(f"next: pop train {folder} --minutes 2")
+    print(f"next: pop train {quote(str(folder))} --minutes 2")
     return 0

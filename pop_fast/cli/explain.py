@@ -125,9 +125,11 @@ def chosen_view(capture: Capture, which: str) -> View:
         return named[0]
     last = len(capture.views) - 1
     span = f"0 ({capture.views[0].name}) to {last} ({capture.views[-1].name})"
-    if not which.lstrip("-").isdigit():
+    try:
+        place = int(which)
+    except ValueError:
         what = f"names {len(named)} views" if named else "is no view"
-        raise PopError(f"view {which!r} {what} of {capture.name}; give a file name, or a place from {span}")
-    if not 0 <= int(which) <= last:
+        raise PopError(f"view {which!r} {what} of {capture.name}; give a file name, or a place from {span}") from None
+    if not 0 <= place <= last:
         raise PopError(f"view is {which}; {capture.name} has views {span}")
-    return capture.views[int(which)]
+    return capture.views[place]

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import numpy as np
@@ -209,7 +210,7 @@ def _loaded_transform(splat: Splat, args: Args) -> np.ndarray:
     return open_with_bars(as_trained, replace(args, own_frame=False, training_frame=False))[0].world_transform
 
 
-def known_transform(splat: Splat, args: Args) -> np.ndarray | None:
+def known_transform(splat: Splat, args: CaptureArguments) -> np.ndarray | None:
     """Return what moves the capture's own frame into the training frame, where the file or its run says. [4, 4]"""
     if splat.frame is not None and splat.frame.transform is not None:
         return np.array(splat.frame.transform)
@@ -257,7 +258,7 @@ class FinishOptions(LimitOptions):
 def finish(folder: Path, capture: Capture, options: Any) -> int:
     """Write what surrounds a run whose results are complete; see `after_results`."""
     own = FinishOptions(**{f.name: getattr(options, f.name) for f in fields(FinishOptions)})
-    left = f"the results in {folder} are complete; pop export {folder} writes the files"
+    left = f"the results in {folder} are complete; pop export {quote(str(folder))} writes the files"
     return after_results(lambda: _finish(folder, capture, own), "writing exports", "", left)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Final
 
 import tyro
@@ -43,5 +44,5 @@ def run(argv: Sequence[str]) -> int:
         found = take_frames(args.video, out, args.count, args.max_size, progress, overwrite=args.overwrite)
     resting = f"; the camera rested in {found.alike} stretches" if found.alike else ""
     print(f"{len(found.frames)} of {found.of:,} frames{resting} -> {found.folder}")
-    print(f"next: pop train {found.folder}")
+    print(f"next: pop train {quote(str(found.folder))}")
     return 0

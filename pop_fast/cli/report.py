@@ -18,7 +18,8 @@ from pop_fast.train.load_result import load_splat
 class Args(CaptureArguments):
     """Write report.html into a result folder, from the files in it; also for a run that was stopped.
 
-    --check renders first what older and stopped runs lack, with the capture: depth, the orbit, floaters, exposure.
+    --check renders first what older and stopped runs lack, with the capture: depth, the orbit, floaters, exposure. The
+    report's commands name --capture, where the capture has moved.
     """
 
     result: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT")]
@@ -36,5 +37,5 @@ def run(argv: Sequence[str]) -> int:
         checked(args.result, splat, *open_with_bars(splat, args))
     from pop_fast.view.report import write_report
 
-    print(write_report(args.result))
+    print(write_report(args.result, args.capture))
     return 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Final, Literal
 
 import tyro
@@ -57,5 +58,5 @@ def run(argv: Sequence[str]) -> int:
         f"{found.registered} of {found.photographs} photographs placed, {found.points:,} points, "
         f"mean reprojection error {found.reprojection_error:.2f} px -> {found.capture}"
     )
-    print(f"next: pop train {found.capture}")
+    print(f"next: pop train {quote(str(found.capture))}")
     return 0

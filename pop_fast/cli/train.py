@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import tyro
@@ -288,7 +289,7 @@ def report(folder: Path) -> int:
 
         print(f"report: {write_report(folder)}")
 
-    left = f"the results in {folder} are complete; pop report {folder} writes the report"
+    left = f"the results in {folder} are complete; pop report {quote(str(folder))} writes the report"
     return after_results(write, "writing the report", "the report could not be written: ", left)
 
 

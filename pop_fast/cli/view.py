@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-import numpy as np
 import tyro
 
 from pop_fast.cli import parse
 from pop_fast.cli.options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
-from pop_fast.train.load_result import Splat, load_splat
+from pop_fast.train.load_result import Splat, frame_of_splat, load_splat
 
 if TYPE_CHECKING:
     from pop_fast.data import Capture
@@ -63,6 +62,7 @@ def run(argv: Sequence[str]) -> int:
 
 def make_viewer(args: Args, splat: Splat) -> LiveViewer:
     """Start the viewer of a splat: with the cameras of its capture, or where none is known with one made up."""
+    from pop_fast.cli.export import known_transform
     from pop_fast.train.engines import renderer
     from pop_fast.view.html import camera_of_points
     from pop_fast.view.live import SplatScene
@@ -74,31 +74,24 @@ def make_viewer(args: Args, splat: Splat) -> LiveViewer:
         print(f"note: {note}")
     if args.capture is None and (not data or not Path(data).is_dir()):
         print("note: no capture is known, so there are no training cameras; give --capture DIR")
-        scene = SplatScene(splat.params, splat.config, splat.sh_degree, backend, transform_of(splat))
+        transform = known_transform(splat, args) if frame_of_splat(splat, args) == "training" else None
+        scene = SplatScene(splat.params, splat.config, splat.sh_degree, backend, transform)
         stands = stands_of([camera_of_points(splat.params["means"])], [None], splat.params["means"])
     else:
         capture, config = open_with_bars(splat, args)
         scene = SplatScene(splat.params, config, splat.sh_degree, backend, capture.world_transform)
         stands = stands_of_capture(capture, config.test_every, splat.params["means"])
-    path = splat.folder or splat.path
-    return LiveViewer(scene, stands, path.resolve().stem, args.host, args.port)
-
-
-def transform_of(splat: Splat) -> np.ndarray | None:
-    """Return how a lone file's world came from its capture's, as its header says; None where it does not."""
-    frame = splat.frame
-    if frame is None or frame.name != "training" or frame.transform is None:
-        return None
-    return np.array(frame.transform)
+    title = splat.folder.resolve().name if splat.folder else splat.path.resolve().stem
+    return LiveViewer(scene, stands, title, args.host, args.port)
 
 
 def stands_of_capture(capture: Capture, test_every: int, means: Any) -> list[Any]:
-    """Make places to look from of the training views, at most sixty."""
+    """Make places to look from of the training views, or where there are none of all, at most sixty."""
     from pop_fast.io.images import fit
     from pop_fast.view.html import cameras_of
     from pop_fast.view.live.server import stands_of
 
-    views = capture.train_views(test_every)
+    views = capture.train_views(test_every) or capture.views
     cameras, by_name = cameras_of(views), {view.name: view for view in views}
     photos = [fit(by_name[camera.name].image, max_side=_PHOTO_SIDE) for camera in cameras]
     return stands_of(cameras, photos, means.detach().cpu())

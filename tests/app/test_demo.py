@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from pop_fast.demo import make_demo
 from pop_fast.demo.make import first_hits, render_view
 from pop_fast.demo.scene import Ball, Box, Frustum, Shape, Torus, make_scene
 from tests.app.captures import assert_one_line, look_at, raw
+from tests.app.conftest import Pop
 from tests.app.damage import contents
 
 SMALL = {"views": 8, "width": 64, "height": 48}
@@ -104,6 +106,12 @@ def test_an_existing_folder_is_replaced_only_on_request(tmp_path: Path) -> None:
     before = contents(target)
     assert_one_line(lambda: make_demo(target, overwrite=True, **tiny), str(target), "did not write (mine.txt)")
     assert contents(target) == before
+
+
+def test_the_next_command_names_a_folder_with_a_space_as_a_shell_takes_it(pop: Pop, tmp_path: Path) -> None:
+    out = tmp_path / "a demo"
+    last = pop.done("demo", out, "--views", "4", "--width", "16", "--height", "16").out.splitlines()[-1]
+    assert shlex.split(last) == ["next:", "pop", "train", str(out), "--minutes", "2"]
 
 
 @pytest.mark.parametrize("size", [{"views": 3}, {"width": 8}, {"height": 0}])

@@ -349,6 +349,9 @@ def test_a_name_that_two_views_bear_is_refused_and_a_number_may_be_a_name() -> N
     capture = replace(capture, views=tuple(replace(v, name=n) for v, n in zip(capture.views, names, strict=True)))
     with pytest.raises(PopError, match=r"view 'a\.png' names 2 views of tiny; give a file name, or a place from 0"):
         chosen_view(capture, "a.png")
+    for odd in ("²", "--1"):
+        with pytest.raises(PopError, match="is no view of tiny"):
+            chosen_view(capture, odd)
     assert chosen_view(capture, "right/a.png").name == "right/a.png"
     assert chosen_view(capture, "0").name == "0.png"
     # places go by file name

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ from pop_fast.io.formats import load_splat_file, save_as
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
 from pop_fast.train.views import ViewTensors, render_view
+from pop_fast.view.document import asset
 from pop_fast.view.html import PageCamera, camera_of_points, cameras_of, first_view, page_of, view_distances
 from tests.app.captures import many
 from tests.app.test_render import walk
@@ -177,6 +180,71 @@ def test_the_buttons_fit_into_the_window(tab: Browser, tmp_path: Path, width: in
         assert 0 <= top <= bottom <= height
 
 
+# as much of a browser as the page's script needs: what it asks WebGL to draw is kept, and a worker sorts when asked to
+WITHOUT_BROWSER = """
+const elements = {}, heard = {}, frames = [], drawn = [];
+let lost = false, worker;
+const listen = (kind, act) => { heard[kind] = act; };
+const element = (id) => elements[id] ??= {
+  textContent: texts[id] ?? "", dataset: {}, clientWidth: 80, clientHeight: 60, addEventListener: listen,
+  setPointerCapture() {}, getContext: () => gl,
+};
+const gl = new Proxy({}, { get: (_, name) => (...given) => {
+  if (name === "isContextLost") return lost;
+  if (name === "uniformMatrix4fv") drawn.push(given[2]);
+  return 4096;
+} });
+globalThis.document = { getElementById: element, body: { classList: { toggle() {} } } };
+globalThis.location = { hash: "" };
+globalThis.window = { addEventListener: listen };
+globalThis.requestAnimationFrame = (act) => frames.push(act);
+globalThis.Worker = class {
+  constructor() { worker = this; }
+  postMessage(data) { this.asked = data.id; }
+};
+const settle = () => {
+  worker.onmessage({ data: { id: worker.asked, order: new Uint32Array(0) } });
+  while (frames.length) frames.shift()();
+};
+const drag = (dy) => {
+  heard.pointerdown({ pointerId: 1, clientX: 0, clientY: 0 });
+  heard.pointermove({ pointerId: 1, clientX: 0, clientY: dy, buttons: 1 });
+  settle();
+};
+"""
+
+
+def without_browser(page: bytes, doings: str) -> Any:
+    """Run a page's script and what is done to it under node, and return what that reports."""
+    node = shutil.which("node") or pytest.skip("no node on the PATH")
+    texts = dict(re.findall(r'<script id="([\w-]+)" type="[^"]+">(.*?)</script>', page.decode(), re.DOTALL))
+    script = f"const texts = {json.dumps(texts)};{WITHOUT_BROWSER}{asset('html', 'viewer.js')}"
+    script += f"const begin = () => {{ if (!worker) return setTimeout(begin, 10); settle(); {doings} }};begin();"
+    found = subprocess.run([node, "-"], input=script, capture_output=True, text=True, check=True, timeout=100)
+    return json.loads(found.stdout)
+
+
+def test_no_drag_leaps_over_the_pole() -> None:
+    page = page_of(many(5), [camera_of(a_view())], TrainConfig(), 3, "x")
+    moves = [140, 70, 140, 900, -200, -900, -140]
+    # how far the picture's lower edge points down: under 0 the view is upside down
+    doings = f"const [x, y, z] = JSON.parse(texts.scene).up; for (const dy of {moves}) drag(dy);"
+    doings += "console.log(JSON.stringify(drawn.map((m) => -x * m[1] + y * m[5] + z * m[9])))"
+    upright = without_browser(page, doings)
+    assert len(upright) > len(moves)
+    assert min(upright) > 0.0
+    assert max(upright) > 0.9
+
+
+def test_that_the_graphics_card_is_lost_is_said_until_the_page_is_loaded_again() -> None:
+    page = page_of(many(5), [], TrainConfig(), 3, "x")
+    doings = "const before = elements.message.textContent; lost = true; heard.webglcontextlost(); drag(20);"
+    doings += "console.log(JSON.stringify([before, elements.message.textContent]))"
+    before, after = without_browser(page, doings)
+    assert before == ""
+    assert "load it again" in after
+
+
 def test_an_empty_splat_and_a_lone_one_have_pages(tab: Browser, tmp_path: Path) -> None:
     for n in (0, 1):
         assert shown(tab, page_in(tmp_path, n, background=(0.0, 1.0, 0.0)))[0, 0].tolist() == [0, 255, 0]
@@ -230,3 +298,7 @@ def test_a_large_capture_gives_sixty_cameras_evenly() -> None:
     views = tiny_capture(n_views=200).views
     cameras = cameras_of(views)
     assert (len(cameras), cameras[0].name, cameras[-1].name) == (60, views[0].name, views[-1].name)
+
+
+def test_a_name_that_is_no_text_is_a_title_with_escapes() -> None:
+    assert b"<title>sc\\udce8ne</title>" in page_of(many(5), [], TrainConfig(), 3, "sc\udce8ne")

@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock, PropertyMock
 from urllib.request import urlopen
 
 import cv2
@@ -18,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 
-from pop_fast.cli.view import stands_of_capture
+from pop_fast.cli.view import Args, make_viewer, stands_of_capture
 from pop_fast.io.images import id_colors
 from pop_fast.train import TrainingRun
 from pop_fast.train.engines import renderer
@@ -26,6 +27,8 @@ from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
 from pop_fast.train.views import ViewTensors, render_layers, render_view
 from pop_fast.view.live import KeyCamera, RecordedPath, SplatScene, ViewState, read_path
 from pop_fast.view.live.draw import (
+    Box,
+    Panel,
     field_of_view,
     follow,
     from_capture,
@@ -175,6 +178,36 @@ def test_a_path_passes_its_cameras_in_any_frame(tmp_path: Path) -> None:
     assert 0.5 < along[1].fov_y < 1.0
     single = RecordedPath((cameras[0],)).along(3, np.eye(4))
     assert len(single) == 3
+
+
+def test_a_result_whose_capture_is_missing_is_still_shown_in_the_frame_of_the_capture(
+    shared_result: Path, shown: Shown, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pop_fast.view.live.server.LiveViewer", lambda scene, *_: scene)
+    splat = load_splat(shared_result)
+    splat = replace(splat, config=replace(splat.config, data="moved away"))
+    for words, transform in (({}, shown[2].world_transform), ({"own_frame": True}, np.eye(4))):
+        scene: Any = make_viewer(Args(splat=shared_result, **words), splat)
+        np.testing.assert_allclose(scene.world_transform, transform)
+
+
+def test_where_every_view_is_held_out_one_looks_from_all(shown: Shown) -> None:
+    scene, _, capture = shown
+    assert len(stands_of_capture(capture, 1, scene.params["means"])) == len(capture.views)
+
+
+@pytest.mark.parametrize("box", [(448210.1, 5411850.3, 120.0, 448290.9, 5411930.2, 180.0), (-1e-5,) * 3 + (2e-5,) * 3])
+def test_a_crop_is_said_exactly_in_any_unit_and_far_from_the_origin(box: Box) -> None:
+    client = MagicMock()
+    client.gui.add_multi_slider = lambda axis, low, high, step, ends: MagicMock(value=ends, min=low, max=high)
+    panel = Panel(client, ["a"], "x", box, np.eye(4), {}, lambda call: lambda event: call())
+    said = []
+    type(client.gui.add_markdown.return_value).content = PropertyMock(side_effect=said.append)
+    panel._update()
+    assert said[0].startswith("the same in a file: `--crop ")
+    crop = [float(word) for word in said[0].split("`")[1].split()[1:]]
+    np.testing.assert_allclose(crop, box, rtol=0.0, atol=0.01 * (box[3] - box[0]))
+    assert panel.crop == pytest.approx(crop, rel=1e-11)
 
 
 def test_a_recorded_path_is_rendered(pop: Pop, shared_result: Path, shown: Shown, tmp_path: Path) -> None:

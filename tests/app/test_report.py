@@ -518,6 +518,21 @@ def test_a_resumed_run_has_all_its_commands(pop: Pop, result: Path, shared_captu
     assert second["words"] == ["pop", *map(str, words)]
 
 
+def test_checks_of_a_run_that_went_on_are_not_shown_as_its_last(looked: Looked) -> None:
+    measured = max((looked.folder / "stats").glob("val_step*.json"))
+    later = {**json.loads(measured.read_text()), "step": 99, "psnr": 42.0}
+    measured.with_name("val_step99.json").write_text(json.dumps(later))
+    data = read_result(looked.folder)
+    assert (data.checked, data.orbit) == (False, None)
+    assert [finding.about for finding in data.verdict] == ["Quality"]
+    assert "42.00 dB on average" in data.verdict[0].text
+    assert all(view.depth is None for view in data.views)
+
+
+def test_checks_without_a_training_view_are_refused_in_one_line(pop: Pop, looked: Looked) -> None:
+    says(pop("report", looked.folder, "--check", "--test-every", "1"), "every view is held out")
+
+
 def test_a_run_without_checks_says_how_to_get_them(pop: Pop, looked: Looked) -> None:
     (looked.folder / "report_data" / "checks_step29.json").unlink()
     (looked.folder / "videos" / "orbit_step29.webm").unlink()

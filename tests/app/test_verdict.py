@@ -304,6 +304,17 @@ def test_the_capture_is_asked_for_as_it_was_read(tmp_path: Path) -> None:
     assert options.ignore_masks
 
 
+def test_commands_name_a_capture_that_has_moved_and_a_result_that_is_called_by_a_dot(tmp_path, monkeypatch):
+    run = TrainConfig.of(method="pop", data="scene", result_dir="out/a")
+    (tmp_path / "a").mkdir()
+    monkeypatch.chdir(tmp_path / "a")
+    commands = (("train", "DATA"), ("export", "RESULT", "--to", "html"))
+    findings = [Finding("bad", "it", "is", words) for words in commands]
+    train, export = (typed(found, run, Path("."), Path("elsewhere")).next for found in findings)
+    assert train == ("train", "elsewhere", "--out", f"{tmp_path / 'a'}_next")
+    assert export == ("export", ".", "--to", "html", "--capture", "elsewhere")
+
+
 # What the report says to type next helps: commands are taken from reports and typed, and the results are measured.
 
 

@@ -21,6 +21,7 @@ from pop_fast.io.formats import encoded
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.views import evenly
 from pop_fast.view.document import asset
+from pop_fast.view.paths import mean_up
 
 # of a larger capture, an even selection
 _MOST: Final = 60
@@ -184,12 +185,10 @@ def _scene(means: Tensor, cameras: Sequence[PageCamera], config: TrainConfig) ->
     profile = config.renderer
     chosen = list(cameras) or [camera_of_points(means)]
     distances = view_distances(chosen, means)
-    upwards = -np.mean([camera.viewmat[1, :3] for camera in chosen], axis=0)
-    norm = np.linalg.norm(upwards)
     return {
         "cameras": [camera.entry(distance) for camera, distance in zip(chosen, distances, strict=True)],
         "first": first_view(chosen),
-        "up": (upwards / norm if norm > 1e-3 else np.array([0.0, -1.0, 0.0])).tolist(),
+        "up": mean_up(np.stack([camera.viewmat for camera in chosen])).tolist(),
         "extent": max(distances),
         "background": [float(value) for value in torch.tensor(config.background)],
         "antialiased": config.antialiased,

@@ -189,6 +189,11 @@
 
   const up = [scene.up[0], -scene.up[1], -scene.up[2]];
   function orbit(right, down) {
+    // in turns too small to leap over the pole
+    if (Math.abs(down) > 0.1) {
+      orbit(right / 2, down / 2);
+      return orbit(right / 2, down / 2);
+    }
     const yawed = camera.axes.map((axis) => turned(axis, up, -right));
     const pitched = yawed.map((axis) => turned(axis, yawed[0], -down));
     // not over the pole
@@ -229,9 +234,11 @@
     count = data.order.length;
     gl.bindBuffer(gl.ARRAY_BUFFER, rows);
     gl.bufferData(gl.ARRAY_BUFFER, data.order, gl.DYNAMIC_DRAW);
-    say("");
+    // that the graphics card is lost stays said
+    if (!gl.isContextLost()) say("");
     dirty();
   };
+  worker.onerror = ({ message }) => say(`The splat cannot be sorted: ${message || "this browser starts no worker"}`);
 
   const ratio = () => Math.min(window.devicePixelRatio || 1, 2);
   function dirty() {

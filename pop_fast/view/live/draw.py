@@ -221,7 +221,7 @@ class RecordedPath:
         return json.dumps({"kind": _KIND, "frame": "capture", "cameras": entries}, indent=2) + "\n"
 
     def along(self, n_frames: int, world_transform: np.ndarray) -> list[KeyCamera]:
-        """Glide through the cameras: cubic splines through places, rotations and the logarithm of the focal length.
+        """Glide through the cameras: cubic splines through places and rotations, the focal length in even ratios.
 
         The first and the last are the recorded ones, in the world; a single camera stays.
         """
@@ -404,8 +404,9 @@ class Panel:
             self._cropped = gui.add_checkbox("leave out what is outside", False)
             self._ranges = []
             for k, axis in enumerate(_AXES):
-                low, high = round(box[k], 4), round(box[k + 3], 4)
-                step = max((high - low) / 200.0, 1e-4)
+                # a round step of the box's own size: captures are of any unit, and far from their origin
+                step = float(f"{(box[k + 3] - box[k]) / 200.0:.1g}") or 1e-4
+                low, high = (round(value / step) * step for value in (box[k], box[k + 3]))
                 self._ranges.append(gui.add_multi_slider(axis, low, high, step, (low, high)))
             self._crop_words = gui.add_markdown("")
 
@@ -447,6 +448,6 @@ class Panel:
 
     def _update(self) -> None:
         crop = self.crop
-        words = "" if crop is None else f"`--crop {' '.join(f'{value:.4g}' for value in crop)}`"
+        words = "" if crop is None else f"`--crop {' '.join(f'{value:.12g}' for value in crop)}`"
         self._crop_words.content = words and f"the same in a file: {words} of `pop export`"
         self.changed()

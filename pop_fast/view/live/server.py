@@ -25,6 +25,7 @@ from pop_fast.errors import PopError
 from pop_fast.view.html import view_distances
 from pop_fast.view.live.draw import Panel, SplatScene, ViewState, field_of_view, pose_of_viewmat, viewmat_of_pose
 from pop_fast.view.live.guard import Guard, is_any, listen
+from pop_fast.view.paths import mean_up
 
 if TYPE_CHECKING:
     from pop_fast.view.html import PageCamera
@@ -169,8 +170,8 @@ class LiveViewer:
             self._server = viser.ViserServer(host=host, port=self.port, label=title, verbose=False)
         self._forget_sharing()
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
-        upwards = -np.mean([stand.camera.viewmat[1, :3] for stand in self._stands], axis=0)
-        self._server.scene.set_up_direction(tuple(float(v) for v in upwards))
+        upwards = mean_up(np.stack([stand.camera.viewmat for stand in self._stands]))
+        self._server.scene.set_up_direction(tuple(upwards.tolist()))
         self._server.scene.world_axes.visible = False
         start = self._server.initial_camera
         position, look_at, up, fov = pose_at(self._stands[0])

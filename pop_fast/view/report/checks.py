@@ -124,6 +124,7 @@ def write_checks(
         return render_layers(backend, chosen, ViewTensors.of(view), config, sh_degree)
 
     train, test = capture.train_views(config.test_every), capture.test_views(config.test_every)
+    turn = orbit_views(train)
     some = [train[i] for i in np.unique(np.linspace(0, len(train) - 1, min(len(train), _MOST_TRAIN)).astype(int))]
     learned = results.read_stats("appearance", step) or {}
     seen = {view.name: looked(_from_learned(view, learned)) for view in (*some, *test)}
@@ -146,7 +147,6 @@ def write_checks(
     near = are_floaters(params["means"], capture, config.test_every) if known else torch.zeros(0, dtype=torch.bool)
     cleared = {name: tensor[~near] for name, tensor in params.items()} if near.any() else {}
     without = [(view, looked(view, cleared).image) for view in test] if cleared else []
-    turn = orbit_views(train)
     checks = Checks(
         photographs=len(train),
         train_psnr=float(np.mean([_psnr(view, fitted[view.name]) for view in some])),
@@ -356,7 +356,9 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def orbit_views(train: Sequence[View]) -> list[View]:
-    """Make the cameras of the orbit, as large as fits the report."""
+    """Make the cameras of the orbit, as large as fits the report; a PopError refuses to do it without a view."""
+    if not train:
+        raise PopError("every view is held out, and the orbit follows the others; hold fewer out with --test-every 8")
     lens = train[0]
     scale = min(1.0, _ORBIT_SIDE / max(lens.width, lens.height))
     width, height = (max(2, 2 * round(scale * side / 2)) for side in (lens.width, lens.height))

@@ -44,18 +44,19 @@ _DEPTH: Final = {"name": ("U", 0), "depth": ("f", 2)}
 _SMOOTH: Final = 0.03  # width of the running means, as a share of the records
 
 
-def read_result(folder: Path) -> ReportData:
-    """Read all that the report shows of a result folder."""
+def read_result(folder: Path, capture: Path | None = None) -> ReportData:
+    """Read all that the report shows of a result folder; its commands name `capture` where that has moved."""
     config = read_config(folder)
     records = read_records(folder)
     stats = read_last_stats(folder)
     method = METHODS[config.method].title
     histograms = list(_histograms(folder, config.max_steps))
-    views = _views(folder)
     dominant = _dominant(folder)
     changes = [record for record in records if "cloned" in record or "reset" in record]
     curves, checks = _curves(records, folder), None
-    if measured := _numbered(folder / "report_data", r"checks_step(\d+)\.json"):
+    measured = _numbered(folder / "report_data", r"checks_step(\d+)\.json")
+    # a run that was checked where it stopped, and went on, has later statistics
+    if measured and measured[-1][0] >= (stats.get("step") or 0):
         checks = read_checks(measured[-1][1])
     viewer = folder / "viewer.html"
     fix = "train again with --resume, which measures them"
@@ -71,32 +72,36 @@ def read_result(folder: Path) -> ReportData:
         resets=[int(record["step"]) for record in changes if record.get("reset")],
         histograms=histograms,
         dominant=dominant,
-        views=views,
+        views=_views(folder, checks is not None),
         n_held_out=stats.get("views"),
         config=_settings(config, folder),
         changes=[{key: change.get(key) for key in _CHANGE_COLUMNS} for change in changes],
         files=encoding_table(entries) if entries else [],
         viewer=_read(viewer).decode("utf-8", "replace") if viewer.is_file() else None,
-        verdict=[typed(found, config, folder) for found in verdict(stats, checks, curves.get("psnr_val"))],
+        verdict=[typed(found, config, folder, capture) for found in verdict(stats, checks, curves.get("psnr_val"))],
         checked=checks is not None,
-        orbit=_orbit(folder),
+        orbit=_orbit(folder) if checks is not None else None,
         commands=[(shlex.join(entry["words"]), entry["folder"]) for entry in read_commands(folder)],
         links=list(_links(folder)),
     )
 
 
-def typed(finding: Finding, config: TrainConfig, folder: Path) -> Finding:
+def typed(finding: Finding, config: TrainConfig, folder: Path, capture: Path | None = None) -> Finding:
     """Put capture and folder into the command that a finding ends in; another training is asked for as this one was."""
     if not finding.next:
         return finding
-    places = {"DATA": config.data, "RESULT": str(folder)}
+    places = {"DATA": str(capture or config.data), "RESULT": str(folder)}
     words = [places.get(word, word) for word in finding.next]
     record = read_record(folder) or CaptureRecord()
     if words[0] in ("train", "data") and record.images is not None:
         words += ["--images", record.images]
     if words[0] == "train":
         words += _read_again(record)
-        words += [*_asked_again(config, finding.next), "--out", f"{folder}_next"]
+        # "." has no name to put something behind
+        named = folder.resolve() if folder.name in ("", "..") else folder
+        words += [*_asked_again(config, finding.next), "--out", f"{named}_next"]
+    if words[0] == "export" and capture is not None:
+        words += ["--capture", str(capture)]
     return replace(finding, next=tuple(words))
 
 
@@ -306,9 +311,9 @@ def _histograms(folder: Path, max_steps: int) -> Iterator[Histogram]:
         yield Histogram(title, counts.reshape(-1, 2).sum(axis=1))
 
 
-def _views(folder: Path) -> list[ReportView]:
-    """Read the held-out views, the worst first."""
-    kept = (read_arrays(path, _DEPTH, _AGAIN) for path in _last_view_files(folder, "depth"))
+def _views(folder: Path, checked: bool) -> list[ReportView]:
+    """Read the held-out views, the worst first; their depth was measured where the splat was checked."""
+    kept = (read_arrays(path, _DEPTH, _AGAIN) for path in _last_view_files(folder, "depth") if checked)
     depths = {str(found["name"]): found["depth"] for found in kept}
     views = []
     for path in _last_view_files(folder):
@@ -456,10 +461,13 @@ def held_out_views(count: int) -> str:
     return f"{count} held-out view{'' if count == 1 else 's'}"
 
 
-def write_report(result_dir: str | Path) -> Path:
-    """Write report.html into a result folder, from the files in it alone, and return its path."""
+def write_report(result_dir: str | Path, capture: Path | None = None) -> Path:
+    """Write report.html into a result folder, from the files in it alone, and return its path.
+
+    Its commands name `capture` where that is not where training found it.
+    """
     folder = Path(result_dir)
     # a name that is no text is shown with escapes
     target = folder / "report.html"
-    write_file(target, page(read_result(folder)).encode("utf-8", "backslashreplace"))
+    write_file(target, page(read_result(folder, capture)).encode("utf-8", "backslashreplace"))
     return target
