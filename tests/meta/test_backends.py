@@ -359,6 +359,10 @@ class OneStage(Adapter):
         return float(np.exp(-sigma))
 
 
+class InWords(OneStage):
+    dtype = "float64"
+
+
 class Blending(Adapter):
     """Blending alone; the oracle projects and lists."""
 
@@ -432,6 +436,8 @@ def test_an_adapter_is_found_by_its_path_and_must_be_one() -> None:
     assert made_by("tests.meta.test_backends:OneStage").has("falloff")
     with pytest.raises(ValueError, match="makes no adapter: it has no dtype, has, stage"):
         made_by("pathlib:Path")
+    with pytest.raises(ValueError, match=r"has dtype 'float64'; it must be np\.float32 or np\.float64"):
+        made_by("tests.meta.test_backends:InWords")
     with pytest.raises(ValueError, match="must be written module:name"):
         made_by("tests.meta.test_backends")
     with pytest.raises(ValueError, match="has no function Nobody"):
