@@ -148,9 +148,10 @@ class TorchAdapter(Adapter):
             return None
 
     def first_error(self) -> Exception | None:
-        """Draw one small picture; return what is raised in its place, None where it is drawn."""
+        """Draw one small picture, and again with gradients; return what is raised in its place, None if nothing is."""
         try:
-            self._call(s := super().sees(golden_scene()), self._leaves(s, grad=False), dominance=False, counts=False)
+            self._drawn(super().sees(golden_scene()), dominance=False, counts=False)
+            self.has(GRADIENTS)
         except Exception as error:
             return error
         return None
@@ -163,8 +164,9 @@ class TorchAdapter(Adapter):
         except NotImplementedError:
             return False
         except RuntimeError as error:
-            # what leaves torch on its way, to NumPy or to a foreign kernel, says that a tensor requires grad
-            if "requires grad" not in str(error):
+            # what leaves torch on its way, to NumPy or to a foreign kernel, says that a tensor requires grad; so does
+            # what writes over its arguments, which is a fault
+            if "requires grad" not in str(error) or "in-place" in str(error):
                 raise
             return False
         return bool(image.requires_grad)

@@ -23,7 +23,15 @@ from pop_ref.compositing import composite, composite_vjp
 from pop_ref.conformance import Adapter, Scene, capabilities
 from pop_ref.conformance.adapter import OracleAdapter, View, error_bounds_of, stage_function, under
 from pop_ref.conformance.assertions import assert_same_image
-from pop_ref.conformance.backends import ELSEWHERE, Absent, Unavailable, made_by, shipped, shipped_or_absent
+from pop_ref.conformance.backends import (
+    ELSEWHERE,
+    Absent,
+    Unavailable,
+    made_by,
+    require_a_picture,
+    shipped,
+    shipped_or_absent,
+)
 from pop_ref.conformance.failure_report import failure_report
 from pop_ref.conformance.foreign_adapters import inria
 from pop_ref.conformance.law import missing
@@ -505,6 +513,30 @@ def test_a_gradient_that_fails_is_a_failure_and_not_a_missing_piece() -> None:
 
     with pytest.raises(RuntimeError, match="illegal memory access"):
         TorchAdapter("broken", broken).has(capabilities.GRADIENTS)
+
+
+def two_values(*args: Any, **options: Any) -> Any:
+    return sound(*args, **options)[:2]
+
+
+def writing_over(means: Any, *args: Any, **options: Any) -> Any:
+    means += 0.0
+    return sound(means, *args, **options)
+
+
+def failing_with_gradients(means: Any, *args: Any, **options: Any) -> Any:
+    if means.requires_grad:
+        raise RuntimeError("no backward kernel")
+    return sound(means, *args, **options)
+
+
+@pytest.mark.parametrize(
+    ("rasterization", "said"),
+    [(two_values, "expected 3, got 2"), (writing_over, "in-place"), (failing_with_gradients, "no backward kernel")],
+)
+def test_an_answer_that_no_law_can_read_is_told_in_a_line_before_they_run(rasterization: Any, said: str) -> None:
+    with pytest.raises(ValueError, match=f"a first small picture raises .*{said}"):
+        require_a_picture(TorchAdapter("odd", rasterization))
 
 
 def ids_alone(*args: Any, **options: Any) -> Any:
