@@ -69,7 +69,7 @@ def opacities_from_logits(logit_opacities: Float64[np.ndarray, " N"]) -> Float64
         >>> opacities_from_logits(np.array([0.0, -1000.0, 1000.0]))
         array([0.5, 0. , 1. ])
     """
-    opacities = np.zeros_like(logit_opacities)
+    opacities = np.zeros(logit_opacities.shape)
     for i, logit in enumerate(logit_opacities.tolist()):
         # the exponent is never positive, so that exp cannot overflow
         fall = math.exp(-abs(logit))
@@ -116,7 +116,7 @@ def unit_quats_from_quats(quats: Float64[np.ndarray, "N 4"]) -> Float64[np.ndarr
         >>> unit_quats_from_quats(np.array([[0.0, 0.0, -4.0, 0.0]]))
         array([[ 0.,  0., -1.,  0.]])
     """
-    units = np.zeros_like(quats)
+    units = np.zeros(quats.shape)
     for i in range(len(quats)):
         units[i] = quats[i] / math.hypot(*quats[i].tolist())
     return units
@@ -141,7 +141,7 @@ def unit_quats_from_quats_vjp(
         >>> unit_quats_from_quats_vjp(np.array([[2.0, 0.0, 0.0, 0.0]]), np.array([[8.0, 4.0, 2.0, 0.0]]))
         array([[0., 2., 1., 0.]])
     """
-    v_quats = np.zeros_like(quats)
+    v_quats = np.zeros(quats.shape)
     units = unit_quats_from_quats(quats)
     for i in range(len(quats)):
         u, v_u = units[i], v_unit_quats[i]

@@ -46,7 +46,7 @@ def expose(image: Float64[np.ndarray, "H W 3"], exposure: Float64[np.ndarray, "3
         >>> expose(np.array([[[0.25, 0.5, 1.0]]]), brighter)
         array([[[0.75, 0.5 , 1.  ]]])
     """
-    exposed = np.zeros_like(image)
+    exposed = np.zeros(image.shape)
     for y, x in np.ndindex(image.shape[:2]):
         exposed[y, x] = exposure[:, :3] @ image[y, x] + exposure[:, 3]
     return exposed
@@ -77,7 +77,7 @@ def expose_vjp(
                [1. , 1. , 1. , 2. ],
                [0. , 0. , 0. , 0. ]])
     """
-    v_image, v_exposure = np.zeros_like(image), np.zeros((3, 4))
+    v_image, v_exposure = np.zeros(image.shape), np.zeros((3, 4))
     for y, x in np.ndindex(image.shape[:2]):
         v_image[y, x] = exposure[:, :3].T @ v_exposed[y, x]
         v_exposure[:, :3] += np.outer(v_exposed[y, x], image[y, x])
@@ -200,7 +200,7 @@ def color_correct(image: Float64[np.ndarray, "P 3"], target: Float64[np.ndarray,
         array([[0.  , 0.25],
                [1.  , 0.75]])
     """
-    corrected = np.zeros_like(image)
+    corrected = np.zeros(image.shape)
     for channel in range(3):
         c, t = image[:, channel], target[:, channel]
         variance = max(float(np.mean(t * t) - np.mean(t) ** 2), _LEAST)

@@ -124,7 +124,7 @@ def means_cam_from_means(
         array([[1. , 2. , 3.5]])
     """
     R, t = viewmat[:3, :3], viewmat[:3, 3]
-    means_cam = np.zeros_like(means)
+    means_cam = np.zeros(means.shape)
     for i in range(len(means)):
         means_cam[i] = R @ means[i] + t
     return means_cam
@@ -152,7 +152,7 @@ def means_cam_from_means_vjp(
         array([1., 2., 4., 1.])
     """
     R = viewmat[:3, :3]
-    v_means = np.zeros_like(means)
+    v_means = np.zeros(means.shape)
     v_viewmat = np.zeros((4, 4))
     for i in range(len(means)):
         v_means[i] = R.T @ v_means_cam[i]
@@ -182,7 +182,7 @@ def covars_cam_from_covars(
         array([2., 1., 4.])
     """
     R = viewmat[:3, :3]
-    covars_cam = np.zeros_like(covars)
+    covars_cam = np.zeros(covars.shape)
     for i in range(len(covars)):
         covars_cam[i] = R @ covars[i] @ R.T
     return covars_cam
@@ -214,7 +214,7 @@ def covars_cam_from_covars_vjp(
         array([2., 0., 0., 0.])
     """
     R = viewmat[:3, :3]
-    v_covars = np.zeros_like(covars)
+    v_covars = np.zeros(covars.shape)
     v_viewmat = np.zeros((4, 4))
     for i in range(len(covars)):
         V = v_covars_cam[i]

@@ -115,7 +115,7 @@ def compensations_vjp(
         array([[3., 0.],
                [0., 3.]])
     """
-    v_covars2d = np.zeros_like(covars2d)
+    v_covars2d = np.zeros(covars2d.shape)
     blurred = low_pass(covars2d, eps2d)
     factors = compensations(covars2d, eps2d)
     for i in range(len(covars2d)):
@@ -172,7 +172,7 @@ def conics_from_covars2d_vjp(
         array([[-4., -2.],
                [-2., -4.]])
     """
-    v_covars2d = np.zeros_like(covars2d)
+    v_covars2d = np.zeros(covars2d.shape)
     for i in range(len(covars2d)):
         if _det(covars2d[i]) > 0.0:
             Q = _inverse(covars2d[i])

@@ -187,15 +187,15 @@ def colors_from_sh_vjp(
     n_sh = _enough(sh, degree)
     units = _unit(dirs)
     basis = sh_basis(units, degree)
-    v_sh = np.zeros_like(sh)
-    v_basis = np.zeros_like(basis)
+    v_sh = np.zeros(sh.shape)
+    v_basis = np.zeros(basis.shape)
     for i in range(len(sh)):
         unclamped = basis[i] @ sh[i, :n_sh] + 0.5
         v_sum = np.where(unclamped >= 0.0, v_colors[i], 0.0)
         v_sh[i, :n_sh] = np.outer(basis[i], v_sum)
         v_basis[i] = sh[i, :n_sh] @ v_sum
     v_units = sh_basis_vjp(units, degree, v_basis)
-    v_dirs = np.zeros_like(dirs)
+    v_dirs = np.zeros(dirs.shape)
     for i in range(len(dirs)):
         u, v_u = units[i], v_units[i]
         v_dirs[i] = (v_u - u * (u @ v_u)) / math.hypot(*dirs[i].tolist())
@@ -253,7 +253,7 @@ def lower_degree(
 
 
 def _unit(dirs: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
-    units = np.zeros_like(dirs)
+    units = np.zeros(dirs.shape)
     for i in range(len(dirs)):
         units[i] = dirs[i] / math.hypot(*dirs[i].tolist())
     return units

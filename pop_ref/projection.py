@@ -79,7 +79,7 @@ def project_means_vjp(
         array([[ 2.,  4., -5.]])
     """
     fx, fy, _, _ = _intrinsics(K, width, height, profile)
-    v_means_cam = np.zeros_like(means_cam)
+    v_means_cam = np.zeros(means_cam.shape)
     for i, (x, y, z) in enumerate(means_cam.tolist()):
         v_x, v_y = v_means2d[i].tolist()
         v_means_cam[i] = fx / z * v_x, fy / z * v_y, -(fx * x * v_x + fy * y * v_y) / (z * z)
@@ -160,7 +160,7 @@ def projection_jacobians_vjp(
     """
     fx, fy, _, _ = _intrinsics(K, width, height, profile)
     limits_x, limits_y = _frustum_limits(K, width, height, profile)
-    v_means_cam = np.zeros_like(means_cam)
+    v_means_cam = np.zeros(means_cam.shape)
     for i, (x, y, z) in enumerate(means_cam.tolist()):
         (v_xx, _, v_xz), (_, v_yy, v_yz) = v_jacobians[i].tolist()
         v_x, v_z_x = _offset_vjp(x, z, fx, limits_x, v_xz, profile)
@@ -223,8 +223,8 @@ def project_covars_vjp(
         array([[4., 0., 0.],
                [0., 4., 0.]])
     """
-    v_covars_cam = np.zeros_like(covars_cam)
-    v_jacobians = np.zeros_like(jacobians)
+    v_covars_cam = np.zeros(covars_cam.shape)
+    v_jacobians = np.zeros(jacobians.shape)
     for i in range(len(covars_cam)):
         J, Sigma, V = jacobians[i], covars_cam[i], v_covars2d[i]
         v_covars_cam[i] = J.T @ V @ J

@@ -74,8 +74,8 @@ class Gaussians(_PrintsAsCode):
             raise ValueError(f"sh has {self.sh.shape[1]} coefficients; it must have 1, 4, 9 or 16")
         _reject("scales", self.scales, self.scales < 0.0, "must be >= 0")
         _reject("opacities", self.opacities, (self.opacities < 0.0) | (self.opacities > 1.0), "must be in [0, 1]")
-        norms = np.sqrt(np.sum(self.quats**2, axis=1))
-        _reject("quats", self.quats, norms == 0.0, "must have a norm > 0")
+        # a square could be too small, or too large, for a number
+        _reject("quats", self.quats, ~np.any(self.quats, axis=1), "must have a norm > 0")
 
     def __len__(self) -> int:
         return len(self.means)

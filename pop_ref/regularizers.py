@@ -104,7 +104,7 @@ def sparse_depth_loss_vjp(
         >>> sparse_depth_loss_vjp(np.array([[2.0, 4.0]]), np.array([[1.5, 0.5]]), np.array([0.5]), 16.0)
         array([[0., 1.]])
     """
-    v_depth = np.zeros_like(depth)
+    v_depth = np.zeros(depth.shape)
     for place, d in zip(places, disparities, strict=True):
         disparity = _disparity(depth, place)
         for pixel, weight in _around(depth, place):

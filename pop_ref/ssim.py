@@ -154,7 +154,7 @@ def ssim_vjp(
     x, y = _padded(replace_left_out(image, target, mask), target, padding)
     kept: list[list[int]] = np.argwhere(_kept_windows(image, padding, mask)).tolist()
     window = gaussian_window()[:, :, None]
-    v_x = np.zeros_like(x)
+    v_x = np.zeros(x.shape)
     for row, col in kept:
         _, v_mu, v_xx, v_xy = _compare_window(x, y, row, col)
         here = np.s_[row : row + WINDOW_SIZE, col : col + WINDOW_SIZE]

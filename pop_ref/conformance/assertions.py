@@ -121,16 +121,15 @@ def assert_same_image(
     """Assert that two images agree where no decision is near its threshold, within their error bounds."""
     where = error_bounds.unambiguous if at is None else error_bounds.unambiguous & at
     magnitude = error_bounds.image + error_bounds.absolute
-    assert_close(key, actual[where], expected[where], magnitude[where], backend.dtype, against_oracle)
+    assert_close(key, actual, expected, magnitude, backend.dtype, against_oracle, where)
 
 
 def assert_same_transmittance(
     key: str, backend: Any, actual: Any, expected: Any, error_bounds: PixelErrorBounds, against_oracle: bool = False
 ) -> None:
     """Assert that two maps of remaining transmittance agree where no decision is near its threshold."""
-    where = error_bounds.unambiguous
     magnitude = error_bounds.T_final + 1.0
-    assert_close(key, actual[where], expected[where], magnitude[where], backend.dtype, against_oracle)
+    assert_close(key, actual, expected, magnitude, backend.dtype, against_oracle, error_bounds.unambiguous)
 
 
 def require(backend: Any, offered: dict[str, Any], name: str) -> None:

@@ -9,6 +9,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from pop_ref.conformance.adapter import Adapter, OracleAdapter
 from pop_ref.conformance.capabilities import RENDER
 from pop_ref.constants import PAPER, Profile
@@ -99,6 +101,9 @@ def made_by(path: str) -> Adapter:
         raise ValueError(
             f"{path} makes no adapter: it has no {', '.join(lacks)}; derive it from pop_ref.conformance.Adapter"
         )
+    # the word "float64" equals no np.float64, and would be judged by the tolerances of another precision
+    if made.dtype not in (np.float32, np.float64):
+        raise ValueError(f"{path} has dtype {made.dtype!r}; it must be np.float32 or np.float64")
     return made
 
 

@@ -299,6 +299,12 @@ class _Recorder:
         self.path = Path(option("--scorecard"))
         if self.path.suffix not in (".json", ".html"):
             raise pytest.UsageError(f"scorecard {self.path} must end in .json or .html")
+        try:
+            # what cannot be written is told before the laws run, not after
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self.path.open("a").close()
+        except OSError as error:
+            raise pytest.UsageError(f"scorecard {self.path} cannot be written: {error.strerror}") from error
         single = option("--rasterizer") or option("--stages")
         profile = getattr(_chosen_backends(config)[-1], "profile", None) if single else None
         how = f", {option('--dtype')}, profile {profile.name if profile else 'any'}" if single else ""

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from types import ModuleType, SimpleNamespace
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from hypothesis import reject
@@ -33,9 +33,6 @@ from pop_ref.conformance.cases import BY_NAME, Case, with_own_lists
 from pop_ref.conformance.scenes import Scene, golden_scene
 from pop_ref.conformance.torch_autograd import Ask, Differentiated, differentiated
 from pop_ref.constants import PAPER, Profile
-
-# arguments at the values by which a rasterizer that lacks them draws
-NEUTRAL: Final = {"packed": False, "near_plane": 0.01, "eps2d": 0.3}
 
 
 class _CountedWhenRead(View):
@@ -151,9 +148,10 @@ class TorchAdapter(Adapter):
             return None
 
     def first_error(self) -> Exception | None:
-        """Draw one small picture; return what is raised in its place, None where it is drawn."""
+        """Draw one small picture, and again with gradients; return what is raised in its place, None if nothing is."""
         try:
-            self._call(s := super().sees(golden_scene()), self._leaves(s, grad=False), dominance=False, counts=False)
+            self._drawn(super().sees(golden_scene()), dominance=False, counts=False)
+            self.has(GRADIENTS)
         except Exception as error:
             return error
         return None
@@ -166,8 +164,9 @@ class TorchAdapter(Adapter):
         except NotImplementedError:
             return False
         except RuntimeError as error:
-            # what leaves torch on its way, to NumPy or to a foreign kernel, says that a tensor requires grad
-            if "requires grad" not in str(error):
+            # what leaves torch on its way, to NumPy or to a foreign kernel, says that a tensor requires grad; so does
+            # what writes over its arguments, which is a fault
+            if "requires grad" not in str(error) or "in-place" in str(error):
                 raise
             return False
         return bool(image.requires_grad)
@@ -279,21 +278,32 @@ class TorchAdapter(Adapter):
     def _view(self, scene: Scene, drawn: Any, dominance: bool, counts: bool) -> View:
         image, alphas, meta = drawn
         H, W, N = scene.camera.height, scene.camera.width, len(scene.gaussians)
+        if image.shape[-3:-1] != (H, W):
+            raise ValueError(f"images have shape {[*image.shape]}; they must be [cameras, {H}, {W}, channels]")
         T_final = meta.get("final_T")
         shown: dict[str, Any] = {}
         # reading what was not asked for may draw anew
         if dominance or "dominance" not in self._instruments:
-            shown |= {name: (meta.get(name), (H, W)) for name in ("dominant_ids", "dominant_weights")}
-            shown["dominant_counts"] = (meta.get("dominant_counts"), (N,))
+            shown |= {name: (name, (H, W)) for name in ("dominant_ids", "dominant_weights")}
+            shown["dominant_counts"] = ("dominant_counts", (N,))
         if counts or "counts" not in self._instruments:
-            shown |= {"n_blended": (meta.get("n_contrib"), (H, W)), "n_traversed": (meta.get("n_traversed"), (H, W))}
+            shown |= {"n_blended": ("n_contrib", (H, W)), "n_traversed": ("n_traversed", (H, W))}
         shapes = {"radii": (N, 2), "means2d": (N, 2), "depths": (N,), "conics": (N, 3)}
-        shown |= {name: (meta.get(name), shape) for name, shape in shapes.items()}
+        shown |= {name: (name, shape) for name, shape in shapes.items()}
         return View(
             image=self._array(image).reshape(H, W, -1),
             T_final=self._array(T_final if T_final is not None else 1.0 - alphas).reshape(H, W),
-            **{name: None if x is None else self._array(x).reshape(shape) for name, (x, shape) in shown.items()},
+            **{name: self._told(meta, key, shape) for name, (key, shape) in shown.items()},
         )
+
+    def _told(self, meta: Any, key: str, shape: tuple[int, ...]) -> np.ndarray | None:
+        value = meta.get(key)
+        if value is None:
+            return None
+        array = np.asarray(self._array(value))
+        if array.size != np.prod(shape):
+            raise ValueError(f"meta[{key!r}] has shape {[*array.shape]}; of one camera it must be {[1, *shape]}")
+        return array.reshape(shape)
 
     def gradients(self, scene: Scene, v_image: Any, v_T_final: Any) -> dict[str, np.ndarray]:
         """Return autograd's cotangents; those of the screen means when the meta keeps them."""
@@ -384,16 +394,18 @@ class TorchAdapter(Adapter):
         return asked | ({"profile": scene.profile} if self._takes_profile else {})
 
     def _taken(self, **options: Any) -> dict[str, Any]:
-        """Return the options without those that the rasterizer's signature lacks and that change nothing in an image.
+        """Return the options without those that the rasterizer's signature lacks and that are at its own constants.
 
         The side of a tile is how a rasterizer works, not what it draws; where it does (square extents, D3), its
         profile has it.
         """
         unknown = set() if self._takes_anything else options.keys() - self._parameters
+        constants = self.profile or PAPER
+        neutral = {"packed": False, "near_plane": constants.near_plane, "eps2d": constants.eps2d}
         return {
             name: value
             for name, value in options.items()
-            if name not in unknown or (name != "tile_size" and value != NEUTRAL.get(name))
+            if name not in unknown or (name != "tile_size" and value != neutral.get(name))
         }
 
     def _leaves(self, scene: Scene, grad: bool) -> dict[str, Any]:

@@ -111,10 +111,12 @@ def _check(index: dict[str, Any], folder: Path, results: Path, precision: str) -
         arrays = index["kinds"][vector["kind"]]["arrays"]
         outputs = {array: entry for array, entry in arrays.items() if entry["role"] == "output"}
         known_outputs |= dict.fromkeys(outputs)
-        path = next((p for p in (results / f"{name}.npz", results / f"{name}.json") if p.exists()), None)
-        if path is None:
+        paths = [p for p in (results / f"{name}.npz", results / f"{name}.json") if p.exists()]
+        if not paths:
             found.missing.append(name)
             continue
+        path = paths[0]
+        found.strange += [f"{other.name} ({path.name} is there)" for other in paths[1:]]
         result = read_arrays(path)
         found.strange += [f"{path.name}: {array}" for array in result if array not in outputs]
         seen |= result.keys() & outputs.keys()

@@ -87,11 +87,12 @@ def _split(text: str) -> list:
 def test_one_wrong_entry_is_found_and_what_the_index_does_not_know_is_said(pop, shared_vectors, port, tmp_path):
     results = shutil.copytree(port, tmp_path / "results")
     (results / "notes.txt").write_text("mine")
+    (results / "golden.json").write_text("{}")
     with np.load(results / "golden.npz") as stored:
         arrays = {**stored, "v_mean": np.zeros(3)}
     np.savez(results / "golden.npz", **arrays)
     outcome = pop.done("vectors", "check", shared_vectors, results)
-    assert "unknown, not judged: notes.txt, golden.npz: v_mean" in outcome.out
+    assert "unknown, not judged: notes.txt, golden.json (golden.npz is there), golden.npz: v_mean" in outcome.out
     arrays["image"][3, 5, 1] += 1e-3
     np.savez(results / "golden.npz", **arrays)
     outcome = pop("vectors", "check", shared_vectors, results)

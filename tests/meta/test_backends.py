@@ -21,8 +21,17 @@ from torch import Tensor
 from pop_fast.api.rasterize import rasterization as fast
 from pop_ref.compositing import composite, composite_vjp
 from pop_ref.conformance import Adapter, Scene, capabilities
-from pop_ref.conformance.adapter import OracleAdapter, View, stage_function, under
-from pop_ref.conformance.backends import ELSEWHERE, Absent, Unavailable, made_by, shipped, shipped_or_absent
+from pop_ref.conformance.adapter import OracleAdapter, View, error_bounds_of, stage_function, under
+from pop_ref.conformance.assertions import assert_same_image
+from pop_ref.conformance.backends import (
+    ELSEWHERE,
+    Absent,
+    Unavailable,
+    made_by,
+    require_a_picture,
+    shipped,
+    shipped_or_absent,
+)
 from pop_ref.conformance.failure_report import failure_report
 from pop_ref.conformance.foreign_adapters import inria
 from pop_ref.conformance.law import missing
@@ -276,6 +285,58 @@ def test_a_rasterizer_with_one_profile_is_judged_under_it(profile: str) -> None:
     assert adapter.sees(golden_scene()).profile == PROFILES[profile]
 
 
+def test_a_rasterizer_that_lacks_an_argument_is_not_handed_its_own_constant() -> None:
+    def rasterization(means: Any, quats: Any, scales: Any, opacities: Any, colors: Any, viewmats: Any, Ks: Any,
+                      width: int, height: int, sh_degree: Any = None, backgrounds: Any = None) -> Any:  # fmt: skip
+        options = {"sh_degree": sh_degree, "backgrounds": backgrounds, "profile": "inria", "packed": False}
+        return sound(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **options)
+
+    backend = TorchAdapter("Inria's", rasterization, profile=INRIA)
+    assert backend.first_error() is None
+    assert "near_plane" in str(backend.why_not(capabilities.PLANES))
+    assert not broken(backend, SQUARE)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda images, meta: (images.permute(0, 3, 1, 2), meta),
+         "images have shape [1, 3, 16, 16]; they must be [cameras, 16, 16, channels]"),
+        (lambda images, meta: (images, {"radii": meta["radii"][..., 0]}),
+         "meta['radii'] has shape [1, 10]; of one camera it must be [1, 10, 2]"),
+    ],
+    ids=["channels first", "one radius"],
+)  # fmt: skip
+def test_an_image_or_meta_of_another_shape_is_told_by_name(change: Callable[..., Any], said: str) -> None:
+    def rasterization(*args: Any, **options: Any) -> Any:
+        images, alphas, meta = sound(*args, **options)
+        images, meta = change(images, meta)
+        return images, alphas, meta
+
+    with pytest.raises(ValueError, match=re.escape(said)):
+        TorchAdapter("strange", rasterization).render(golden_scene())
+
+
+def test_a_pixel_that_differs_is_told_by_its_place_and_an_image_of_another_shape_by_its_shape() -> None:
+    class Transposed(Blending):
+        def composite(self, splats: Any, lists: Any, *rest: Any) -> Any:  # type: ignore[override]
+            found = composite(splats, lists, *rest)
+            return SimpleNamespace(image=found.image.swapaxes(0, 1), T_final=found.T_final)
+
+    scene = golden_scene().with_overrides(width=20)
+    expected, wrong = (adapter.render(scene).image for adapter in (Blending(), Transposed()))
+    sure, of = np.ones((16, 20), dtype=bool), error_bounds_of(scene, np.float64)
+    bounds: Any = SimpleNamespace(unambiguous=sure, image=of.image, absolute=of.absolute)
+    with pytest.raises(AssertionError, match=re.escape("shape (20, 16, 3), expected (16, 20, 3)")):
+        assert_same_image("agreement.image", Blending(), wrong, expected, bounds)
+    sure[0] = False
+    changed = expected.copy()
+    changed[0, 1:] += 1.0
+    changed[5, 7, 2] += 1.0
+    with pytest.raises(AssertionError, match=re.escape("first at [5, 7, 2]: got")):
+        assert_same_image("agreement.image", Blending(), changed, expected, bounds)
+
+
 def test_a_rasterizer_of_another_profile_than_it_claims_is_noticed() -> None:
     adapter = fixed("paper")
     adapter.profile = GSPLAT_1_6
@@ -304,6 +365,10 @@ class OneStage(Adapter):
 
     def falloff(self, sigma: float) -> float:
         return float(np.exp(-sigma))
+
+
+class InWords(OneStage):
+    dtype = "float64"
 
 
 class Blending(Adapter):
@@ -379,6 +444,8 @@ def test_an_adapter_is_found_by_its_path_and_must_be_one() -> None:
     assert made_by("tests.meta.test_backends:OneStage").has("falloff")
     with pytest.raises(ValueError, match="makes no adapter: it has no dtype, has, stage"):
         made_by("pathlib:Path")
+    with pytest.raises(ValueError, match=r"has dtype 'float64'; it must be np\.float32 or np\.float64"):
+        made_by("tests.meta.test_backends:InWords")
     with pytest.raises(ValueError, match="must be written module:name"):
         made_by("tests.meta.test_backends")
     with pytest.raises(ValueError, match="has no function Nobody"):
@@ -446,6 +513,30 @@ def test_a_gradient_that_fails_is_a_failure_and_not_a_missing_piece() -> None:
 
     with pytest.raises(RuntimeError, match="illegal memory access"):
         TorchAdapter("broken", broken).has(capabilities.GRADIENTS)
+
+
+def two_values(*args: Any, **options: Any) -> Any:
+    return sound(*args, **options)[:2]
+
+
+def writing_over(means: Any, *args: Any, **options: Any) -> Any:
+    means += 0.0
+    return sound(means, *args, **options)
+
+
+def failing_with_gradients(means: Any, *args: Any, **options: Any) -> Any:
+    if means.requires_grad:
+        raise RuntimeError("no backward kernel")
+    return sound(means, *args, **options)
+
+
+@pytest.mark.parametrize(
+    ("rasterization", "said"),
+    [(two_values, "expected 3, got 2"), (writing_over, "in-place"), (failing_with_gradients, "no backward kernel")],
+)
+def test_an_answer_that_no_law_can_read_is_told_in_a_line_before_they_run(rasterization: Any, said: str) -> None:
+    with pytest.raises(ValueError, match=f"a first small picture raises .*{said}"):
+        require_a_picture(TorchAdapter("odd", rasterization))
 
 
 def ids_alone(*args: Any, **options: Any) -> Any:

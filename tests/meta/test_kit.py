@@ -250,6 +250,7 @@ REFUSED = {
     ("--adapter", "pathlib:Path"): "pathlib:Path makes no adapter: it has no dtype",
     ("--backend", "gsplt"): "backend 'gsplt' is unknown; use one of oracle, fast64",
     ("--scorecard", "card.txt"): "scorecard card.txt must end in .json or .html",
+    ("--scorecard", "kit.md/card.html"): "card.html cannot be written: ",
     ("--stage", "order"): "invalid choice: 'order' (choose from",
     ("--strategy", "nowhere.at_all:Strategy"): "needs nowhere, which is not installed",
     ("--strategy", "math:Strategy"): "module math has no function Strategy",

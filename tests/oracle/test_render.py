@@ -6,6 +6,8 @@ Single stages up to the screen stand at the end, held to mpmath and SciPy, and a
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from dataclasses import replace
 from fractions import Fraction
 
@@ -457,8 +459,22 @@ def test_scales_are_exponentials(log_scale: float) -> None:
 
 def test_quaternions_whose_squares_underflow_or_overflow_are_still_normalised() -> None:
     for size in (1e-200, 1e200):
-        unit = activations.unit_quats_from_quats(np.array([[size, size, size, size]]))
-        np.testing.assert_allclose(unit, 0.5, rtol=1e-15)
+        quats = np.full((1, 4), size)
+        np.testing.assert_allclose(activations.unit_quats_from_quats(quats), 0.5, rtol=1e-15)
+        one = {"means": np.zeros((1, 3)), "scales": np.ones((1, 3)), "opacities": np.ones(1), "sh": np.zeros((1, 1, 3))}
+        with np.errstate(all="raise"):
+            assert Gaussians(quats=quats, **one).quats.tolist() == quats.tolist()
+
+
+def test_whole_numbers_are_taken_as_numbers_where_types_are_not_checked() -> None:
+    # in a process of its own: in this one every argument that is no float64 is refused
+    script = (
+        "import numpy as np; from pop_ref import activations, camera; one = np.array([[1, 1, 1, 1]])\n"
+        "print(activations.unit_quats_from_quats(one).tolist(), activations.opacities_from_logits(one[0, :1]).tolist(),"
+        "camera.means_cam_from_means(one[:, :3], np.eye(4) + 0.5 * np.eye(4, k=1)).tolist())"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.split("\n")[0] == "[[0.5, 0.5, 0.5, 0.5]] [0.7310585786300049] [[1.5, 1.5, 1.5]]"
 
 
 # multiples of 1/1024, so that no square underflows where bits are compared
