@@ -386,6 +386,11 @@ def test_the_answer_is_shown_when_asked_twice_or_after_a_pass(mine: Path, capsys
             "alpha.py, line 2: this is not Python yet",
         ),
         ({"alpha.py": "import math\nimport maths\ndef falloff(sigma):\n    return 1\n"}, ["map"], "alpha.py, line 2"),
+        (
+            {"alpha.py": "def falloff(sigma):\n    return 1\nraise SystemExit(0)\n"},
+            ["check", "alpha"],
+            "alpha.py, line 3: the file cannot be run: SystemExit: 0",
+        ),
         ({}, ["train"], "not all is written yet: activations"),
         ({}, ["check", "alpha", "--json"], "--json belongs to --all"),
         ({}, ["train", "--picture", "a.png", "--scene", "b"], "exclude each other"),
@@ -405,6 +410,18 @@ def test_bad_input_gets_one_line(
     told_to = capsys.readouterr().err
     assert message in told_to
     assert told_to.count("\n") == 1
+
+
+def test_a_file_with_a_mark_before_its_text_is_read_and_what_is_no_number_is_named(
+    mine: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = "import math\ndef falloff(sigma):\n    return math.exp\n"
+    (mine / "alpha.py").write_text(code, encoding="utf-8-sig")
+    assert main(["learn", "check", "alpha", str(mine)]) == 1
+    assert "falloff returns <built-in function exp>, which is not made of numbers alone.\n" in capsys.readouterr().out
+    (mine / "alpha.py").write_text(code.replace("return math.exp", "raise SystemExit(0)"), encoding="utf-8")
+    assert main(["learn", "check", "alpha", str(mine)]) == 1
+    assert "line 3: it stops with SystemExit: 0" in " ".join(capsys.readouterr().out.split())
 
 
 def _written(folder: Path) -> None:
