@@ -411,6 +411,7 @@ def test_the_answer_is_shown_when_asked_twice_or_after_a_pass(mine: Path, capsys
             "alpha.py, line 3: the file cannot be run: SystemExit: 0",
         ),
         ({}, ["train"], "not all is written yet: activations"),
+        ({}, ["train", "--steps", "-5"], "--steps is -5; give 0, for the start alone, or more"),
         ({}, ["check", "alpha", "--json"], "--json belongs to --all"),
         ({}, ["train", "--picture", "a.png", "--scene", "b"], "exclude each other"),
         (None, ["check", "alpha"], "has no stubs; 'pop-learn start"),
