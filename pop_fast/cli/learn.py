@@ -127,8 +127,11 @@ def _class(args: Class) -> int:
     needs_of_judging()
     from pop_ref.learn.grading import class_report, submissions
 
+    found, left_out = submissions(args.folder)
+    if left_out:
+        print(f"not graded, since no file of the course lies right inside: {', '.join(left_out)}", flush=True)
     grades = []
-    for folder in submissions(args.folder):
+    for folder in found:
         grades.append((folder.name, _graded_apart(folder, args.seconds)))
         print(f"{folder.name}: {grades[-1][1].get('stopped') or grades[-1][1]['score']}", flush=True)
     out = args.out or args.folder / "report.md"
@@ -145,7 +148,15 @@ def _graded_apart(folder: Path, seconds: float) -> dict[str, Any]:
 
     command = module_command("pop_ref.learn.grading", str(folder))
     try:
-        done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=seconds)
+        # who asks for input gets none, and does not wait for whoever grades
+        done = subprocess.run(
+            command,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=seconds,
+        )
     except subprocess.TimeoutExpired:
         return stopped(f"it runs for longer than {seconds:g} s; is there an endless loop?")
     grade = read_grade(done.stdout)

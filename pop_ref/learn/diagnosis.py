@@ -18,7 +18,7 @@ import numpy as np
 from pop_ref.learn.mistakes import explained_by
 from pop_ref.learn.mistakes_geometry import with_turned_rotation
 from pop_ref.learn.probes import oracle
-from pop_ref.learn.student import Call, numbers, said, same, where
+from pop_ref.learn.student import Call, NotNumbersError, numbers, said, same, where
 
 # what is wrong, the hint, the call that shows it
 Diagnosis = tuple[str, str, Call]
@@ -55,6 +55,8 @@ def diagnose(calls: Sequence[Call], folder: Path) -> Diagnosis:
     wrong = [call for call in calls if not call.is_right]
     name = wrong[0].function
     stopped = next((call for call in wrong if call.error), None)
+    if stopped is not None and isinstance(stopped.error, NotNumbersError):
+        return f"{name} {stopped.error}.", "", stopped
     if stopped is not None and stopped.error is not None:
         sentence = f"{where(stopped.error, folder)}: it stops with {said(stopped.error)}."
         hint = _of_shapes(stopped) or _of_totals(stopped) or "Call it by hand with these numbers."

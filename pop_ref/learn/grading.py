@@ -80,8 +80,11 @@ def handed_over(grade: dict[str, Any]) -> str:
     return _MARK + json.dumps(grade)
 
 
-def submissions(folder: Path) -> list[Path]:
-    """Find the folders of a class: those inside `folder` that hold a file of the course.
+def submissions(folder: Path) -> tuple[list[Path], list[str]]:
+    """Find the folders of a class.
+
+    Returns:
+        Those inside `folder` that hold a file of the course, and the names of those that hold none.
 
     Raises:
         ValueError: there is none.
@@ -92,7 +95,7 @@ def submissions(folder: Path) -> list[Path]:
         raise ValueError(
             f"{folder} has no submissions; put one folder a student into it, each with files of the course"
         )
-    return found
+    return found, [each.name for each in inside if each not in found and not each.name.startswith(".")]
 
 
 def read_grade(printed: str) -> dict[str, Any] | None:

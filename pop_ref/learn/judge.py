@@ -31,7 +31,7 @@ from pop_ref.learn.course import DENSITY_SETTINGS, NOT_TAUGHT, Stage
 from pop_ref.learn.diagnosis import diagnose, leaves, parts_named
 from pop_ref.learn.probes import oracle, probes
 from pop_ref.learn.stubs import formulas
-from pop_ref.learn.student import PACKAGE, Borrowed, Call, Work, borrowing, said, same, tried_on, where
+from pop_ref.learn.student import PACKAGE, STOPS, Borrowed, Call, Work, borrowing, said, same, tried_on, where
 from pop_ref.recipes import RECIPES
 
 EXAMPLES: Final = 12
@@ -121,7 +121,7 @@ def _broken_example(borrowed: Borrowed, home: str, name: str) -> str:
             try:
                 found = eval(source, ours) if is_value else exec(source, ours)
                 agrees = not is_value or found is wanted or same(found, wanted)
-            except Exception as error:
+            except STOPS as error:
                 return f"{source} stops with {said(error)}"
         if not agrees:
             return f"{source} should give {' '.join(each.want.split())} and gives {' '.join(repr(found).split())[:200]}"

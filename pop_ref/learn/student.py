@@ -30,7 +30,13 @@ import pop_ref
 from pop_ref.learn.course import COURSE, Stage
 
 PACKAGE: Final = "pop_yours"
+# with which a student's code may stop; one that ends Python has not passed
+STOPS: Final = (Exception, SystemExit)
 _ORACLE: Final = Path(pop_ref.__file__).parent
+
+
+class NotNumbersError(TypeError):
+    """A function returned what is not made of numbers, such as a generator or a function that was not called."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +74,7 @@ class Call:
     found: Any
     expected: Any
     words: str = ""
-    error: Exception | None = None
+    error: BaseException | None = None
     raises: bool = False
 
     @property
@@ -131,9 +137,10 @@ def _is_stub(node: ast.FunctionDef) -> bool:
 
 def _parsed(path: Path) -> ast.Module:
     try:
-        return ast.parse(path.read_text(encoding="utf-8"), str(path))
+        # Python, too, takes the mark that some editors put before the text
+        return ast.parse(path.read_text(encoding="utf-8-sig"), str(path))
     except SyntaxError as error:
-        raise ValueError(f"{path}, line {error.lineno}: this is not Python yet: {error.msg}") from None
+        raise ValueError(f"{path}, line {error.lineno or 1}: this is not Python yet: {error.msg}") from None
     except UnicodeDecodeError:
         raise ValueError(f"{path} is not UTF-8 text; save it as UTF-8") from None
     # which of the two comes is up to Python's version
@@ -231,11 +238,19 @@ def tried_on(function: Callable[..., Any], truth: Callable[..., Any], given: tup
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         try:
-            found = function(*ours)
-        except Exception as error:
+            found = _numbers_alone(function(*ours))
+        except STOPS as error:
             return Call(name, parameters_of(truth), given, {}, (None, ()), meant, words, error, raises)
     written = found, _written_to((given,), ours)
     return Call(name, parameters_of(truth), given, {}, written, meant, words, raises=raises)
+
+
+def _numbers_alone(found: Any) -> Any:
+    try:
+        numbers(found)
+    except (TypeError, ValueError):
+        raise NotNumbersError(f"returns {repr(found)[:80]}, which is not made of numbers alone") from None
+    return found
 
 
 def _written_to(kept: tuple[Any, ...], after: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -267,7 +282,7 @@ def _run(path: Path) -> ModuleType:
     sys.modules[module.__name__] = module
     try:
         exec(compile(tree, str(path), "exec"), module.__dict__)
-    except Exception as error:
+    except STOPS as error:
         raise ValueError(f"{where(error, path.parent)}: the file cannot be run: {said(error)}") from None
     return module
 

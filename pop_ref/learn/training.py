@@ -178,8 +178,10 @@ def train(work: Work, subject: Subject, steps: int = 120, every: int = 10, seed:
     """Fit the subject, telling at the start and now and then.
 
     Raises:
-        ValueError: a stage is not written, or stops with an error; the message names it.
+        ValueError: there are fewer than 0 steps, or a stage is not written or stops with an error, which is named.
     """
+    if steps < 0:
+        raise ValueError(f"--steps is {steps}; give 0, for the start alone, or more")
     missing = [stage.name for stage in COURSE if not work.is_whole(stage)]
     if missing:
         raise ValueError(f"not all is written yet: {', '.join(missing)}; 'pop-learn check' says what each lacks")

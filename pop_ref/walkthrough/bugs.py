@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Callable
+from typing import Any
 
-from pop_ref.conformance.mutants import MUTANTS, Mutant
+from pop_ref.conformance.mutants import MUTANTS, Mutant, living
 from pop_ref.conformance.mutants.trial import killed_by, sound
 
 
@@ -18,6 +20,12 @@ def bug_named(name: str) -> Mutant:
         if mutant.name == name:
             return mutant
     raise ValueError(f"the kit has no mutant {name!r}")
+
+
+def broken(name: str, function: str) -> Callable[..., Any]:
+    """Return a function of the oracle as a mutant has it, so that an answer can hold what it says against it."""
+    with living(bug_named(name)) as backend:
+        return backend.stage(function)
 
 
 def caught(name: str) -> str:

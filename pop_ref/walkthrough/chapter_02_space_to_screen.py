@@ -40,7 +40,7 @@ from pop_ref.pixel import SplatRows, composite_pixel
 from pop_ref.projection import project_covars, project_means, projection_jacobians
 from pop_ref.records import Camera, Gaussians
 from pop_ref.splatting import geometry, project
-from pop_ref.walkthrough.bugs import caught
+from pop_ref.walkthrough.bugs import broken, caught
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, INK, MUTED, SECOND, THIRD, axes
 
@@ -421,6 +421,12 @@ for k in range(2):
 # {{bug: jacobian_sign}}
 
 # %% answer
-# One entry of the last column has the wrong sign. On the axis $x = 0$ nothing changes, and everywhere else ellipses
-# lean the wrong way, the more the farther out they lie. In a photograph of a real scene it is hard to see.
+# The last column has the wrong sign. This $J \operatorname{diag}(1, 1, -1)$ draws every Gaussian as its mirror image in
+# depth. Round ones, and all on the optical axis, look right. The others lean and stretch the wrong way, the more the
+# farther out they lie. In a photograph of a real scene it is hard to see.
+wrong = broken("jacobian_sign", "projection_jacobians")(means_cam, K, width, height)
+mirror = np.diag([1.0, 1.0, -1.0])
+assert np.allclose(
+    project_covars(covars_cam, wrong), project_covars(mirror @ covars_cam @ mirror, J)
+)
 print(caught("jacobian_sign"))

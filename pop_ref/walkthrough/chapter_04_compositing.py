@@ -273,7 +273,8 @@ assert np.allclose(first + T_1 * second + T_1 * T_2 * background, pixel.color)
 # {{bug: terminating_splat_blended}}
 
 # %% answer
-# The test for the stop comes after the blending, so the splat that crosses the line is blended before the pixel ends.
+# `stops` is asked about $T$ before the splat and not about the light that the splat would leave. So the splat that
+# crosses the line is blended, and the pixel ends at the next one.
 # Every pixel that stops gets more light, by the weight $T \alpha$ of that splat. Since $T (1 - \alpha) \le 10^{-4}$,
 # this is at most $10^{-4} \alpha / (1 - \alpha)$: no more than $10^{-4}$ up to an alpha of one half, but up to a tenth
 # under the ceiling of 0.999, as for the wall above. Two programs do it on purpose; one that is compared with gsplat

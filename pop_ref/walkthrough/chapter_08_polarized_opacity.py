@@ -41,7 +41,7 @@ from pop_ref.polarization import importance_mask, pop_loss, pop_loss_vjp
 from pop_ref.records import Camera
 from pop_ref.render import render, render_vjp
 from pop_ref.training import gaussians_from_params, params_vjp
-from pop_ref.walkthrough.bugs import caught
+from pop_ref.walkthrough.bugs import broken, caught
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, MUCH, MUTED, SECOND, axes
 
@@ -439,6 +439,12 @@ for mask in (important, np.ones(5, dtype=bool), np.zeros(5, dtype=bool)):
 # {{bug: prior_over_all}}
 
 # %% answer
-# Both sums are divided by $N$. The important are pulled up with $1/1000$ instead of $1/250$, a quarter; the others down
-# with $1/1000$ instead of $1/750$, three quarters. The balance shifts by three towards 0, and the model gets too small.
+# The sum of the important is divided by $N$ and not by $N_{\mathrm{imp}}$. They are pulled up with $1/1000$ instead of
+# $1/250$, a quarter; the others down with $1/750$, as before. The balance shifts by four towards 0, and the model gets
+# too small.
+half, first_250 = np.full(1000, 0.5), np.arange(1000) < 250
+for side, share in ((first_250, 1 / 4), (~first_250, 1.0)):
+    losses = (pop_loss, broken("prior_over_all", "pop_loss"))
+    change = [loss(half + 0.1 * side, first_250) - loss(half, first_250) for loss in losses]
+    assert np.isclose(change[1] / change[0], share)
 print(caught("prior_over_all"))

@@ -35,7 +35,7 @@ from pop_ref.polarization import importance_mask, pop_loss_vjp
 from pop_ref.records import Camera, Splats
 from pop_ref.render import render, render_vjp
 from pop_ref.tiles import tile_lists
-from pop_ref.walkthrough.bugs import caught
+from pop_ref.walkthrough.bugs import broken, caught
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import ACCENT, INK, SECOND, THIRD, axes, show_image
 
@@ -478,9 +478,14 @@ assert haze["all at 0.5"] > ends["prior"]["haze"]
 # {{bug: moments_left_behind}}
 
 # %% answer
-# The moments are cut to the right length instead of gathered by the same rows, so each Gaussian after a removed one
-# continues with the momentum of its predecessor. After every densification step they move in wrong directions for some
-# ten steps, until $m$ has forgotten ($0.9^{22} = 0.1$), and by wrong lengths for some hundred, until $v$ has.
+# $m$ is cut to the right length instead of gathered by the same rows, so each Gaussian after a removed one continues
+# with the momentum of its predecessor. After every densification step they move in wrong directions for some twenty
+# steps, until $m$ has forgotten ($0.9^{22} = 0.1$). $v$ is gathered as it should be; were it cut, too, steps would have
+# wrong lengths for hundreds of steps ($0.999^{693} = 0.5$).
 assert round(0.9**22, 1) == 0.1
-assert 0.999**700 < 0.5 < 0.999**600
+assert round(0.999**693, 2) == 0.5
+four = density.Rows(*({"x": np.arange(4.0)} for _ in range(3)))
+cut = broken("moments_left_behind", "prune_rows")(four, np.arange(4) == 1)
+assert cut.params["x"].tolist() == cut.v["x"].tolist() == [0.0, 2.0, 3.0]
+assert cut.m["x"].tolist() == [0.0, 1.0, 2.0]
 print(caught("moments_left_behind"))

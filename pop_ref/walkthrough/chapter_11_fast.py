@@ -25,9 +25,10 @@ from pop_ref.alpha import alpha_from_sigma, sigma_at_pixel
 from pop_ref.compositing import composite, composite_vjp
 from pop_ref.constants import PAPER
 from pop_ref.footprint import conics_from_covars2d, radii_from_covars2d
+from pop_ref.pixel import SplatRows, composite_pixel, zero_gradients
 from pop_ref.records import Splats
 from pop_ref.tiles import tile_lists
-from pop_ref.walkthrough.bugs import caught
+from pop_ref.walkthrough.bugs import broken, caught
 from pop_ref.walkthrough.pages import picture
 from pop_ref.walkthrough.style import DIVERGING, SECOND, axes, show_image
 
@@ -410,6 +411,13 @@ assert np.allclose(by_sums, v_means2d[:, 0])
 # {{bug: stale_last_contributor}}
 
 # %% answer
-# The walk begins one splat too early in the list, so the last splat that a pixel blended gets no gradient from it.
-# Nothing crashes, and no picture shows it (chapter 12 draws one).
+# The walk begins one splat too early in the list, so the last splat that a pixel blended gets no gradient from it, and
+# those before it get one as if the background lay where it is. Nothing crashes, and no picture shows it (chapter 12
+# draws one).
+two = SplatRows([[0.5, 0.5]] * 2, [[1.0, 0.0, 1.0]] * 2, [0.5, 0.5], [[1.0], [0.25]])
+at, totals = (0.5, 0.5, [0.0]), zero_gradients(2, 1)
+walk = broken("stale_last_contributor", "composite_pixel_vjp")
+walk(composite_pixel([0, 1], two, *at), two, *at, [1.0], 0.0, totals)
+# 7/8 and 1/8 are right: T (c - b)
+assert totals.v_opacities.tolist() == [1.0, 0.0]
 print(caught("stale_last_contributor"))

@@ -425,6 +425,19 @@ def test_a_broken_chapter_ends_the_command_with_one_line(
     assert list((tmp_path / "pages").iterdir()) == []
 
 
+def test_a_chapter_that_is_not_there_and_a_folder_that_cannot_be_made_end_the_command_with_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(SystemExit):
+        main([str(tmp_path / "pages"), "--only", "1", "4c"])
+    assert "--only: there is no chapter 4c; there are 0 1 1b 2 3 4 4b" in capsys.readouterr().err
+    (tmp_path / NAME).write_text(GOOD, encoding="utf-8")
+    monkeypatch.setattr("pop_ref.walkthrough.builder.command.chapter_files", lambda: [tmp_path / NAME])
+    assert main([str(tmp_path / NAME)]) == 2
+    assert "File exists" in capsys.readouterr().err
+    assert (tmp_path / NAME).read_text(encoding="utf-8") == GOOD
+
+
 def test_what_is_not_installed_is_named(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     found = importlib.util.find_spec
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "latex2mathml" else found(name))

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import ast
 import json
+import os
 import re
 import shutil
+import subprocess
 import tomllib
 from functools import partial
 from pathlib import Path
@@ -18,6 +20,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
+from pop_fast.children import module_command
 from pop_fast.cli import main
 from pop_fast.data import load_capture
 from pop_fast.demo import make_demo
@@ -225,6 +228,22 @@ def test_a_function_knows_its_chapter() -> None:
     assert BY_NAME["projection"].chapter_of("project_covars_vjp") == "5b"
 
 
+def test_the_assignments_ask_for_every_stage_once_its_chapters_are_read() -> None:
+    text = (ROOT / "docs" / "teaching.md").read_text(encoding="utf-8")
+    plan = re.findall(r"^\| Day.* \| (.+) \| assignment \d \|$", text, re.MULTILINE)
+    asked = [
+        re.findall(r"`(\w+)`", words) for words in re.findall(r"^Write (.*?)[.:]\s", text, re.MULTILINE | re.DOTALL)
+    ]
+    assert len(plan) == len(asked) == 4
+    read = set[str]()
+    for chapters, stages in zip(plan, asked, strict=True):
+        read |= set(re.findall(r"\b\d+b?\b", chapters))
+        for name in stages:
+            missing = {each for each in map(BY_NAME[name].chapter_of, BY_NAME[name].names) if each not in read}
+            assert not missing, f"{name} needs {missing}"
+    assert {name for stages in asked for name in stages} == set(BY_NAME)
+
+
 def test_stubs_write_labels_in_words_and_explain_the_settings_that_the_course_has() -> None:
     for stage in COURSE:
         text = stubs.stub(stage)
@@ -386,7 +405,13 @@ def test_the_answer_is_shown_when_asked_twice_or_after_a_pass(mine: Path, capsys
             "alpha.py, line 2: this is not Python yet",
         ),
         ({"alpha.py": "import math\nimport maths\ndef falloff(sigma):\n    return 1\n"}, ["map"], "alpha.py, line 2"),
+        (
+            {"alpha.py": "def falloff(sigma):\n    return 1\nraise SystemExit(0)\n"},
+            ["check", "alpha"],
+            "alpha.py, line 3: the file cannot be run: SystemExit: 0",
+        ),
         ({}, ["train"], "not all is written yet: activations"),
+        ({}, ["train", "--steps", "-5"], "--steps is -5; give 0, for the start alone, or more"),
         ({}, ["check", "alpha", "--json"], "--json belongs to --all"),
         ({}, ["train", "--picture", "a.png", "--scene", "b"], "exclude each other"),
         (None, ["check", "alpha"], "has no stubs; 'pop-learn start"),
@@ -405,6 +430,18 @@ def test_bad_input_gets_one_line(
     told_to = capsys.readouterr().err
     assert message in told_to
     assert told_to.count("\n") == 1
+
+
+def test_a_file_with_a_mark_before_its_text_is_read_and_what_is_no_number_is_named(
+    mine: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = "import math\ndef falloff(sigma):\n    return math.exp\n"
+    (mine / "alpha.py").write_text(code, encoding="utf-8-sig")
+    assert main(["learn", "check", "alpha", str(mine)]) == 1
+    assert "falloff returns <built-in function exp>, which is not made of numbers alone.\n" in capsys.readouterr().out
+    (mine / "alpha.py").write_text(code.replace("return math.exp", "raise SystemExit(0)"), encoding="utf-8")
+    assert main(["learn", "check", "alpha", str(mine)]) == 1
+    assert "line 3: it stops with SystemExit: 0" in " ".join(capsys.readouterr().out.split())
 
 
 def _written(folder: Path) -> None:
@@ -540,6 +577,21 @@ def test_a_class_is_graded_whatever_one_submission_does(tmp_path: Path, capsys: 
     assert "notes" not in report
     assert main(["learn", "class", str(tmp_path / "notes")]) == 2
     assert "has no submissions" in capsys.readouterr().err
+
+
+def test_a_class_is_told_of_folders_without_files_and_nobody_waits_for_input(tmp_path: Path) -> None:
+    (tmp_path / "anna" / "mine").mkdir(parents=True)
+    (tmp_path / "anna" / "mine" / "alpha.py").write_text("def falloff(sigma):\n    return 1\n")
+    (tmp_path / "bert").mkdir()
+    (tmp_path / "bert" / "alpha.py").write_text("input('go on?')\ndef falloff(sigma):\n    return 1\n")
+    command = module_command("pop_fast.cli", "learn", "class", str(tmp_path), "--seconds", "60")
+    # who grades sits before a terminal, on which nothing is typed
+    terminal, typed = os.pipe()
+    done = subprocess.run(command, stdin=terminal, capture_output=True, text=True)
+    os.close(terminal)
+    os.close(typed)
+    assert "not graded, since no file of the course lies right inside: anna\nbert: 0\n" in done.stdout
+    assert "the file cannot be run: EOFError" in (tmp_path / "report.md").read_text()
 
 
 # one sentence may be of several mistakes, such as half a pixel to the left and to the right

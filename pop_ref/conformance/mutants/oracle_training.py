@@ -66,7 +66,7 @@ _LINES: Final[Lines] = {
          "test_losses:the_objectives_with_every_option_are_the_oracles"),
     ),
     "polarization.py": (
-        ("prior_over_all", "both sums of the prior are divided by N instead of their own number",
+        ("prior_over_all", "the sum of the important is divided by N instead of their own number",
          "toward_one = np.sum(1.0 - opacities[important]) / max(int(np.sum(important)), 1)",
          "toward_one = np.sum(1.0 - opacities[important]) / max(len(mask), 1)",
          "test_losses:the_prior_is_the_mean_distance_of_each_side_from_its_pole"),
@@ -160,7 +160,7 @@ _LINES: Final[Lines] = {
     ),
     "density_rows.py": (
         ("moments_left_behind",
-         "pruning gathers parameters but truncates moments: every survivor inherits a stranger's momentum",
+         "pruning gathers parameters but truncates first moments: every survivor inherits a stranger's momentum",
          "m = {name: np.concatenate([array[keep],", "m = {name: np.concatenate([array[: int(np.sum(keep))],",
          "test_density:survivors_of_pruning_keep_their_order_bits_and_moments"),
         ("clones_inherit_moments", "copies start with moments of their own values instead of zero",

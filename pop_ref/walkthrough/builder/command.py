@@ -64,7 +64,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     try:
         write(wanted)
-    except (ChapterError, BrowserError) as error:
+    except (ChapterError, BrowserError, OSError) as error:
         print(error, file=sys.stderr)
         return 2
     return 0
@@ -87,6 +87,10 @@ def _wanted(arguments: list[str] | None) -> argparse.Namespace:
     given = parser.parse_args(arguments)
     if given.folder is None and not (given.all or given.notebooks or given.slides or given.pdf):
         parser.error("name the folder that the pages go to, or --notebooks, --slides or --pdf")
+    numbers = [chapter_number(path) for path in chapter_files()]
+    unknown = [each for each in given.only or [] if each not in numbers]
+    if unknown:
+        parser.error(f"--only: there is no chapter {', '.join(unknown)}; there are {' '.join(numbers)}")
     if given.all:
         if given.folder is None:
             parser.error("--all needs the folder that the pages go to")
