@@ -8,6 +8,7 @@ explained in `step.h`. Results are the same bits for any number of threads.
 from __future__ import annotations
 
 import ctypes
+import os
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from pop_fast.compiled.library import (
     PROJECTION_CONSTANTS,
     REAL,
     WHOLE,
+    StepperFunctions,
     call_library,
     fields_of,
     stepper_functions,
@@ -156,6 +158,12 @@ class _Target:
         return sum(maps.numel() * maps.element_size() for maps in (self.target, self.mu_y, self.s_yy))
 
 
+def _close(functions: StepperFunctions, stepper: int, owner: int) -> None:
+    # a fork of the process that made it has none of its threads, and would wait for them without end
+    if os.getpid() == owner:
+        functions.close(stepper)
+
+
 class NativeTrainer:
     """Takes training steps on CPU tensors.
 
@@ -195,7 +203,7 @@ class NativeTrainer:
         if stepper is None:
             raise MemoryError("there is no memory for the native training step")
         self._stepper = stepper
-        weakref.finalize(self, self._functions.close, self._stepper)
+        weakref.finalize(self, _close, self._functions, self._stepper, os.getpid())
         self._given = StepGiven()
         self._seconds = torch.zeros(len(PARTS), dtype=torch.float64)
         self._v_exposure = torch.zeros((3, 4), dtype=torch.float64)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -420,6 +422,14 @@ def test_counts_are_those_of_a_walk_through_the_lists() -> None:
     # a parabola that errs lets too much through, never too little
     assert found["reached"] <= found["marked"] <= found["pairs"] // TILE
     assert found["walked"] < found["entries"]
+
+
+def test_a_fork_does_not_let_go_of_threads_that_it_does_not_have() -> None:
+    closed: list[int] = []
+    functions: Any = SimpleNamespace(close=closed.append)
+    native_step._close(functions, 1, os.getpid() + 1)
+    native_step._close(functions, 2, os.getpid())
+    assert closed == [2]
 
 
 @pytest.mark.parametrize(
