@@ -189,7 +189,7 @@ def colors_of_view(sh: Tensor, means: Tensor, viewmat: Tensor, degree: int, visi
         raise ValueError("visible must name rows in ascending order, each once; use visible.unique()")
     if len(visible) and not (int(visible[0]) >= 0 and int(visible[-1]) < len(sh)):
         raise ValueError(f"visible names row {int(visible[0])} to {int(visible[-1])}; there are {len(sh)}")
-    check_bands(sh, degree)
+    check_bands(sh.shape[1], degree)
     return _Colors.apply(sh, means, viewmat, degree, visible)
 
 

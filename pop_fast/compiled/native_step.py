@@ -29,6 +29,7 @@ from pop_fast.compiled.library import (
     this_library,
 )
 from pop_fast.stages.blend import Stop, below
+from pop_fast.stages.harmonics import check_bands
 from pop_fast.stages.losses import REACH, Padding, border_of, check_size, kept_windows
 from pop_fast.train.signals import Abandoned, StopRequest, heard
 from pop_fast.train.steps import Collected, Phase, StepSettings, StepStats
@@ -275,7 +276,8 @@ class NativeTrainer:
         """Take steps until the counter stands at `until`, all of one phase, or until a stop was requested.
 
         Raises:
-            ValueError: a Gaussian is no longer finite; the message names its row and step.
+            ValueError: a Gaussian is no longer finite; the message names its row and step. Or the phase's degree has
+                more coefficients than the Gaussians.
             MemoryError: there is not enough, or the Gaussians reach more tiles than can be numbered.
         """
         self._history = {}
@@ -328,6 +330,7 @@ class NativeTrainer:
 
     def _set_phase(self, phase: Phase) -> None:
         given, settings, found = self._given, self.settings, self.statistics
+        check_bands(1 + given.n_rest, phase.sh_degree)
         given.degree, given.l1 = phase.sh_degree, LOSSES.index(phase.objective.pixelwise)
         given.pixel_weight, given.ssim_weight = phase.objective.weights
         given.lambda_pop = settings.lambda_pop if phase.pop else 0.0

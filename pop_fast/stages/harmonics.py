@@ -94,7 +94,7 @@ class Evaluation:
 
 def evaluate_sh(sh: Tensor, dirs: Tensor, degree: int) -> Evaluation:
     """Evaluate the active bands and keep what the transpose needs."""
-    n_sh = check_bands(sh, degree)
+    n_sh = check_bands(sh.shape[1], degree)
     rows = sh[:, :n_sh].permute(1, 2, 0).contiguous()
     components = dirs.T
     norms = torch.sqrt((components * components).sum(0))
@@ -103,11 +103,11 @@ def evaluate_sh(sh: Tensor, dirs: Tensor, degree: int) -> Evaluation:
     return Evaluation(degree, rows, basis, unit, norms, (rows * basis[:, None]).sum(0) + 0.5)
 
 
-def check_bands(sh: Tensor, degree: int) -> int:
-    """Return how many coefficients a degree needs; ValueError where it is none, or `sh` [N, n_sh, 3] has fewer."""
+def check_bands(given: int, degree: int) -> int:
+    """Return how many coefficients a degree needs; ValueError where it is none, or fewer are given."""
     n_sh = _n_sh(degree)
-    if sh.shape[1] < n_sh:
-        raise ValueError(f"sh has {sh.shape[1]} coefficients; degree {degree} needs {n_sh}")
+    if given < n_sh:
+        raise ValueError(f"sh has {given} coefficients; degree {degree} needs {n_sh}")
     return n_sh
 
 

@@ -5,6 +5,8 @@ Sixteen numbers side by side are the same numbers, however wide the processor's 
 
 from __future__ import annotations
 
+import mmap
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -431,6 +433,15 @@ def test_rows_that_are_none_are_refused_before_they_are_read(visible: Tensor, wo
         in_cpp.colors_of_view(sh, means, torch.eye(4), 1, visible)
     shown = in_cpp.colors_of_view(sh, means, torch.eye(4), 1, MASK.nonzero().squeeze(1))
     assert (shown != 0.0).any(1).tolist() == MASK.tolist()
+
+
+def test_a_file_whose_name_is_no_text_does_not_hide_the_threads_of_torch(tmp_path: Path) -> None:
+    name = os.fsencode(tmp_path) + b"/\xff"
+    with open(name, "w+b") as file:
+        file.write(bytes(mmap.PAGESIZE))
+        file.flush()
+        with mmap.mmap(file.fileno(), 0):
+            assert (library._fork() is None) == (library.this_library().fork is None)
 
 
 def test_bands_that_are_not_there_are_not_read() -> None:
