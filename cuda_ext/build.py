@@ -110,7 +110,10 @@ def _architectures(arch: str | list[str] | None, nvcc: str) -> list[str]:
         if match is None:
             raise BuildError(f"arch is {name!r}; write it like sm_90")
         numbers.append(int(match.group(1)))
-    oldest, version = min(numbers), nvcc_version(nvcc)
+    try:
+        oldest, version = min(numbers), nvcc_version(nvcc)
+    except (RuntimeError, OSError) as error:
+        raise BuildError(f"{error}; set CUDACXX to the path of an nvcc that works") from error
     if oldest < OLDEST:
         raise BuildError(f"sm_{oldest} is too old: the kernels are written for sm_{OLDEST} and newer")
     newest = max(numbers)

@@ -52,7 +52,10 @@ def link_flags(nvcc: str) -> list[str]:
 
 def find_compiler() -> list[str] | None:
     """Return the command of a C++17 compiler: what CXX says where it is set, else g++, clang++ or c++; None without."""
-    given = shlex.split(os.environ.get("CXX", ""))
+    try:
+        given = shlex.split(os.environ.get("CXX", ""))
+    except ValueError:  # a quotation that nothing closes
+        return None
     for command in [given] if given else [["g++"], ["clang++"], ["c++"]]:
         found = shutil.which(command[0])
         if found:

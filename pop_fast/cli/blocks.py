@@ -89,6 +89,11 @@ def _part(args: Args, job: Job) -> Part:
         raise PopError(f"{args.result}: has no block {args.block}; its blocks are {', '.join(known)}")
     number = (0 if args.part == "train" else job.rounds) if args.round is None else args.round
     found = [part for part in parts_of(job) if (part.round, part.block) == (number, args.block)]
+    if not found and 0 <= number <= job.rounds:
+        others = ", ".join(part.block for part in parts_of(job) if part.round == number and part.block is not None)
+        raise PopError(
+            f"{args.result}: round {number} trains {others} and not {args.block}; name one of these, or another --round"
+        )
     if not found:
         raise PopError(
             f"{args.result}: has no round {number}, but rounds 0 to {job.rounds}; for more of them start pop train "

@@ -23,6 +23,7 @@ from pop_fast.stages import compositing
 from pop_fast.stages import contributions as passes
 from pop_fast.stages.blend import Stop, below
 from pop_fast.stages.compositing import BlendOptions
+from pop_fast.stages.harmonics import check_bands
 from pop_fast.stages.projection import intrinsics, view_dirs_vjp
 from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of
 from pop_fast.stages.tiles import TileLists, grid_size, listed_rows, tile_rects
@@ -173,7 +174,8 @@ def project(means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, v
 
 
 def colors_of_view(sh: Tensor, means: Tensor, viewmat: Tensor, degree: int, visible: Tensor) -> Tensor:
-    """See `pop_fast.stages.splatting.colors_of_view`; ValueError where `visible` is no list of rows, ascending.
+    """See `pop_fast.stages.splatting.colors_of_view`; ValueError where `visible` is no list of rows, ascending,
+    or `degree` needs more coefficients than there are.
 
     Optimizations: one pass over the coefficients forward and one backward (`colors.h`).
     """
@@ -183,8 +185,11 @@ def colors_of_view(sh: Tensor, means: Tensor, viewmat: Tensor, degree: int, visi
             f"visible is a tensor of {visible.dtype} and shape {shape}; it must hold the numbers of the rows to "
             "evaluate, torch.int64 [V]; of a mask these are mask.nonzero().squeeze(1)"
         )
-    if len(visible) and not (int(visible.min()) >= 0 and int(visible.max()) < len(sh)):
-        raise ValueError(f"visible names row {int(visible.min())} to {int(visible.max())}; there are {len(sh)}")
+    if not bool((visible[1:] > visible[:-1]).all()):
+        raise ValueError("visible must name rows in ascending order, each once; use visible.unique()")
+    if len(visible) and not (int(visible[0]) >= 0 and int(visible[-1]) < len(sh)):
+        raise ValueError(f"visible names row {int(visible[0])} to {int(visible[-1])}; there are {len(sh)}")
+    check_bands(sh.shape[1], degree)
     return _Colors.apply(sh, means, viewmat, degree, visible)
 
 

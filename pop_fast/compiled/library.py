@@ -277,7 +277,8 @@ def _fork() -> Any:
     """
     if not sys.platform.startswith("linux"):
         return None
-    lines = Path("/proc/self/maps").read_text(encoding="utf-8").splitlines()
+    # names of files are bytes
+    lines = Path("/proc/self/maps").read_text(encoding="utf-8", errors="surrogateescape").splitlines()
     # wheels keep it in torch/lib or torch.libs; other packages bring their own, whose threads would be asleep
     files = {line.split(maxsplit=5)[-1] for line in lines if re.search(r"/torch(/lib|\.libs)/libgomp", line)}
     for file in sorted(files):

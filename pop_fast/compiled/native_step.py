@@ -8,6 +8,7 @@ explained in `step.h`. Results are the same bits for any number of threads.
 from __future__ import annotations
 
 import ctypes
+import os
 import weakref
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,12 +22,14 @@ from pop_fast.compiled.library import (
     PROJECTION_CONSTANTS,
     REAL,
     WHOLE,
+    StepperFunctions,
     call_library,
     fields_of,
     stepper_functions,
     this_library,
 )
 from pop_fast.stages.blend import Stop, below
+from pop_fast.stages.harmonics import check_bands
 from pop_fast.stages.losses import REACH, Padding, border_of, check_size, kept_windows
 from pop_fast.train.signals import Abandoned, StopRequest, heard
 from pop_fast.train.steps import Collected, Phase, StepSettings, StepStats
@@ -156,6 +159,12 @@ class _Target:
         return sum(maps.numel() * maps.element_size() for maps in (self.target, self.mu_y, self.s_yy))
 
 
+def _close(functions: StepperFunctions, stepper: int, owner: int) -> None:
+    # a fork of the process that made it has none of its threads, and would wait for them without end
+    if os.getpid() == owner:
+        functions.close(stepper)
+
+
 class NativeTrainer:
     """Takes training steps on CPU tensors.
 
@@ -195,7 +204,7 @@ class NativeTrainer:
         if stepper is None:
             raise MemoryError("there is no memory for the native training step")
         self._stepper = stepper
-        weakref.finalize(self, self._functions.close, self._stepper)
+        weakref.finalize(self, _close, self._functions, self._stepper, os.getpid())
         self._given = StepGiven()
         self._seconds = torch.zeros(len(PARTS), dtype=torch.float64)
         self._v_exposure = torch.zeros((3, 4), dtype=torch.float64)
@@ -267,7 +276,8 @@ class NativeTrainer:
         """Take steps until the counter stands at `until`, all of one phase, or until a stop was requested.
 
         Raises:
-            ValueError: a Gaussian is no longer finite; the message names its row and step.
+            ValueError: a Gaussian is no longer finite; the message names its row and step. Or the phase's degree has
+                more coefficients than the Gaussians.
             MemoryError: there is not enough, or the Gaussians reach more tiles than can be numbered.
         """
         self._history = {}
@@ -320,6 +330,7 @@ class NativeTrainer:
 
     def _set_phase(self, phase: Phase) -> None:
         given, settings, found = self._given, self.settings, self.statistics
+        check_bands(1 + given.n_rest, phase.sh_degree)
         given.degree, given.l1 = phase.sh_degree, LOSSES.index(phase.objective.pixelwise)
         given.pixel_weight, given.ssim_weight = phase.objective.weights
         given.lambda_pop = settings.lambda_pop if phase.pop else 0.0

@@ -22,7 +22,7 @@ from pop_fast.stages.tile_groups import (
     splat_gradients,
     tile_groups,
 )
-from pop_fast.stages.tiles import TileLists
+from pop_fast.stages.tiles import TileLists, check_grid
 from pop_ref.constants import PAPER, Profile
 
 
@@ -65,7 +65,11 @@ def composite(
         counts: also count blended and traversed entries.
         absgrad_sink: [N, 2], to which the transpose adds the sum over pixels of |dL/dmeans2d|.
         function: what blends, from the four tensors and `BlendOptions`; None takes torch's.
+
+    Raises:
+        ValueError: the lists are not of that size of image.
     """
+    check_grid(lists, width, height, lists.tile_size)
     inputs = (means2d, conics, opacities, colors)
     keep = torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
     options = BlendOptions(lists, width, height, profile, dominance, counts, keep, absgrad_sink)

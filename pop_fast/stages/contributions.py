@@ -27,7 +27,7 @@ from pop_fast.stages.covariance import rotmats_from_quats
 from pop_fast.stages.projection import camera_center, intrinsics
 from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of, colors_of_view, covariances, project
 from pop_fast.stages.tile_groups import BLOCK, Entries, PackedLists, TileGroup, tile_groups
-from pop_fast.stages.tiles import TileLists
+from pop_fast.stages.tiles import TileLists, check_grid
 from pop_fast.stages.types import Camera, Gaussians
 from pop_ref.constants import PAPER, Profile
 
@@ -371,16 +371,6 @@ def _background_or_black(background: Tensor | None, colors: Tensor) -> Tensor:
     if behind.shape != colors.shape[1:]:
         raise ValueError(f"background has shape {list(behind.shape)}; it must be {list(colors.shape[1:])}, as a colour")
     return behind
-
-
-def check_grid(lists: TileLists, width: int, height: int, tile_size: int) -> None:
-    """Raise ValueError where lists are not those of a grid."""
-    tiles = (-(-width // tile_size), -(-height // tile_size))
-    if (lists.tile_size, lists.tiles_x, lists.tiles_y) != (tile_size, *tiles):
-        raise ValueError(
-            f"the lists are of {lists.tiles_x} x {lists.tiles_y} tiles of {lists.tile_size} px; "
-            f"{width} x {height} px in tiles of {tile_size} px are {tiles[0]} x {tiles[1]}"
-        )
 
 
 @dataclass(frozen=True)

@@ -94,15 +94,21 @@ class Evaluation:
 
 def evaluate_sh(sh: Tensor, dirs: Tensor, degree: int) -> Evaluation:
     """Evaluate the active bands and keep what the transpose needs."""
-    n_sh = _n_sh(degree)
-    if sh.shape[1] < n_sh:
-        raise ValueError(f"sh has {sh.shape[1]} coefficients; degree {degree} needs {n_sh}")
+    n_sh = check_bands(sh.shape[1], degree)
     rows = sh[:, :n_sh].permute(1, 2, 0).contiguous()
     components = dirs.T
     norms = torch.sqrt((components * components).sum(0))
     unit = components / norms
     basis = torch.stack(_basis_columns(unit[0], unit[1], unit[2], degree))
     return Evaluation(degree, rows, basis, unit, norms, (rows * basis[:, None]).sum(0) + 0.5)
+
+
+def check_bands(given: int, degree: int) -> int:
+    """Return how many coefficients a degree needs; ValueError where it is none, or fewer are given."""
+    n_sh = _n_sh(degree)
+    if given < n_sh:
+        raise ValueError(f"sh has {given} coefficients; degree {degree} needs {n_sh}")
+    return n_sh
 
 
 def evaluate_sh_vjp(evaluation: Evaluation, v_colors: Tensor) -> tuple[Tensor, Tensor]:

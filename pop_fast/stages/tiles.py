@@ -55,6 +55,16 @@ def grid_size(width: int, height: int, tile_size: int) -> tuple[int, int]:
     return -(-width // tile_size), -(-height // tile_size)
 
 
+def check_grid(lists: TileLists, width: int, height: int, tile_size: int) -> None:
+    """Raise ValueError where lists are not those of a grid."""
+    tiles = grid_size(width, height, tile_size)
+    if (lists.tile_size, lists.tiles_x, lists.tiles_y) != (tile_size, *tiles):
+        raise ValueError(
+            f"the lists are of {lists.tiles_x} x {lists.tiles_y} tiles of {lists.tile_size} px; "
+            f"{width} x {height} px in tiles of {tile_size} px are {tiles[0]} x {tiles[1]}"
+        )
+
+
 def tile_rects(
     means2d: Tensor, radii: Tensor, width: int, height: int, tile_size: int, profile: Profile = PAPER
 ) -> Tensor:

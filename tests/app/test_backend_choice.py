@@ -537,6 +537,8 @@ def test_a_compiler_that_does_not_run_or_fails_is_named_and_leaves_nothing(fresh
     says(outcome, "compiling the CPU kernels failed")
     assert "error: no such vectors" in outcome.out
     assert not list(fresh.glob("*.so"))
+    monkeypatch.setenv("CXX", "g++ '-DA=1")
+    says(pop("build-cpu"), """CXX is "g++ '-DA=1", which is not on this machine""")
 
 
 def test_without_a_compiler_it_says_which_to_install(fresh, pop, monkeypatch, capsys):

@@ -117,6 +117,8 @@ def test_parts_are_done_by_name_and_a_run_without_a_coarse_model_has_none(pop, s
     job = read_job(shared_coarse)
     assert [part.name for part in parts_of(job)][:3] == ["block_coarse", "round_0_merge", "round_1_block_0_0"]
     assert f"its blocks are {COARSE}, 0_0, 1_0" in pop("blocks", "train", shared_coarse, "7_7").err
+    says(pop("blocks", "train", shared_coarse, "0_0"), f"round 0 trains {COARSE} and not 0_0; name one of these")
+    says(pop("blocks", "train", shared_coarse, COARSE, "--round", "1"), "round 1 trains 0_0, 1_0 and not coarse")
     assert parts_of(Job(blocks="2x1", rounds=1, round_steps=1))[0].block == "0_0"
 
 

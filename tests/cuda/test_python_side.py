@@ -144,6 +144,14 @@ def test_an_architecture_that_cannot_be_built_for_is_refused(monkeypatch, arch, 
         build_module._architectures(arch, "nvcc")
 
 
+@pytest.mark.parametrize("content", ["#!/bin/sh\nexit 0\n", "no program"])
+def test_an_nvcc_that_does_not_answer_is_an_error_of_the_build(tmp_path, content):
+    (tmp_path / "nvcc").write_text(content)
+    (tmp_path / "nvcc").chmod(0o755)
+    with pytest.raises(BuildError, match="set CUDACXX to the path of an nvcc that works"):
+        build_module._architectures("sm_90", str(tmp_path / "nvcc"))
+
+
 def test_machine_code_is_made_for_each_architecture_and_ptx_for_the_newest(monkeypatch):
     monkeypatch.setattr(build_module, "nvcc_version", lambda nvcc: (13, 0))
     assert build_module._architectures(["sm_90", "sm_75", "80"], "nvcc") == ["75-real", "80-real", "90"]

@@ -5,6 +5,8 @@ Sixteen numbers side by side are the same numbers, however wide the processor's 
 
 from __future__ import annotations
 
+import mmap
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -420,8 +422,10 @@ MASK = torch.tensor([True, False, True])
         (torch.tensor([0, 2], dtype=torch.int32), "visible is a tensor of torch.int32"),
         (torch.tensor([0, 3]), "visible names row 0 to 3; there are 3"),
         (torch.tensor([-1, 2]), "visible names row -1 to 2; there are 3"),
+        (torch.tensor([2, 0]), "ascending order, each once; use visible.unique()"),
+        (torch.tensor([1, 1]), "ascending order, each once; use visible.unique()"),
     ],
-    ids=["mask", "columns", "int32", "beyond", "negative"],
+    ids=["mask", "columns", "int32", "beyond", "negative", "descending", "twice"],
 )
 def test_rows_that_are_none_are_refused_before_they_are_read(visible: Tensor, words: str) -> None:
     sh, means = torch.ones(3, 4, 3), torch.ones(3, 3)
@@ -429,6 +433,30 @@ def test_rows_that_are_none_are_refused_before_they_are_read(visible: Tensor, wo
         in_cpp.colors_of_view(sh, means, torch.eye(4), 1, visible)
     shown = in_cpp.colors_of_view(sh, means, torch.eye(4), 1, MASK.nonzero().squeeze(1))
     assert (shown != 0.0).any(1).tolist() == MASK.tolist()
+
+
+def test_a_file_whose_name_is_no_text_does_not_hide_the_threads_of_torch(tmp_path: Path) -> None:
+    name = os.fsencode(tmp_path) + b"/\xff"
+    with open(name, "w+b") as file:
+        file.write(bytes(mmap.PAGESIZE))
+        file.flush()
+        with mmap.mmap(file.fileno(), 0):
+            assert (library._fork() is None) == (library.this_library().fork is None)
+
+
+def test_bands_that_are_not_there_are_not_read() -> None:
+    rows = (torch.ones(3, 4, 3), torch.ones(3, 3), torch.eye(4))
+    for stage in (splatting.colors_of_view, in_cpp.colors_of_view):
+        for degree, words in ((2, "sh has 4 coefficients; degree 2 needs 9"), (4, "it must be 0, 1, 2 or 3")):
+            with pytest.raises(ValueError, match=words):
+                stage(*rows, degree, torch.arange(3))
+
+
+@pytest.mark.parametrize("blend", [native, composite_in_torch])
+def test_lists_of_another_size_of_image_are_refused(blend: Callable[..., Composite]) -> None:
+    drawn = splats()
+    with pytest.raises(ValueError, match="the lists are of 6 x 5 tiles of 8 px; 90 x 38 px in tiles of 8 px are 12 x"):
+        blend(*drawn.tensors, drawn.lists, 2 * WIDTH, HEIGHT)
 
 
 LEVELS = [level for level, _ in building.LEVELS["x86_64"]]

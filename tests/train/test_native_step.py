@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -420,6 +422,25 @@ def test_counts_are_those_of_a_walk_through_the_lists() -> None:
     # a parabola that errs lets too much through, never too little
     assert found["reached"] <= found["marked"] <= found["pairs"] // TILE
     assert found["walked"] < found["entries"]
+
+
+def test_bands_that_the_gaussians_do_not_have_are_not_trained() -> None:
+    params = gaussians()
+    params["shN"] = params["shN"][:, :3].contiguous()
+    m, v = ({name: torch.zeros_like(value) for name, value in params.items()} for _ in range(2))
+    settings = StepSettings(steady_updates(dict.fromkeys(PARAMETERS, 1e-3), 10), profile=PAPER)
+    trainer = native_step.NativeTrainer(params, m, v, [view()], [0] * 10, settings)
+    trainer.run(1, Phase(1, pop=True, statistics=True, blur=True))
+    with pytest.raises(ValueError, match="sh has 4 coefficients; degree 2 needs 9"):
+        trainer.run(2, Phase(2, pop=True, statistics=True, blur=True))
+
+
+def test_a_fork_does_not_let_go_of_threads_that_it_does_not_have() -> None:
+    closed: list[int] = []
+    functions: Any = SimpleNamespace(close=closed.append)
+    native_step._close(functions, 1, os.getpid() + 1)
+    native_step._close(functions, 2, os.getpid())
+    assert closed == [2]
 
 
 @pytest.mark.parametrize(
