@@ -335,12 +335,14 @@ class Told:
         verdict: over the scenes.
         evidence: by scene.
         deciders: commands that train what would decide the scenes that are not.
+        enough: the fewest of such commands that would decide the claim.
     """
 
     reading: str
     verdict: Verdict
     evidence: tuple[Evidence, ...]
     deciders: tuple[str, ...]
+    enough: tuple[str, ...]
 
     @property
     def where(self) -> str:
@@ -389,10 +391,12 @@ class Claim:
         return "; ".join(f"{e.scene}: {e.under}" for e in self.told.evidence)
 
 
-def told(reading: str, evidence: Iterable[Evidence], deciders: Iterable[str]) -> Told:
+def told(reading: str, evidence: Iterable[Evidence], deciders: Iterable[str], enough: Iterable[str] | None) -> Told:
     """Put what the scenes say together."""
-    found = tuple(evidence)
-    return Told(reading, verdict_over(e.verdict for e in found if e.is_whole), found, tuple(dict.fromkeys(deciders)))
+    found, commands = tuple(evidence), tuple(dict.fromkeys(deciders))
+    # where no scene has all its runs, or none of the whole schedule, the first is as good as any
+    fewest = commands[:1] if enough is None else tuple(enough)
+    return Told(reading, verdict_over(e.verdict for e in found if e.is_whole), found, commands, fewest)
 
 
 def verdict_over(verdicts: Iterable[Verdict]) -> Verdict:

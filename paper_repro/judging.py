@@ -145,11 +145,12 @@ def _under(reading: str, question: Question, found: Groups, noise: Noise, scale:
         at.append(_At(scene, used, asked, missing, seeds))
     together = sum(c.asked != "nothing" for one in at for c in one.made)
     names = tuple(rows.values())
-    evidence, deciders = [], _Deciders(scale)
+    evidence, judged, deciders = [], list[_At](), _Deciders(scale)
     for one in at:
         if not any(one.asked) and one.missing:
             deciders.add(one.missing or names, one.scene, one.seeds, bool(found.get(one.scene)))
             continue
+        judged.append(one)
         verdict, why = _verdict(question, one, together)
         said = "; ".join(c if isinstance(c, str) else c.text(together) for c in one.asked if c is not None)
         groups = list(one.rows.values())
@@ -161,7 +162,8 @@ def _under(reading: str, question: Question, found: Groups, noise: Noise, scale:
         )
         if verdict == "not decided":
             _decide(deciders, question, one, names, together)
-    return told(reading, evidence, deciders.commands())
+    is_open = [one for one, e in zip(judged, evidence, strict=True) if e.is_whole and e.verdict == "not decided"]
+    return told(reading, evidence, deciders.commands(), _enough(scale, names, is_open, together))
 
 
 def _verdict(question: Question, at: _At, together: int) -> tuple[Verdict, str]:
@@ -184,9 +186,13 @@ def _verdict(question: Question, at: _At, together: int) -> tuple[Verdict, str]:
     return "not decided", f"within the noise of the seeds{few}"
 
 
+def _undecided(at: _At, together: int) -> list[Comparison]:
+    return [c for c in at.made if c.asked != "nothing" and c.holds(together) is None]
+
+
 def _seeds_to_decide(at: _At, together: int) -> int | None:
     """Say how many seeds of each row would decide what is open on a scene; None for more than `MOST_SEEDS`."""
-    found = [c.seeds_needed(together) for c in at.made if c.asked != "nothing" and c.holds(together) is None]
+    found = [c.seeds_needed(together) for c in _undecided(at, together)]
     return None if None in found else max(n for n in found if n is not None)
 
 
@@ -206,6 +212,22 @@ def _decide(deciders: _Deciders, question: Question, at: _At, names: tuple[str, 
         seeds = _seeds_to_decide(at, together)
         if seeds is not None:
             deciders.add(names, at.scene, seeds)
+
+
+def _enough(scale: str, names: tuple[str, ...], is_open: Sequence[_At], together: int) -> list[str] | None:
+    """Give the fewest commands that would decide a claim, None where more seeds of what is there would not.
+
+    A scene on which the claim fails is enough; where none looks like one, all have to be decided.
+    """
+    margins = {at.scene: [c.margin for c in _undecided(at, together)] for at in is_open}
+    if not margins or [] in margins.values():
+        return None
+    needed = {at.scene: _seeds_to_decide(at, together) for at in is_open}
+    failing = [(seeds, scene) for scene, seeds in needed.items() if seeds and min(margins[scene]) < 0.0]
+    if not failing and None in needed.values():
+        return []
+    chosen = [min(failing)] if failing else [(seeds, scene) for scene, seeds in needed.items() if seeds]
+    return [command(scale, names, [scene], seeds) for seeds, scene in chosen]
 
 
 class _Deciders:

@@ -119,8 +119,8 @@ def _outcome_line(by_scale: Sequence[tuple[str, Claim]]) -> str:
         if told.reading:
             line += f"; under {told.reading} **{told.verdict}**"
         line += f" ({numbers})" if numbers else ""
-        if told.verdict == "not decided" and told.deciders:
-            line += f"; `{told.deciders[0]}` would decide it"
+        if told.verdict == "not decided" and told.enough:
+            line += f"; {' and '.join(f'`{command}`' for command in told.enough)} would decide it"
     return line + "."
 
 
@@ -467,7 +467,7 @@ def _claim_row(by_scale: Sequence[Claim], found: Sequence[Result]) -> list[str]:
     judged = [(scale, c) for scale, c in named if c.verdict != "not decided"]
     ours = "; ".join(f"{c.verdict} at scale {scale}: {c.line}" for scale, c in judged)
     scale, told = deciding(named)
-    command = f"pop-repro claims --scale {scale}" if judged else next(iter(told.told.deciders), "none")
+    command = f"pop-repro claims --scale {scale}" if judged else next(iter(told.told.enough), "none")
     readings = [reading for _, c in judged or [(scale, told)] for reading in (c.told, *c.others)]
     runs = {run for reading in readings for e in reading.evidence for run in e.runs}
     used = [r for r in found if r.run in runs]

@@ -118,6 +118,24 @@ def test_every_command_that_would_decide_is_one(capsys: pytest.CaptureFixture[st
                 assert capsys.readouterr().out.strip(), line
 
 
+def test_the_fewest_runs_that_would_decide_a_claim_are_named() -> None:
+    def enough(fox: float, bear: float) -> list[str]:
+        pairs = [*two("pop", psnr=30.0 + fox), *two("reset"), *two("pop", "bear_512", psnr=30.0 + bear)]
+        told = judged("reset", [*pairs, *two("reset", "bear_512")]).told
+        assert told.verdict == "not decided"
+        return [command.partition("--scenes ")[2] for command in told.enough]
+
+    # all scenes have to hold
+    both = enough(0.01, 0.005)
+    assert [command.split()[0] for command in both] == ["fox", "bear_512"]
+    # one on which it does not is enough, and of several the one that takes the fewest seeds
+    assert enough(0.01, -0.005) == [both[1]]
+    assert enough(-0.01, -0.005) == [both[0]]
+    # a scene that no number of seeds decides keeps it open, unless it fails on another
+    assert enough(0.01, 0.0) == []
+    assert enough(-0.01, 0.0) == [both[0]]
+
+
 @pytest.mark.parametrize("id", ["half", "blur", "reset", "window", "growth"])
 def test_a_shortened_schedule_decides_no_question_of_duration(id: str) -> None:
     rows = next(question.rows for question in questions(paper()) if question.id == id)
