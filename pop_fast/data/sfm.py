@@ -118,7 +118,10 @@ def run_sfm(
         max_size=max_size, camera_model=camera_model, single_camera=single_camera, matcher=matcher, seed=seed
     )
     if not photos.is_dir():
-        raise CaptureError(f"{photos}: no such folder; give the folder with the photographs")
+        what = "no such folder; give the folder with the photographs"
+        if photos.is_file():
+            what = "is a file; 'pop train' takes videos and archives, 'pop frames' makes a folder of a video's frames"
+        raise CaptureError(f"{photos}: {what}")
     photos = photo_folder(photos)
     check_camera_model(camera_model)
     capture, target = _place(photos, out_dir)

@@ -208,6 +208,9 @@ def fill(folder: Path, *names: str | bytes) -> Path:
 
 def test_what_cannot_be_searched_for_cameras_is_refused_and_nothing_is_written(tmp_path: Path) -> None:
     assert_one_line(lambda: run_sfm(tmp_path / "absent"), "absent", "no such folder")
+    (tmp_path / "walk.mp4").touch()
+    assert_one_line(lambda: run_sfm(tmp_path / "walk.mp4"), "walk.mp4", "pop frames")
+    (tmp_path / "walk.mp4").unlink()
     assert_one_line(lambda: run_sfm(tmp_path), "has 0 photograph")
     fill(tmp_path / "one", "a.png", "masks/a.png")
     assert_one_line(lambda: run_sfm(tmp_path / "one"), "has 1 photograph")
