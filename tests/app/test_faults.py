@@ -311,6 +311,7 @@ EXEMPT = {
         (f"pop_fast.data.sfm:{name}" for name in ("_extract", "_listen", "_rows", "find_cameras", "main")),
         "reads what the search has written, and what its own child process says",
     ),
+    "pop_fast.data.sfm:_stage": "tells by twelve bytes whether COLMAP reads the format; decoders judge the photograph",
     "pop_fast.io.images:main": "a child process that decodes what has been read; its end harms nobody",
     "cuda_ext.gpu_check.shared:Command._words": "the end of a log that it has written, with any bytes",
     "cuda_ext.gpu_check.stages": "shows what its own trainings and benchmarks have written",

@@ -536,7 +536,7 @@ KINDS: dict[str, dict[str, int]] = {
     "speedy-splat": {"densify, soft prune and reset": 12, "hard prune": 25},
 }
 USUAL = {"plain": 1, "densify": 4, "densify and reset": 12}
-CHANGES: dict[str, dict[str, Any]] = {"taming": {"sampled_prunes": 2}, "speedy-splat": {"soft_prune_iters": (12,)}}
+CHANGES: dict[str, dict[str, Any]] = {"taming": {"sampled_prunes": 3}, "speedy-splat": {"soft_prune_iters": (12,)}}
 # whoever is seen is grown, and somebody is pruned, so that no event is left out for want of Gaussians
 EAGER = {"grow_grad2d": 1e-7}
 FAINT = -6.0
