@@ -444,7 +444,7 @@ def _load_transforms(path: Path) -> dict[str, Any]:
 def _read_listing(path: Path, listing: dict[str, Any], split: Split | None) -> list[PosedImage]:
     splits = _named_splits(path, listing)
     named = [split for split in ("train", "val", "test") if listing.get(f"{split}_filenames")]
-    rest: Split | None = "test" if named == ["train"] else None if "train" in named else "train"
+    rest: Split = "test" if "train" in named else "train"
     shots: list[PosedImage] = []
     for index, frame in enumerate(listing["frames"]):
         where = f"{path}: frames[{index}]"
@@ -453,9 +453,9 @@ def _read_listing(path: Path, listing: dict[str, Any], split: Split | None) -> l
         name = _name(frame["file_path"])
         own = split
         if splits:
-            own = splits.get(name, rest)
-            if own is None:  # named by no list
+            if name not in splits and "train" in named and len(named) > 1:  # named by no list
                 continue
+            own = splits.get(name, rest)
         mask = path.parent / _name(frame["mask_path"]) if frame.get("mask_path") else None
         fields = _fields(listing, frame)
         angle = _angle(where, fields)
