@@ -402,11 +402,19 @@ def test_a_row_that_is_measured_again_has_its_own_machine_and_leaves_what_others
 def test_what_was_foretold_of_four_captures_came_within_thirty_percent() -> None:
     known = json.loads((ROOT / "benchmarks" / "results" / "estimates.json").read_text(encoding="utf-8"))
     rows = [row for name, row in known.items() if name != "machine"]
-    assert len(rows) == 4
+    whole = [row for row in rows if row["steps"] == 30_000]
+    assert len(rows) - len(whole) == 4
     for row in rows:
         for name, said in row["foretold"].items():
-            assert said / 1.3 < row["came"][name] < 1.3 * said, (row, name)
-    assert "within 30 % of the predicted time on the four captures" in (ROOT / "docs" / "guide.md").read_text()
+            # the Gaussians of whole schedules, and so their memory, are not foretold so well, which the guide says
+            if name == "seconds" or row not in whole:
+                assert said / 1.3 < row["came"][name] < 1.3 * said, (row, name)
+    guide = (ROOT / "docs" / "guide.md").read_text(encoding="utf-8")
+    assert "within 30 % of the predicted time on the four captures" in guide
+    for row in whole:
+        ratios = {name: row["came"][name] / said for name, said in row["foretold"].items()}
+        said = f"{ratios['seconds']:.2f} times the predicted time, with {ratios['gaussians']:.1f} times the Gaussians and"
+        assert f"{said} {ratios['memory']:.1f} times the memory" in guide
 
 
 def test_the_guide_says_how_far_off_the_expected_gaussians_of_whole_schedules_were() -> None:
