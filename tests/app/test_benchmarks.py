@@ -413,7 +413,8 @@ def test_what_was_foretold_of_four_captures_came_within_thirty_percent() -> None
     assert "within 30 % of the predicted time on the four captures" in guide
     for row in whole:
         ratios = {name: row["came"][name] / said for name, said in row["foretold"].items()}
-        said = f"{ratios['seconds']:.2f} times the predicted time, with {ratios['gaussians']:.1f} times the Gaussians and"
+        seconds, gaussians = (f"{ratios[name]:{form}}" for name, form in (("seconds", ".2f"), ("gaussians", ".1f")))
+        said = f"{seconds} times the predicted time, with {gaussians} times the Gaussians and"
         assert f"{said} {ratios['memory']:.1f} times the memory" in guide
 
 
