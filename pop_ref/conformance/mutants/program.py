@@ -329,7 +329,7 @@ _LINES: Final[Lines] = {
          "gradients are cleared where an update is made, and pile up where it is skipped (nerfstudio's accumulation)",
          "            counter.fill_(float(number))\n        optimizer.zero_grad(set_to_none=True)",
          "            counter.fill_(float(number))\n            optimizer.zero_grad(set_to_none=True)",
-         "test_strategies:a_training_by_taming_is_the_oracles_at_every_step"),
+         "test_strategies:a_training_is_the_oracles_under_every_reading"),
         ("adam_counts_the_training",
          "the bias correction is of the training's iteration, not of the updates (fused Adam kernels)",
          "counter.fill_(float(number - 1))", "counter.fill_(float(step))",
