@@ -209,8 +209,8 @@ def is_updated(name: str, step: int, recipe: Recipe) -> bool:
     """Tell whether Adam moves a parameter at a step.
 
     Source: Inria's training loop (a step that edits the Gaussians moves nothing); taming-3dgs (bands beyond the first
-        move each 16 steps, opacities not after 15,000).
-    Departs: nothing.
+        move at steps 16, 32, ..., of which those that edit are left out, opacities not after 15,000).
+    Departs: nothing; there is no step 0 in these codes, whose first one is 1.
 
     Args:
         name: of the parameter.
@@ -222,14 +222,14 @@ def is_updated(name: str, step: int, recipe: Recipe) -> bool:
 
     Example:
         >>> [is_updated("shN", step, Recipe(updates=UpdateRules(sh_rest_every=2))) for step in range(4)]
-        [False, True, False, True]
+        [False, False, True, False]
     """
     rules = recipe.updates
     if rules.edits_replace_update and (densifies_at(step, recipe.density) or step in recipe.adam_restarts):
         return False
     if name == "opacities" and 0 <= rules.opacities_stop_iter <= step:
         return False
-    return name != "shN" or (step + 1) % rules.sh_rest_every == 0
+    return name != "shN" or max(step, 1) % rules.sh_rest_every == 0
 
 
 def update_numbers(names: Iterable[str], step: int, recipe: Recipe) -> dict[str, int]:
@@ -251,7 +251,7 @@ def update_numbers(names: Iterable[str], step: int, recipe: Recipe) -> dict[str,
     Example:
         >>> recipe = Recipe(updates=UpdateRules(sh_rest_every=2), adam_restarts=(1,))
         >>> [update_numbers(["means", "shN"], step, recipe) for step in range(4)]
-        [{'means': 1}, {'means': 2, 'shN': 1}, {'means': 1}, {'means': 2, 'shN': 1}]
+        [{'means': 1}, {'means': 2}, {'means': 1, 'shN': 1}, {'means': 2}]
     """
     first = 1 + max((restart for restart in recipe.adam_restarts if restart < step), default=-1)
     moved = [name for name in names if is_updated(name, step, recipe)]

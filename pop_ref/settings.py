@@ -203,7 +203,8 @@ class UpdateRules:
         edits_replace_update: a step after which Gaussians are added or removed moves nothing, as in Inria's loop, where
             the edit makes new tensors before Adam is asked; gsplat, since 1.5, moves first.
         sh_start_iter: step from which the degree of the harmonics is counted; before it is 0 (Mini-Splatting).
-        sh_rest_every: the bands beyond the first move each so many steps, by the sum of their gradients (Taming-3DGS).
+        sh_rest_every: the bands beyond the first move at steps that are multiples of it, step 0 excepted, by the sum of
+            their gradients since the last one (Taming-3DGS).
         opacities_stop_iter: first step from which opacities stay as they are (Taming-3DGS); -1 never.
         means_rewind_iter: step from which the positions' rate is that of an earlier one (Mini-Splatting); 0 never.
         means_rewind_to: that earlier step.

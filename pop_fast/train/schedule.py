@@ -54,7 +54,7 @@ def updates_of(
         moved[[*edits, *restarts]] = False
     if rules.opacities_stop_iter >= 0:
         moved[rules.opacities_stop_iter :, PARAMETERS.index("opacities")] = False
-    moved[:, PARAMETERS.index("shN")] &= (steps + 1) % rules.sh_rest_every == 0
+    moved[:, PARAMETERS.index("shN")] &= steps.clamp(min=1.0) % rules.sh_rest_every == 0
     numbers = moved.cumsum(0)
     for step in sorted(set(restarts)):
         numbers[step + 1 :] -= numbers[step].clone()

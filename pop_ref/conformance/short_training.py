@@ -454,7 +454,7 @@ class OracleSteps:
         if every > 1:
             if len(self._waiting) == len(errors["shN"]):
                 errors["shN"] = errors["shN"] + self._waiting
-            self._waiting = np.zeros(0) if (number + 1) % every == 0 else errors["shN"]
+            self._waiting = np.zeros(0) if max(number, 1) % every == 0 else errors["shN"]
 
 
 def _at(where: str) -> Any:

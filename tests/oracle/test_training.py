@@ -396,12 +396,13 @@ def test_a_round_of_pup_loses_the_update_that_its_pruning_replaces_and_starts_ad
 
 def test_taming_moves_upper_bands_each_16_steps_and_opacities_until_15_000() -> None:
     recipe = replace(BASELINES["Taming-3DGS"], updates=replace(BASELINES["Taming-3DGS"].updates))
-    bands = moved(recipe, "shN")
-    assert bands[:3] == [15, 31, 47]
-    assert all((step + 1) % 16 == 0 for step in bands)
+    # as its loop counts, from 1: where a multiple of 16 is a densification step too, the new tensors have no gradient
+    lost = [step for step in range(16, 15_000, 16) if step % 500 == 0]
+    assert lost == list(range(2_000, 15_000, 2_000))
+    assert moved(recipe, "shN") == [step for step in range(16, 30_000, 16) if step not in lost]
     assert max(moved(recipe, "opacities")) == 14_999
     assert max(moved(recipe, "means")) == 29_999
-    assert update_numbers(["shN"], 47, recipe) == {"shN": 3}
+    assert update_numbers(["shN"], 48, recipe) == {"shN": 3}
 
 
 def test_the_positions_rate_of_mini_splatting_goes_back_to_what_it_was() -> None:
