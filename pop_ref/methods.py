@@ -309,10 +309,10 @@ class Driven:
         params, scores = self.rows.params, np.zeros(self.n)
         for index in order:
             view = script.over(int(index), self.n, script.sh_degree(step))
-            photo = script.photo(int(index))
-            mean = np.mean(taming.pixel_weights(view.image, photo))
+            photo, mask = script.photo(int(index)), script.mask(int(index))
+            mean = np.mean(taming.pixel_weights(view.image, photo, mask))
             found = replace(view.found, map_sum=view.found.map_sum * mean)
-            photometric = losses.photometric_3dgs(view.image, photo / 255.0, padding="same")
+            photometric = losses.photometric_3dgs(view.image, photo / 255.0, padding="same", mask=mask)
             o, scales = 1.0 / (1.0 + np.exp(-params["opacities"])), np.exp(params["scales"])
             scores += taming.view_score(photometric, grads, o, scales, view.depths, view.radii, found)
         before = config.refine_start_iter // config.refine_every

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from pop_ref._shapes import Float64, Int64
+from pop_ref._shapes import Bool, Float64, Int64
 from pop_ref.constants import INRIA, Profile
 from pop_ref.contributions import Contributions, contributions
 from pop_ref.losses import photometric_3dgs
@@ -94,15 +94,19 @@ def edge_map(photo: np.ndarray) -> Float64[np.ndarray, "H W"]:
     return edges
 
 
-def pixel_weights(image: Float64[np.ndarray, "H W 3"], photo: np.ndarray) -> Float64[np.ndarray, "H W"]:
+def pixel_weights(
+    image: Float64[np.ndarray, "H W 3"], photo: np.ndarray, mask: Bool[np.ndarray, "H W"] | None = None
+) -> Float64[np.ndarray, "H W"]:
     """Weigh a view's pixels: `50 minmax(mean_c |C - photo|) + 50 minmax(edges)`, `minmax(x) = (x - min) / (max - min)`.
 
     Source: Mallick et al. 2024 (Taming-3DGS), and its code.
-    Departs: where all pixels are alike the code divides by 0; here such a map is 0.
+    Departs: where all pixels are alike the code divides by 0; here such a map is 0. The code has no masks: here min and
+        max are of what a mask keeps, and the rest weighs nothing.
 
     Args:
         image: the render, encoded rgb, not clamped.
         photo: the photograph, uint8 [H, W, 3].
+        mask: True where a pixel counts; None keeps all.
 
     Returns:
         Weights from 0 to 100.
@@ -118,7 +122,7 @@ def pixel_weights(image: Float64[np.ndarray, "H W 3"], photo: np.ndarray) -> Flo
     if image.shape != photo.shape:
         raise ValueError(f"image has shape {list(image.shape)}, photo {list(photo.shape)}; they must be the same")
     error = np.mean(np.abs(image - photo / 255.0), axis=2)
-    return ERROR * _minmax(error) + EDGE * _minmax(edges)
+    return ERROR * _minmax(error, mask) + EDGE * _minmax(edges, mask)
 
 
 def scaled_to_median(c: float, x: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
@@ -164,7 +168,7 @@ def view_score(
     Departs: nothing.
 
     Args:
-        photometric: P, the view's loss 0.8 L1 + 0.2 D-SSIM.
+        photometric: P, the view's loss 0.8 L1 + 0.2 D-SSIM, of what its mask keeps.
         grads: average view-space gradients of the window (`density.average_grads`).
         opacities: activated.
         scales: standard deviations, activated, world units.
@@ -202,11 +206,13 @@ def taming_scores(
     background: Float64[np.ndarray, "3"] | None = None,
     sh_degree: int | None = None,
     profile: Profile = INRIA,
+    masks: Sequence[np.ndarray | None] | None = None,
 ) -> Float64[np.ndarray, " N"]:
     """Score Gaussians by a few views: render each, weigh its pixels, sum what each Gaussian adds, add the scores.
 
     Source: Mallick et al. 2024 (Taming-3DGS).
-    Departs: nothing.
+    Departs: the code has no masks. What one leaves out is in no loss, neither P nor the weights of pixels; the sums of
+        pixels, distances and blending weights are over all.
 
     Args:
         gaussians: activated.
@@ -215,6 +221,7 @@ def taming_scores(
         background: colour behind everything, default black.
         sh_degree: bands in use, default all.
         profile: of the renderer.
+        masks: of each view, True where a pixel counts [H, W], or None; None for no masks.
 
     Returns:
         The scores, >= 0; 0 where no view shows the Gaussian.
@@ -229,13 +236,13 @@ def taming_scores(
         (1,)
     """
     scores = np.zeros(len(gaussians))
-    for camera, photo in views:
+    for (camera, photo), mask in zip(views, masks or [None] * len(views), strict=True):
         drawn = render(gaussians, camera, background, sh_degree, profile)
-        weights = pixel_weights(drawn.image, photo)
+        weights = pixel_weights(drawn.image, photo, mask)
         found = contributions(
             drawn.splats, drawn.tile_lists, camera.width, camera.height, profile.tile_size, weights, profile
         )
-        photometric = photometric_3dgs(drawn.image, photo / 255.0, padding="same")
+        photometric = photometric_3dgs(drawn.image, photo / 255.0, padding="same", mask=mask)
         scores = scores + view_score(
             photometric, grads, gaussians.opacities, gaussians.scales, drawn.splats.depths, drawn.splats.radii, found
         )
@@ -268,6 +275,7 @@ def quotas(budget: int, n: int, n_clone: int, n_split: int) -> tuple[int, int]:
     return more * n_clone // max(n_candidates, 1), more * n_split // max(n_candidates, 1)
 
 
-def _minmax(x: Float64[np.ndarray, "H W"]) -> Float64[np.ndarray, "H W"]:
-    least, greatest = float(np.min(x)), float(np.max(x))
-    return (x - least) / (greatest - least) if greatest > least else np.zeros_like(x)
+def _minmax(x: Float64[np.ndarray, "H W"], mask: Bool[np.ndarray, "H W"] | None) -> Float64[np.ndarray, "H W"]:
+    kept = np.ones(x.shape, dtype=bool) if mask is None else mask
+    least, greatest = float(np.min(x[kept], initial=np.inf)), float(np.max(x[kept], initial=-np.inf))
+    return np.where(kept, (x - least) / (greatest - least), 0.0) if greatest > least else np.zeros_like(x)

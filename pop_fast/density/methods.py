@@ -349,7 +349,8 @@ class TamingStrategy(InriaStrategy):
     last densification step prunes nothing. The draw takes the scores in the order from before the split, where they
     belong to other Gaussians: a slip of the released code, with which the published numbers were made. The bands beyond
     the first move each 16 steps by the sum of their gradients, opacities not at all after step 15,000, where the code
-    hands Adam a tensor that it does not train. Everything else is 3DGS of 2024, with twice its rate for these bands.
+    hands Adam a tensor that it does not train. Everything else is 3DGS of 2024, with twice its rate for these bands. Of
+    photographs with masks, which the code does not know, what they leave out is in no view's loss or map of errors.
 
     Attributes:
         budget_multiplier: the budget, in first Gaussians: 15 outdoors and 2 indoors of Mip-NeRF 360, 2 on Tanks &
@@ -422,12 +423,13 @@ class TamingStrategy(InriaStrategy):
         opacities, scales = torch.sigmoid(params["opacities"].flatten()), torch.exp(params["scales"])
         total = torch.zeros(len(context), dtype=torch.float64)
         for index in order:
-            photo = views.photo(index)
+            photo, mask = views.photo(index), views.view(index).mask
+            mask = None if mask is None else mask.to(photo.device)
             found = views.contributions(
-                params, index, context.sh_degree, lambda image, photo=photo: pixel_weights(image, photo)
+                params, index, context.sh_degree, lambda image, shot=(photo, mask): pixel_weights(image, *shot)
             )
             target = photo.to(found.image.dtype) / 255.0
-            photometric = photometric_3dgs(found.image, target, padding="same")
+            photometric = photometric_3dgs(found.image, target, padding="same", mask=mask)
             total += view_score(photometric, grads, opacities, scales, found.depths, found.radii, found).cpu()
         return total
 

@@ -234,13 +234,13 @@ def edge_map(photo: Tensor) -> Tensor:
     return edges.to(torch.float32)
 
 
-def pixel_weights(image: Tensor, photo: Tensor) -> Tensor:
+def pixel_weights(image: Tensor, photo: Tensor, mask: Tensor | None = None) -> Tensor:
     """See `pop_ref.taming.pixel_weights`; ValueError where a photograph is not uint8 [H, W, 3] as the image. [H, W]"""
     edges = edge_map(photo).to(image.dtype)
     if image.shape != photo.shape:
         raise ValueError(f"image has shape {list(image.shape)}, photo {list(photo.shape)}; they must be the same")
     error = (image - photo.to(image.dtype) / 255.0).abs().mean(2)
-    return ERROR * _minmax(error) + EDGE * _minmax(edges)
+    return ERROR * _minmax(error, mask) + EDGE * _minmax(edges, mask)
 
 
 def scaled_to_median(c: float, x: Tensor) -> Tensor:
@@ -284,9 +284,13 @@ def quotas(budget: int, n: int, n_clone: int, n_split: int) -> tuple[int, int]:
     return more * n_clone // max(n_candidates, 1), more * n_split // max(n_candidates, 1)
 
 
-def _minmax(x: Tensor) -> Tensor:
-    least, greatest = x.aminmax()
-    return (x - least) / (greatest - least) if bool(greatest > least) else torch.zeros_like(x)
+def _minmax(x: Tensor, mask: Tensor | None) -> Tensor:
+    kept = x if mask is None else x[mask]
+    if kept.numel() == 0 or bool(kept.max() == kept.min()):
+        return torch.zeros_like(x)
+    least, greatest = kept.aminmax()
+    scaled = (x - least) / (greatest - least)
+    return scaled if mask is None else scaled.masked_fill_(~mask, 0.0)
 
 
 def mean_squared_distances(points: np.ndarray) -> np.ndarray:

@@ -4,18 +4,24 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from pop_fast import compiled
 from pop_fast.api.backend import get_backend
+from pop_fast.density.methods import TamingStrategy
 from pop_fast.density.passes import Passes, ViewContributions
+from pop_fast.density.protocol import DensificationContext, Draws
 from pop_fast.errors import PopError
 from pop_fast.stages.density import pixel_weights
 from pop_fast.train import TrainConfig
 from pop_fast.train.views import ViewTensors, render_view
 from pop_ref.constants import PROFILES
+from pop_ref.records import Camera
+from pop_ref.taming import taming_scores
+from pop_ref.training import gaussians_from_params
 
 WIDTH, HEIGHT = 37, 22
 BACKENDS = [
@@ -145,6 +151,24 @@ def test_a_map_may_be_made_of_the_image() -> None:
     found = made.contributions(raw_params(), 0, 3, lambda image: pixel_weights(image, made.photo(0)))
     assert float(expected.map_sum.max()) > 0.0
     assert torch.equal(found.map_sum, expected.map_sum)
+
+
+def test_scores_of_taming_are_the_oracles_and_of_what_a_mask_keeps() -> None:
+    params, made, strategy = raw_params(), passes("fast", "inria"), TamingStrategy()
+    grads = torch.rand(len(params["means"]), dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    state = {**strategy.initialize_state(), "grad2d": grads, "count": torch.ones_like(grads)}
+    draws = Draws(normals=lambda n: torch.zeros(2, n, 3), uniforms=lambda n: torch.arange(n) / n)
+    found = strategy._scores(DensificationContext(params, {}, state, 1000, draws, made))
+    seen = [(Camera(v.viewmat[0].numpy(), v.K[0].numpy(), WIDTH, HEIGHT), v.photo.numpy()) for v in views()]
+    masks = [None if v.mask is None else v.mask.numpy() for v in views()]
+    gaussians = gaussians_from_params({name: value.numpy() for name, value in params.items()})
+    of_all, expected = (
+        torch.from_numpy(taming_scores(gaussians, seen, grads.numpy(), np.array(BACKGROUND), masks=which))
+        for which in (None, masks)
+    )
+    # a background is of float32
+    torch.testing.assert_close(found, expected, rtol=1e-7, atol=0.0)
+    assert float((of_all - expected).abs().max()) > 0.01 * float(expected.max())
 
 
 def test_what_cannot_be_is_said() -> None:

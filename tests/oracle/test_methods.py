@@ -49,19 +49,23 @@ def test_scores_of_a_population_add_over_views_that_are_rendered_and_weighed() -
         (v, rng.integers(0, 256, (v.height, v.width, 3)).astype(np.uint8)) for v in (camera(), tilted_camera(8, 9))
     ]
     grads, background = rng.exponential(size=9), np.array([0.0, 0.5, 1.0])
-    for profile in (INRIA, PAPER):
+    kept = np.zeros(views[0][1].shape[:2], dtype=bool)
+    kept[:, 3:] = True
+    for profile, masks in ((INRIA, None), (PAPER, None), (INRIA, [kept, None])):
         want = np.zeros(9)
-        for view, photo in views:
+        for (view, photo), mask in zip(views, masks or (None, None), strict=True):
             drawn = render(gaussians, view, background, 1, profile)
             target = photo / 255.0
-            weights = taming.pixel_weights(drawn.image, photo)
+            weights = taming.pixel_weights(drawn.image, photo, mask)
             found = contributions(drawn.splats, drawn.tile_lists, view.width, view.height, 16, weights, profile)
-            loss = 0.8 * np.mean(np.abs(drawn.image - target)) + 0.2 * losses.d_ssim(drawn.image, target, "same")
+            pixels = np.abs(drawn.image - target)
+            l1 = np.mean(pixels if mask is None else pixels[mask])
+            loss = 0.8 * l1 + 0.2 * losses.d_ssim(drawn.image, target, "same", mask)
             shown = (drawn.splats.depths, drawn.splats.radii, found)
             want += taming.view_score(loss, grads, gaussians.opacities, gaussians.scales, *shown)
         assert np.count_nonzero(want) > 4
         np.testing.assert_allclose(
-            taming.taming_scores(gaussians, views, grads, background, 1, profile), want, rtol=1e-10
+            taming.taming_scores(gaussians, views, grads, background, 1, profile, masks), want, rtol=1e-10
         )
 
 

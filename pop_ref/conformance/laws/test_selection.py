@@ -135,6 +135,9 @@ def test_edges_are_eight_times_the_grey_less_its_neighbours_and_the_frame_is_gre
     assert_same_bits("grey", backend.stage("edge_map")(colours), grey.astype(np.float64))
 
 
+KEPT = (np.arange(6)[:, None] + 2 * np.arange(5)) % 3 > 0
+
+
 @law("taming", "pixel_weights", "edge_map", photo=photos, image=arrays_of((6, 5, 3), 0.0, 1.0))
 def test_pixels_weigh_up_to_fifty_by_error_and_up_to_fifty_by_edge(backend, photo, image):
     weights = backend.stage("pixel_weights")(image, photo)
@@ -144,6 +147,16 @@ def test_pixels_weigh_up_to_fifty_by_error_and_up_to_fifty_by_edge(backend, phot
     expected = sum(50.0 * (x - x.min()) / np.ptp(x) if np.ptp(x) > 1e-3 else 0.0 * x for x in parts)
     if np.ptp(error) > 1e-3 or np.ptp(error) == 0.0:
         assert_close("taming.pixel_weights", weights, expected, 50.0 + 50.0 / max(np.ptp(error), 1e-3), backend.dtype)
+    # what a mask leaves out weighs nothing, and stretches nothing: its error and its edges may be any
+    other = image + np.where(KEPT, 0.0, 100.0)[..., None]
+    masked = backend.stage("pixel_weights")(other, photo, KEPT)
+    scaled = [(x - x[KEPT].min()) / np.ptp(x[KEPT]) if np.ptp(x[KEPT]) > 1e-3 else 0.0 * x for x in parts]
+    expected = np.where(KEPT, 50.0 * sum(scaled), 0.0)
+    if np.ptp(error[KEPT]) > 1e-3 or np.ptp(error[KEPT]) == 0.0:
+        bound = 50.0 + 50.0 / max(np.ptp(error[KEPT]), 1e-3)
+        assert_close("taming.pixel_weights", masked, expected, bound, backend.dtype)
+    nothing = backend.stage("pixel_weights")(image, photo, np.zeros_like(KEPT))
+    assert_same_bits("weights of no pixel", nothing, 0.0 * error)
 
 
 @law("taming", "scaled_to_median", c=st.sampled_from([25.0, 0.125, 100.0]), x=columns)

@@ -610,8 +610,8 @@ _LINES: Final[Lines] = {
          "test_collected:a_shorter_schedule_changes_the_gaussians_less_often_and_resets_no_sooner"),
         ("taming_scores_a_clamped_picture",
          "Taming-3DGS compares a picture with its photograph after it has been clamped, as pictures are for a file",
-         'photometric = photometric_3dgs(found.image, target, padding="same")',
-         'photometric = photometric_3dgs(found.image.clamp(0.0, 1.0), target, padding="same")',
+         'photometric = photometric_3dgs(found.image, target, padding="same", mask=mask)',
+         'photometric = photometric_3dgs(found.image.clamp(0.0, 1.0), target, padding="same", mask=mask)',
          "test_strategies:a_training_by_taming_is_the_oracles_at_every_step"),
     ),
     "stages/regularizers.py": (
