@@ -89,7 +89,8 @@ def dominant_points(
     (D8).
 
     Source: Fang and Wang 2024 (Mini-Splatting), depth reinitialization, and its code.
-    Departs: the code divides by a scale of 0.
+    Departs: the code divides by a scale of 0. It also leaves Gaussians that are densest behind the camera out of the
+        light, so that what stands behind one has more weight there; here light is that of a render.
 
     Args:
         splats: the projected Gaussians.
