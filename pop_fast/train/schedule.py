@@ -202,8 +202,15 @@ def refining(config: TrainConfig, steps: int) -> TrainConfig:
     """Return the settings of a training that continues after the last step of another one."""
     last, plan, lr = config.max_steps - 1, config.strategy, config.lr
     degree = active_sh_degree(last, config.sh_interval, config.sh_degree, plan.sh_start_iter)
-    begins = min(_MEANS_AGAIN * lr.means_decay, 1.0)
-    ended = {name: lr.others_decay * getattr(lr, name) for name in ("scales", "quats", "sh0", "sh_rest")}
+    # a curve ends one step after the last, but a round of pruning and refining at its last
+    end = torch.tensor([last if plan.rounds_start_iter > 0 else config.max_steps], dtype=torch.float64)
+    share, factor = float(_share(end, config.max_steps, plan)), float(_round_factor(end, plan))
+    decay = lr.means_decay**share
+    begins = min(_MEANS_AGAIN * decay, 1.0)
+    ended = {
+        name: factor * lr.others_decay**share * getattr(lr, name) for name in ("scales", "quats", "sh0", "sh_rest")
+    }
+    ended["opacities"] = factor * lr.opacities
     strategy = replace(
         at_rest(plan),
         # bands open at regular steps, which are counted from a past in which those in use have opened
@@ -219,7 +226,7 @@ def refining(config: TrainConfig, steps: int) -> TrainConfig:
         strategy=strategy,
         sh_interval=steps,
         l2_stop_iter=0 if config.l2_stop_iter is not None and last >= config.l2_stop_iter else None,
-        lr=replace(lr, **ended, others_decay=1.0, means=begins * lr.means, means_decay=lr.means_decay / begins),
+        lr=replace(lr, **ended, others_decay=1.0, means=begins * lr.means, means_decay=decay / begins),
         eval_steps=(),
         save_steps=(),
         max_renders=0,
