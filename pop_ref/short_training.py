@@ -41,6 +41,13 @@ class Trained:
         # no update has been made
         self.driven.counters = dict.fromkeys(methods.KEYS, 0.0)
         self.driven.recipe = _with_options(self.driven.recipe, short)
+        steps = range(len(short.order) // short.batch)
+        grows = [step for step in steps if density.densifies_at(step, self.driven.recipe.density)]
+        if short.method == "taming" and grows:
+            raise ValueError(
+                f"step {grows[0]} is a densification step; Taming-3DGS grows by scores, which a short training does "
+                "not take: set refine_start_iter to its last step"
+            )
 
     @property
     def recipe(self) -> Recipe:
@@ -89,6 +96,9 @@ def taken_steps(short: ShortTraining, before: Sequence[Mapping[str, Any]] | None
     Returns:
         Of every step: its "view", a list where there are several, its "loss", which is that of the parameters before
         it, and "params", "m" and "v" after it.
+
+    Raises:
+        ValueError: it is of Taming-3DGS and grows.
 
     Example:
         >>> from pop_ref.conformance.short_training import ShortTraining

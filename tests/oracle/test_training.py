@@ -13,6 +13,7 @@ import pytest
 from pop_ref import density, losses
 from pop_ref.activations import opacities_from_logits, opacities_from_logits_vjp
 from pop_ref.ambiguities import AMBIGUITIES
+from pop_ref.conformance.short_training import ShortTraining
 from pop_ref.constants import GSPLAT_1_6, INRIA, PAPER, Profile
 from pop_ref.density import Rows, rows_from_params, split_rows
 from pop_ref.optimizer import adam_step, is_updated, learning_rates, means_learning_rate, sh_degree_at, update_numbers
@@ -21,6 +22,7 @@ from pop_ref.recipes import BASELINES, L1_DIVIDED, RECIPES, Recipe
 from pop_ref.records import Render
 from pop_ref.render import render, render_vjp
 from pop_ref.settings import LearningRates, UpdateRules
+from pop_ref.short_training import taken_steps
 from pop_ref.training import Training, control, gaussians_from_params, objective, params_vjp, start, train_step, update
 from tests.golden import ten_losses
 
@@ -403,6 +405,14 @@ def test_taming_moves_upper_bands_each_16_steps_and_opacities_until_15_000() -> 
     assert max(moved(recipe, "opacities")) == 14_999
     assert max(moved(recipe, "means")) == 29_999
     assert update_numbers(["shN"], 48, recipe) == {"shN": 3}
+
+
+def test_a_short_training_of_taming_that_would_grow_by_no_score_is_told() -> None:
+    settings = {"refine_start_iter": 0, "refine_every": 2}
+    assert len(taken_steps(ShortTraining("taming", settings, order=(0, 1)))) == 2
+    for batch in (1, 2):
+        with pytest.raises(ValueError, match="step 2 is a densification step; Taming-3DGS grows by scores"):
+            taken_steps(ShortTraining("taming", settings, order=(0, 1) * 3, batch=batch))
 
 
 def test_the_positions_rate_of_mini_splatting_goes_back_to_what_it_was() -> None:
