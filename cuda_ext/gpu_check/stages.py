@@ -277,7 +277,8 @@ def ranks_stage(check: StageContext) -> dict[str, Any]:
         return skipped(f"the node has {gpus} GPU; ranks share two or more")
     if not captures:
         return no_capture()
-    sizes = [size for size in (1, 2, 4, 8) if gpus % size == 0]
+    # of 3 GPUs too there are two to compare
+    sizes = sorted({gpus, *(size for size in (1, 2, 4, 8) if gpus % size == 0)})
     found: dict[str, Any] = {"status": 0, "seconds": 0.0, "gpus": gpus, "runs": {}}
     for k, size in enumerate(sizes):
         limit = (check.seconds - found["seconds"]) / (len(sizes) - k)
@@ -314,7 +315,8 @@ def _train_anew(check: StageContext, path: Path, name: str, limit: float, size: 
     words = ["--backend", backend, "--overwrite", "--threads", "1", *more]
     words += ["--max-steps", str(FEW)] if check.rehearsal else ["--steps-scaler", str(check.steps_scaler)]
     found = _train(check, path, folder, limit, words, size)
-    plies = sorted((folder / "ply").glob("*.ply"))
+    # that of step 29999 is later than that of step 6999
+    plies = sorted((folder / "ply").glob("point_cloud_*.ply"), key=lambda file: (len(file.name), file.name))
     if plies:
         found["sha256"] = hashlib.sha256(plies[-1].read_bytes()).hexdigest()
     return found

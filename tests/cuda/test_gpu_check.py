@@ -211,6 +211,28 @@ def test_a_training_that_cannot_be_says_why_and_the_next_is_begun(tmp_path):
     assert "no captures" in gpu_check_stages.train_stage(check(tmp_path))["skipped"]
 
 
+@pytest.mark.parametrize("apart", [6999, 29999])
+def test_ranks_are_compared_by_the_gaussians_after_the_last_step(tmp_path, monkeypatch, apart):
+    def trained(check, path, folder, limit, words, size):
+        (folder / "ply").mkdir(parents=True)
+        for step in (6999, 29999):
+            (folder / "ply" / f"point_cloud_{step}.ply").write_text(f"{step} of {size if step == apart else 'any'}")
+        return {"status": 0, "seconds": 1.0}
+
+    monkeypatch.setattr(gpu_check_stages, "_train", trained)
+    monkeypatch.setattr(gpu_check_stages, "count_gpus", lambda check: 2)
+    found = gpu_check_stages.ranks_stage(check(tmp_path, captures=(tmp_path / "scene",)))
+    assert (found["same_bits"], found["status"]) == ((False, 1) if apart == 29999 else (True, 0))
+
+
+@pytest.mark.parametrize(("gpus", "sizes"), [(2, "1 2"), (3, "1 3"), (4, "1 2 4"), (6, "1 2 6"), (8, "1 2 4 8")])
+def test_any_number_of_gpus_has_bits_to_compare(tmp_path, monkeypatch, gpus, sizes):
+    monkeypatch.setattr(gpu_check_stages, "_train", lambda *_: {"status": 0, "seconds": 1.0})
+    monkeypatch.setattr(gpu_check_stages, "count_gpus", lambda check: gpus)
+    found = gpu_check_stages.ranks_stage(check(tmp_path, captures=(tmp_path / "scene",)))
+    assert " ".join(found["runs"]) == sizes
+
+
 def test_a_training_without_the_package_of_the_command_line_is_skipped(tmp_path, monkeypatch):
     monkeypatch.setattr(gpu_check_stages.importlib.util, "find_spec", lambda name: None)
     found = gpu_check_stages.train_stage(check(tmp_path, captures=(tmp_path,)))
