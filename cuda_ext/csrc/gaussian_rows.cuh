@@ -71,14 +71,20 @@ __device__ __forceinline__ GaussianVjp<float> gaussian_vjp(const GaussianRow<flo
     return project_one_vjp(g, camera, settings.profile, settings.options, of_splat, v_dir, v_viewmat);
 }
 
-// call with the degree as a constant
+// call with the degree as a constant; floats: of a Gaussian's coefficients of all bands that its row has
 template <class Call>
-void with_degree(int degree, Call call) {
+void with_degree(int degree, int floats, Call call) {
+    if (degree < 0 || degree > 3)
+        throw std::invalid_argument("sh_degree is " + std::to_string(degree) + "; the kernels have 0 to 3");
+    // the kernels go through the bands of the degree, whatever a row has
+    const int given = floats / 3, needed = (degree + 1) * (degree + 1);
+    if (given < needed)
+        throw std::invalid_argument("sh has " + std::to_string(given) + " coefficients; degree " +
+                                    std::to_string(degree) + " needs " + std::to_string(needed));
     if (degree == 0) return call(std::integral_constant<int, 0>());
     if (degree == 1) return call(std::integral_constant<int, 1>());
     if (degree == 2) return call(std::integral_constant<int, 2>());
-    if (degree == 3) return call(std::integral_constant<int, 3>());
-    throw std::invalid_argument("sh_degree is " + std::to_string(degree) + "; the kernels have 0 to 3");
+    return call(std::integral_constant<int, 3>());
 }
 
 }  // namespace pop

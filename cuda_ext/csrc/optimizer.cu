@@ -347,7 +347,7 @@ void update(const UpdateArrays& arrays, const ViewArrays& view, const ProjectSet
             const SplatArrays& splats, DeviceState* state, cudaStream_t stream) {
     if (arrays.n == 0) return;
     const RowStride stride = row_stride(3 * arrays.n_rest);
-    with_degree(settings.sh_degree, [&](auto degree) {
+    with_degree(settings.sh_degree, 3 + 3 * arrays.n_rest, [&](auto degree) {
         constexpr int DEGREE = decltype(degree)::value;
         const int blocks = blocks_for(arrays.n, BLOCK);
         if (arrays.n_views > 1)

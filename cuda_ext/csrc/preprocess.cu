@@ -184,8 +184,10 @@ __global__ void __launch_bounds__(PROJECT_BLOCK)
 template <class Launch>
 void with_harmonics(const GaussianArrays& gaussians, int degree, Launch launch) {
     if (gaussians.sh_first == nullptr) return launch(std::integral_constant<int, GIVEN_COLORS>(), std::true_type());
-    with_degree(degree, [&](auto constant) {
-        if (gaussians.sh_rest == nullptr)
+    const bool whole = gaussians.sh_rest == nullptr;
+    const int floats = whole ? gaussians.sh_first_stride : 3 + gaussians.sh_rest_stride;
+    with_degree(degree, floats, [&](auto constant) {
+        if (whole)
             launch(constant, std::true_type());
         else
             launch(constant, std::false_type());

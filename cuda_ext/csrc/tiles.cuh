@@ -70,7 +70,8 @@ struct Exponent {
 
 template <class Real>
 POP_HD Exponent<Real> exponent_of(Real A, Real B, Real C) {
-    return {A, B, C, -B / C, -B / A};
+    // of a splat of billions of px a float's conic is 0: its exponent is 0 wherever on the edge, and 0 / 0 is nowhere
+    return {A, B, C, C > Real(0) ? -B / C : Real(0), A > Real(0) ? -B / A : Real(0)};
 }
 
 // the exponent on an edge of a box at offset `fixed`, at its least over the other offset in [low, high], less the slack

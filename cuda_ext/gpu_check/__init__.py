@@ -1,1 +1,1 @@
-"""Everything that only a GPU can tell, in three jobs: `python3 -m cuda_ext.gpu_check`."""
+"""Everything that only a GPU can tell, in four jobs: `python3 -m cuda_ext.gpu_check`."""

@@ -176,7 +176,8 @@ class BatchTrainer:
         """Take steps until the counter stands at `until`, all of one phase; all processes do so together.
 
         Raises:
-            ValueError: a Gaussian is no longer finite; the message names its row and step.
+            ValueError: a Gaussian is no longer finite; the message names its row and step. Or the phase's degree has
+                more coefficients than the Gaussians.
             CudaMemoryError: no room to grow.
         """
         with torch.cuda.device_of(self._shared.state):

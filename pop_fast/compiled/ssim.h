@@ -177,7 +177,7 @@ template <class Real> struct Products {
     for (int64_t r = 0; r < n; r++) {
       Real *d = at(0, r) + side, *dd = at(1, r) + side, *dy = at(2, r) + side;
       if (top + r < 0 || top + r >= given.height) {
-        for (Real *line : {d, dd, dy}) std::fill(line, line + width, Real(0));
+        for (Real *line : {d, dd, dy}) std::fill(line, line + width + side, Real(0));
         continue;
       }
       const Real *from = given.difference + (top + r) * width, *y = given.target + (top + r) * width;
@@ -186,6 +186,8 @@ template <class Real> struct Products {
         dd[k] = from[k] * from[k];
         dy[k] = from[k] * y[k];
       }
+      // a wider image may have been where the border is now
+      for (Real *line : {d, dd, dy}) std::fill(line + width, line + width + side, Real(0));
     }
   }
 };

@@ -211,6 +211,59 @@ def test_a_training_that_cannot_be_says_why_and_the_next_is_begun(tmp_path):
     assert "no captures" in gpu_check_stages.train_stage(check(tmp_path))["skipped"]
 
 
+@pytest.mark.parametrize("apart", [6999, 29999])
+def test_ranks_are_compared_by_the_gaussians_after_the_last_step(tmp_path, monkeypatch, apart):
+    def trained(check, path, folder, limit, words, size):
+        (folder / "ply").mkdir(parents=True)
+        for step in (6999, 29999):
+            (folder / "ply" / f"point_cloud_{step}.ply").write_text(f"{step} of {size if step == apart else 'any'}")
+        return {"status": 0, "seconds": 1.0}
+
+    monkeypatch.setattr(gpu_check_stages, "_train", trained)
+    monkeypatch.setattr(gpu_check_stages, "count_gpus", lambda check: 2)
+    found = gpu_check_stages.ranks_stage(check(tmp_path, captures=(tmp_path / "scene",)))
+    assert (found["same_bits"], found["status"]) == ((False, 1) if apart == 29999 else (True, 0))
+
+
+@pytest.mark.parametrize(("gpus", "sizes"), [(2, "1 2"), (3, "1 3"), (4, "1 2 4"), (6, "1 2 6"), (8, "1 2 4 8")])
+def test_any_number_of_gpus_has_bits_to_compare(tmp_path, monkeypatch, gpus, sizes):
+    monkeypatch.setattr(gpu_check_stages, "_train", lambda *_: {"status": 0, "seconds": 1.0})
+    monkeypatch.setattr(gpu_check_stages, "count_gpus", lambda check: gpus)
+    found = gpu_check_stages.ranks_stage(check(tmp_path, captures=(tmp_path / "scene",)))
+    assert " ".join(found["runs"]) == sizes
+
+
+@pytest.mark.parametrize("finished", [False, True])
+def test_captures_that_are_given_stand_for_those_that_were_not_packed(tmp_path, monkeypatch, finished):
+    (tmp_path / "packed").mkdir()
+    brought = {"packed": tmp_path / "packed"}
+    assert "no captures" in gpu_check_stages.reproduce_stage(check(tmp_path, **brought))["skipped"]
+    asked = []
+
+    def stopped(self, words, limit):
+        asked.extend(words)
+        if finished:
+            write_json(tmp_path / "work" / "paper_repro" / "results" / "small" / "pop.jsonl", {})
+        return {"status": 130, "seconds": 1.0, "output": "stopped"}
+
+    monkeypatch.setattr(StageContext, "run", stopped)
+    found = gpu_check_stages.reproduce_stage(check(tmp_path, **brought, captures=(tmp_path / "data" / "fox",)))
+    assert asked[asked.index("--data") + 1] == str(tmp_path / "data")
+    # the time ends every call; one that has nothing to show for it is no pass
+    assert (found["status"], len(found["rows"])) == ((0, 1) if finished else (124, 0))
+    assert "the time was up" in found["note"]
+
+
+@pytest.mark.parametrize("kinds", [0, 1, 3])
+def test_a_sanitizer_that_supports_no_device_is_skipped_and_has_not_passed(tmp_path, monkeypatch, kinds):
+    said = iter([{"status": 9, "seconds": 1.0, "output": "Error: Device not supported"}] * kinds)
+    passed = {"status": 0, "seconds": 1.0, "output": ""}
+    monkeypatch.setattr(gpu_check_stages, "_pytest", lambda *_, **__: next(said, passed))
+    monkeypatch.setattr(gpu_check_stages.shutil, "which", lambda name: name)
+    found = gpu_check_stages.sanitizer_stage(check(tmp_path))
+    assert (found["status"], "skipped" in found) == (0, kinds == 3)
+
+
 def test_a_training_without_the_package_of_the_command_line_is_skipped(tmp_path, monkeypatch):
     monkeypatch.setattr(gpu_check_stages.importlib.util, "find_spec", lambda name: None)
     found = gpu_check_stages.train_stage(check(tmp_path, captures=(tmp_path,)))

@@ -254,6 +254,20 @@ def test_rows_of_a_rectangle_are_exact_where_a_float_cannot_number_its_tiles(gpu
     assert torch.equal((end > begin).nonzero()[:, 0], torch.arange(across) + (down - 1) * across)
 
 
+def test_a_splat_whose_conic_is_0_reaches_every_tile_of_its_rectangle(gpu):
+    # its centre is in no tile's box, in one's columns, in one's rows; the determinant of 1e10 px is beyond a float
+    rows = {
+        "means2d": torch.tensor([[-50.0, -40.0], [20.0, -40.0], [-50.0, 12.0], [20.0, 12.0]]),
+        "depths": torch.ones(4),
+        "conics": torch.tensor([[0.0, -0.0, 0.0]]).repeat(4, 1),
+        "opacities": torch.full((4,), 0.5),
+        "radii": torch.full((4, 2), INT_MAX - 127, dtype=torch.int32),
+    }
+    listed, begin, end = made_lists(gpu, rows, 40, 30)
+    assert (end - begin).tolist() == [4] * 12
+    assert listed.tolist() == [0, 1, 2, 3] * 12
+
+
 def test_tiles_of_a_block_beyond_its_words_are_those_of_each_splat_alone(gpu):
     n, g = 20, torch.Generator().manual_seed(11)
     conics, covariance = turned(torch.tensor([[400.0, 30.0]]).repeat(n, 1), g)

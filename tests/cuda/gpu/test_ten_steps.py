@@ -114,6 +114,20 @@ def test_ten_fused_steps_are_the_cpus_ten_steps(gpu, backward):
         assert apart(params[name], value, name) < 0.01, name
 
 
+def test_bands_that_the_gaussians_do_not_have_are_not_trained(gpu):
+    scene = training_scene()
+    few = {**scene.params, "shN": scene.params["shN"][:, :3].contiguous()}
+    (params, _, _), trainer = fused_trainer(replace(scene, params=few), gpu)
+    trainer.run(1, Phase(1, True, True, True))
+    before = {name: value.clone() for name, value in params.items()}
+    for _ in range(2):
+        with pytest.raises(ValueError, match="sh has 4 coefficients; degree 2 needs 9"):
+            trainer.run(2, Phase(2, True, True, True))
+    assert_same_bits(params, before)
+    trainer.run(2, Phase(1, True, True, True))
+    assert trainer.step == 2
+
+
 @pytest.mark.graph
 def test_two_runs_give_the_same_bits(gpu):
     assert_same_bits(*(fused(training_scene(), gpu)[1] for _ in range(2)))
