@@ -30,9 +30,9 @@ Functions that may be offered, and are then called by their names:
   and the field, key or place for each of its parts. Normal deviates of a split are asked for with `draw`.
 - `rasterization`, with gsplat's arguments: several cameras, batch dimensions, modes of depth, plain colours, clipping.
   It answers `images` and `alphas`, and what it likes of gsplat's meta. With `rasterization_vjp` it is pulled back: the
-  same arguments, `v_images` and `v_alphas` give `v_` and the name of each array that has a gradient. A program that
-  offers it need not offer `image` or `v_means`. An argument that a program does not have it refuses, in these words:
-  `error batch dimensions are not supported`.
+  same arguments, `v_images` and `v_alphas` give `v_` and the name of each array that has a gradient; `v_viewmats` and
+  `v_backgrounds` may be left out. A program that offers it need not offer `image` or `v_means`. An argument that a
+  program does not have it refuses, in these words: `error batch dimensions are not supported`.
 """
 
 from __future__ import annotations
@@ -255,8 +255,7 @@ class ProgramAdapter(Adapter):
         if v_images is not None and "rasterization_vjp" in self.offers:
             v = {"v_images": np.asarray(v_images), "v_alphas": np.asarray(v_alphas)}
             words += [(name, call.batched(value)) for name, value in v.items()]
-            pulled = self._called("rasterization_vjp", words)
-            gradients = {name.removeprefix("v_"): value for name, value in pulled.items()}
+            gradients = self._pulled(call, words)
         shape = (B, C, camera.height, camera.width)
         try:
             images, alphas = images.reshape(*shape, call.n_channels), alphas.reshape(shape)
@@ -265,6 +264,17 @@ class ProgramAdapter(Adapter):
                                f"they must be {[*shape, call.n_channels]} and {list(shape)}") from None  # fmt: skip
         whole = {name: value.astype(np.int64) if name in INTEGERS else value for name, value in found.items()}
         return Called(images, alphas, whole, gradients)
+
+    def _pulled(self, call: Call, words: list[tuple[str, Any]]) -> dict[str, np.ndarray]:
+        """Return the gradients of a call's arrays; those of cameras and backgrounds a program need not have."""
+        found = {name.removeprefix("v_"): value for name, value in self._called("rasterization_vjp", words).items()}
+        own = call.tensors().keys()
+        lacks, strange = sorted(own - {"viewmats", "backgrounds"} - found.keys()), sorted(found.keys() - own)
+        if lacks or strange:
+            what = f"without v_{lacks[0]}" if lacks else f"where v_{strange[0]} is the gradient of no argument"
+            answer = ", ".join(f"v_{name}" for name in found) or "nothing"
+            raise ProgramError(f"{self._pipe} answers rasterization_vjp with {answer}, {what}")
+        return found
 
     def _held(self, found: dict[str, np.ndarray], name: str, function: str) -> np.ndarray:
         if name not in found:

@@ -106,6 +106,19 @@ def test_losses_density_control_adam_and_calls_with_several_cameras_cross_a_pipe
 
 
 @pytest.mark.parametrize(
+    ("broken", "words"),
+    [
+        ("quats", "v_viewmats, v_backgrounds, without v_quats"),
+        ("centres", "v_means2d is the gradient of no argument"),
+    ],
+)
+def test_gradients_of_a_call_are_of_all_its_gaussians_arguments_and_of_nothing_else(broken: str, words: str) -> None:
+    scene = golden_scene()
+    with pytest.raises(ProgramError, match=words):
+        ProgramAdapter(oracle_port(broken)).gradients(scene, *cotangents(scene))
+
+
+@pytest.mark.parametrize(
     ("broken", "stage", "law"),
     [
         ("losses", "losses", "test_l2_is_the_oracles"),
