@@ -7,6 +7,7 @@ written to standard error is shown where the program fails.
 
     hello protocol=1
         -> ok name=NAME dtype=float32|float64 profile=PROFILE offers=WORD,WORD,...
+           and sh_degree=0|1|2 where harmonics end before the third degree
     render N= n_sh= width= height= tile_size= sh_degree= antialiased=0|1 CONSTANTS want=NAME,NAME,...
     and means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh [N, n_sh, 3], viewmat [4, 4], K [3, 3],
     background [3]
@@ -115,6 +116,7 @@ class ProgramAdapter(Adapter):
         self.name = words["name"]
         self.dtype = {"float32": np.float32, "float64": np.float64}[words["dtype"]]
         self.profile = None if words["profile"] == "any" else profile_named(words["profile"])
+        self.sh_degree = int(words.get("sh_degree", 3))
         self.offers = tuple(words["offers"].split(","))
         self.able = tuple(ABILITIES[word] for word in self.offers if word in ABILITIES)
         for name in self.offers:
@@ -133,9 +135,9 @@ class ProgramAdapter(Adapter):
         wrong = [key for key in ("name", "dtype", "profile", "offers") if not words.get(key)]
         if wrong:
             raise ProgramError(f"{self._pipe} greets with 'ok {answer}', without {wrong[0]}; it must say ok {expected}")
-        allowed = {"dtype": ("float32", "float64"), "profile": (*PROFILES, "any")}
+        allowed = {"dtype": ("float32", "float64"), "profile": (*PROFILES, "any"), "sh_degree": ("0", "1", "2", "3")}
         for key, values in allowed.items():
-            if words[key] not in values:
+            if words.get(key, values[-1]) not in values:
                 raise ProgramError(
                     f"{self._pipe} greets with {key}={words[key]}; it must be one of {', '.join(values)}"
                 )
