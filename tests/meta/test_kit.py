@@ -50,6 +50,7 @@ from pop_ref.conformance.scenes import (
     scene_as_code,
 )
 from pop_ref.conformance.scorecard import Entry, Scorecard, introduction, outcomes
+from pop_ref.conformance.short_training import _assert_whose
 from pop_ref.conformance.signature import made
 from pop_ref.conformance.strategies import FLOOR, corners, scenes
 from pop_ref.conformance.tolerances import TABLE
@@ -132,13 +133,20 @@ def test_rounding_a_scene_twice_is_rounding_it_once() -> None:
         # one wrong entry among a million
         (np.where(np.arange(10**6) == 123_456, 1e-6, 0.0), np.zeros(10**6), 1.0, np.float32, r"first at \[123456\]"),
         *(([bad], [1.0], 1e300, np.float64, "not finite") for bad in (np.nan, np.inf, -np.inf)),
+        ([1.0], [np.nan], 1.0, np.float64, "got 1.0, expected nan is not finite"),
+        ([1.0], [2.0], np.nan, np.float64, "got 1.0, expected 2.0"),
         (np.zeros(2), np.zeros((2, 1)), 1.0, np.float64, "shape"),
     ],
-    ids=["index", "values", "million", "nan", "inf", "-inf", "shape"],
+    ids=["index", "values", "million", "nan", "inf", "-inf", "expected", "magnitude", "shape"],
 )
 def test_what_differs_is_told_with_index_values_and_units(actual, expected, scale, dtype, said):
     with pytest.raises(AssertionError, match=said):
         assert_close("alpha.sigma", np.array(actual), np.array(expected), scale, dtype)
+
+
+def test_a_row_without_numbers_is_another_row() -> None:
+    with pytest.raises(AssertionError, match="step 0 left another Gaussian at row 1"):
+        _assert_whose(np.array([[0.0], [np.nan]]), np.zeros((2, 1)), "step 0")
 
 
 def test_bits_of_other_shapes_are_not_the_same() -> None:
