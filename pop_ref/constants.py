@@ -64,7 +64,7 @@ class Profile:
         extent: "opacity_aware" is the rectangle that holds every pixel with alpha >= alpha_floor,
             "square" is Inria's square of 3 standard deviations of the larger axis (D2).
         extent_sigmas: upper bound of the extent in standard deviations (D2).
-        alpha_floor: alpha under it is skipped (D5).
+        alpha_floor: alpha under it is skipped (D5); over 0, as extents end where alpha falls under it.
         alpha_ceiling: alpha is clamped to it (D6); 0.99 is float32's, see the module's text.
         ceiling_gradient: "zero" stops the gradient of a clamped alpha, "pass" lets it through (B3).
         transmittance_stop: the transmittance at which a pixel ends (D7).
@@ -102,6 +102,11 @@ class Profile:
             "square": self.extent == "square",
             "pass_ceiling": self.ceiling_gradient == "pass",
         }
+
+    def require_floor(self) -> None:
+        """Raise ValueError where no extent holds all that is seen: alpha falls under a floor of 0 or less nowhere."""
+        if self.alpha_floor <= 0.0:
+            raise ValueError(f"profile {self.name!r}: alpha_floor is {self.alpha_floor}; it must be in (0, 1)")
 
 
 GSPLAT_1_5: Final = Profile(

@@ -205,10 +205,15 @@ def radii_from_covars2d(
         Extents along x and y, px, at most 2^31 - 1; both 0 where the determinant is <= 0 or, in "opacity_aware", the
         opacity is under the floor.
 
+    Raises:
+        ValueError: "opacity_aware", with an alpha floor that is not over 0.
+
     Example:
         >>> radii_from_covars2d(np.diag([4.0, 1.0])[None], np.array([1.0])).tolist()
         [[7, 4]]
     """
+    if profile.extent == "opacity_aware":
+        profile.require_floor()
     radii = np.zeros((len(covars2d), 2), dtype=np.int64)
     for i in range(len(covars2d)):
         opacity = float(opacities[i])

@@ -436,6 +436,7 @@ def _reaches(m: Magnitudes, profile: Profile) -> tuple[Rounded, Rounded]:
             spread = constant(0.1)
         reach = largest_k * (middle + spread.sqrt()).sqrt()
         return reach, reach
+    profile.require_floor()
     # under the floor the Gaussian is culled whatever its reach; log 1 = 0 stands in
     ratio = m.opacity / constant(profile.alpha_floor)
     log = Rounded(math.log(max(1.0, ratio.value)), ratio.error / max(1.0, ratio.value))

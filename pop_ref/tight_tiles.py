@@ -41,11 +41,15 @@ def snug_box(
     Returns:
         (left, top, right, bottom), px; None where the opacity is under the floor.
 
+    Raises:
+        ValueError: the floor is not over 0.
+
     Example:
         >>> left, top, right, bottom = snug_box(np.array([8.0, 4.0]), np.array([0.25, 0.0, 1.0]), 1.0)
         >>> round(right - 8.0, 2), round(bottom - 4.0, 2)
         (6.66, 3.33)
     """
+    profile.require_floor()
     if opacity < profile.alpha_floor:
         return None
     t = 2.0 * math.log(opacity / profile.alpha_floor)
@@ -80,10 +84,14 @@ def accutile(
     Returns:
         Tiles (x, y), row by row. A tile that the ellipse touches with its edge only is not among them.
 
+    Raises:
+        ValueError: the floor is not over 0.
+
     Example:
         >>> accutile(np.array([8.0, 8.0]), np.array([0.5, -0.484375, 0.5]), 2.0 / 255.0, (0, 0, 4, 4), 4)
         [(0, 0), (1, 0), (0, 1), (1, 1), (2, 1), (1, 2), (2, 2), (3, 2), (2, 3), (3, 3)]
     """
+    profile.require_floor()
     x0, y0, x1, y1 = rect
     A, B, C = conic.tolist()
     if opacity < profile.alpha_floor:

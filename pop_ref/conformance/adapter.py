@@ -24,6 +24,7 @@ import numpy as np
 
 from pop_ref.conformance.calls import Call, Called, drawn_scene
 from pop_ref.conformance.capabilities import (
+    ALL_BANDS,
     ANTIALIASING,
     DETERMINISTIC,
     DOMINANCE,
@@ -98,6 +99,7 @@ class Adapter:
         name: how reports call it.
         dtype: the NumPy type of the precision it computes in; its rounding is bounded in units of that type's eps.
         profile: the constants that it implements; None when it takes any, which scenes then carry.
+        sh_degree: of the highest harmonics that it takes; scenes are drawn without those beyond.
         able: what cannot be seen otherwise: ANTIALIASING, DETERMINISTIC, DOMINANCE, ROWWISE of `capabilities`.
 
     Example:
@@ -113,6 +115,7 @@ class Adapter:
     name: str = "adapter"
     dtype: Any = np.float32
     profile: Profile | None = PAPER
+    sh_degree: int = 3
     able: tuple[str, ...] = ()
 
     def has(self, need: str) -> bool:
@@ -131,6 +134,8 @@ class Adapter:
             return self.has(SIGNATURE) and self.why_not(need) is None
         if need == SCALE:
             return self.has(RENDER)
+        if need == ALL_BANDS:
+            return self.sh_degree >= 3
         return need in self.able or need in capabilities_of(self.profile) or callable(getattr(self, need, None))
 
     def takes(self, argument: str) -> bool:
@@ -179,8 +184,9 @@ class Adapter:
         return within_its_constants
 
     def sees(self, scene: Scene) -> Scene:
-        """Return the scene as the implementation reads it: rounded to its dtype, under the constants that it has."""
-        return rounded_to(under(scene, self.profile), self.dtype)
+        """Return the scene as the implementation reads it: rounded to its dtype, under the constants and with the bands
+        of harmonics that it has."""
+        return rounded_to(within_bands(under(scene, self.profile), self.sh_degree), self.dtype)
 
     def render(self, scene: Scene) -> View:
         """Draw a scene; by default the oracle projects and lists, and `composite` blends."""
@@ -240,6 +246,14 @@ def under(scene: Scene, profile: Profile | None) -> Scene:
         K[:2, 2] = centre
         changes |= {"K": K, "means": scene.gaussians.means + aside @ viewmat[:2, :3]}
     return scene.with_overrides(**changes)
+
+
+def within_bands(scene: Scene, degree: int) -> Scene:
+    """Return the scene without harmonics beyond a degree."""
+    sh, used = scene.gaussians.sh[:, : (degree + 1) ** 2], scene.sh_degree
+    if sh.shape == scene.gaussians.sh.shape:
+        return scene
+    return scene.with_overrides(sh=sh, sh_degree=None if used is None else min(used, degree))
 
 
 def _shown(splats: Any) -> dict[str, Any]:

@@ -45,7 +45,8 @@ def assert_close(
         compared &= np.reshape(mask, np.shape(mask) + (1,) * (actual.ndim - np.ndim(mask)))
     if not np.any(compared):
         return
-    strange = compared & ~np.isfinite(actual)
+    # a law compares two answers of one backend, too: either may hold no number
+    strange = compared & ~(np.isfinite(actual) & np.isfinite(expected))
     assert not np.any(strange), f"{key}: {_first(strange, actual, expected, place)} is not finite"
     eps = float(np.finfo(dtype).eps)
     # the smallest normal number keeps a magnitude of zero from asking for more than the format can hold
@@ -53,7 +54,7 @@ def assert_close(
     difference = np.where(compared, np.abs(actual - expected), 0.0)
     tolerances.record(key, dtype, float(np.max(difference / (eps * scale))))
     limit = tolerances.agreement(key, dtype) if against_oracle else tolerances.allowed(key, dtype)
-    wrong = difference > limit * scale
+    wrong = ~(difference <= limit * scale)
     if np.any(wrong):
         where = tuple(int(i) for i in np.argwhere(wrong)[0])
         units = difference[where] / (eps * scale[where])

@@ -42,6 +42,8 @@ PLANES: Final = "planes and low-pass other than its defaults"
 NO_BACKGROUND: Final = "a call without backgrounds"
 SPARSE_GRAD: Final = "sparse_grad"
 SCALE: Final = "thousands of Gaussians in seconds"
+# of one that has fewer bands, scenes are drawn without the others (`Adapter.sees`)
+ALL_BANDS: Final = "harmonics of the third degree"
 
 # what a scorecard lists of whole views
 WHOLE: Final = (RENDER, GRADIENTS, DOMINANCE, DOMINANT_WEIGHTS, DOMINANT_COUNTS, ANTIALIASING, INSTRUMENTS,

@@ -38,7 +38,8 @@ sparse_grad. What it refuses is skipped by name and in its own words: an argumen
 NotImplementedError, a ValueError or TypeError that Python code raises by a statement, a RuntimeError that says
 "unsupported" or "not implemented". Any other error, an assertion among them, is a defect: the laws of that argument
 report it, and the scorecard counts it as crashed. What it accepts is compared with what the oracle draws of every frame
-alone. One that only draws has no gradients to judge.
+alone. One that only draws has no gradients to judge. One that refuses harmonics of the third degree is drawn scenes of
+the bands that it has; an adapter says so by its attribute `sh_degree`, a program by a word of its greeting.
 
 Every two values of two arguments that are taken alone meet in some call of a covering array (`pairs.py`); images,
 gradients and meta of every camera are compared. To refuse two arguments together that are taken alone is a defect, too.

@@ -127,7 +127,7 @@ def _asked(backend: Any) -> Accepted:
     for factor, values in FACTORS.items():
         taken = []
         for one in values:
-            words = _senseless(backend, factor) if one.asks else None
+            words = (_senseless(backend, factor) or _beyond_bands(backend, one)) if one.asks else None
             if one.asks and words is None:
                 words = refusal_of(backend, bare_call(backend, factor, one.name))
             if words is None:
@@ -148,6 +148,12 @@ def _senseless(backend: Any, factor: str) -> str | None:
     if factor == "dominance" and not backend.takes("dominance"):
         return "it has no such argument"
     return None
+
+
+def _beyond_bands(backend: Any, one: Level) -> str | None:
+    """Return why a level of harmonics is none for a rasterizer that has fewer bands; None if it has them."""
+    fewer = one.asks.get("degree", 0) > backend.sh_degree
+    return f"it takes harmonics up to degree {backend.sh_degree}" if fewer else None
 
 
 def pairs_of(rows: Iterable[Mapping[str, str]]) -> set[Pair]:

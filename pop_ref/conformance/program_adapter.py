@@ -7,6 +7,7 @@ written to standard error is shown where the program fails.
 
     hello protocol=1
         -> ok name=NAME dtype=float32|float64 profile=PROFILE offers=WORD,WORD,...
+           and sh_degree=0|1|2 where harmonics end before the third degree
     render N= n_sh= width= height= tile_size= sh_degree= antialiased=0|1 CONSTANTS want=NAME,NAME,...
     and means [N, 3], quats [N, 4], scales [N, 3], opacities [N], sh [N, n_sh, 3], viewmat [4, 4], K [3, 3],
     background [3]
@@ -30,9 +31,9 @@ Functions that may be offered, and are then called by their names:
   and the field, key or place for each of its parts. Normal deviates of a split are asked for with `draw`.
 - `rasterization`, with gsplat's arguments: several cameras, batch dimensions, modes of depth, plain colours, clipping.
   It answers `images` and `alphas`, and what it likes of gsplat's meta. With `rasterization_vjp` it is pulled back: the
-  same arguments, `v_images` and `v_alphas` give `v_` and the name of each array that has a gradient. A program that
-  offers it need not offer `image` or `v_means`. An argument that a program does not have it refuses, in these words:
-  `error batch dimensions are not supported`.
+  same arguments, `v_images` and `v_alphas` give `v_` and the name of each array that has a gradient; `v_viewmats` and
+  `v_backgrounds` may be left out. A program that offers it need not offer `image` or `v_means`. An argument that a
+  program does not have it refuses, in these words: `error batch dimensions are not supported`.
 """
 
 from __future__ import annotations
@@ -115,6 +116,7 @@ class ProgramAdapter(Adapter):
         self.name = words["name"]
         self.dtype = {"float32": np.float32, "float64": np.float64}[words["dtype"]]
         self.profile = None if words["profile"] == "any" else profile_named(words["profile"])
+        self.sh_degree = int(words.get("sh_degree", 3))
         self.offers = tuple(words["offers"].split(","))
         self.able = tuple(ABILITIES[word] for word in self.offers if word in ABILITIES)
         for name in self.offers:
@@ -133,9 +135,9 @@ class ProgramAdapter(Adapter):
         wrong = [key for key in ("name", "dtype", "profile", "offers") if not words.get(key)]
         if wrong:
             raise ProgramError(f"{self._pipe} greets with 'ok {answer}', without {wrong[0]}; it must say ok {expected}")
-        allowed = {"dtype": ("float32", "float64"), "profile": (*PROFILES, "any")}
+        allowed = {"dtype": ("float32", "float64"), "profile": (*PROFILES, "any"), "sh_degree": ("0", "1", "2", "3")}
         for key, values in allowed.items():
-            if words[key] not in values:
+            if words.get(key, values[-1]) not in values:
                 raise ProgramError(
                     f"{self._pipe} greets with {key}={words[key]}; it must be one of {', '.join(values)}"
                 )
@@ -255,8 +257,7 @@ class ProgramAdapter(Adapter):
         if v_images is not None and "rasterization_vjp" in self.offers:
             v = {"v_images": np.asarray(v_images), "v_alphas": np.asarray(v_alphas)}
             words += [(name, call.batched(value)) for name, value in v.items()]
-            pulled = self._called("rasterization_vjp", words)
-            gradients = {name.removeprefix("v_"): value for name, value in pulled.items()}
+            gradients = self._pulled(call, words)
         shape = (B, C, camera.height, camera.width)
         try:
             images, alphas = images.reshape(*shape, call.n_channels), alphas.reshape(shape)
@@ -265,6 +266,17 @@ class ProgramAdapter(Adapter):
                                f"they must be {[*shape, call.n_channels]} and {list(shape)}") from None  # fmt: skip
         whole = {name: value.astype(np.int64) if name in INTEGERS else value for name, value in found.items()}
         return Called(images, alphas, whole, gradients)
+
+    def _pulled(self, call: Call, words: list[tuple[str, Any]]) -> dict[str, np.ndarray]:
+        """Return the gradients of a call's arrays; those of cameras and backgrounds a program need not have."""
+        found = {name.removeprefix("v_"): value for name, value in self._called("rasterization_vjp", words).items()}
+        own = call.tensors().keys()
+        lacks, strange = sorted(own - {"viewmats", "backgrounds"} - found.keys()), sorted(found.keys() - own)
+        if lacks or strange:
+            what = f"without v_{lacks[0]}" if lacks else f"where v_{strange[0]} is the gradient of no argument"
+            answer = ", ".join(f"v_{name}" for name in found) or "nothing"
+            raise ProgramError(f"{self._pipe} answers rasterization_vjp with {answer}, {what}")
+        return found
 
     def _held(self, found: dict[str, np.ndarray], name: str, function: str) -> np.ndarray:
         if name not in found:

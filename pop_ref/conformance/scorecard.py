@@ -249,6 +249,8 @@ def introduction(backend: Any) -> list[str]:
         return [f"conformance: {backend.name} is not judged: {backend.reason}"]
     laws = list(every_law().values())
     as_what = [np.dtype(backend.dtype).name, f"constants {backend.profile.name if backend.profile else 'any'}"]
+    degree = getattr(backend, "sh_degree", 3)
+    as_what += [f"harmonics up to degree {degree}"] if degree < 3 else []
     as_what += [f"on {backend.device}"] if hasattr(backend, "device") else []
     otherwise = "" if backend.profile is None else " (--dtype, --profile, --device say otherwise)"
     lines = [f"conformance: {backend.name}, {', '.join(as_what)}{otherwise}"]

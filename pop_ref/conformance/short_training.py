@@ -463,8 +463,8 @@ def _at(where: str) -> Any:
 
 def _assert_whose(found: np.ndarray, expected: np.ndarray, at: str) -> None:
     assert len(found) == len(expected), f"{at} left {len(found)} Gaussians, expected {len(expected)}"
-    others = np.flatnonzero(np.any(np.abs(found - expected) > PLACE, axis=1))
-    assert not len(others), f"{at} left another Gaussian at row {others[:1]}"
+    others = np.flatnonzero(np.any(~(np.abs(found - expected) <= PLACE), axis=1))
+    assert not len(others), f"{at} left another Gaussian at row {others[0]}"
 
 
 def _assert_rows(record: Mapping[str, Any], wanted: Rows, dtype: Any, at: str) -> None:

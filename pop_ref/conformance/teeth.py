@@ -140,6 +140,9 @@ def _short(values: dict[str, float]) -> dict[str, float]:
 
 def main(words: list[str]) -> int:
     """Write what was measured into the file named, or print it."""
+    if len(words) > 1 or (words[:1] and words[0].startswith("-")):
+        print("usage: python -m pop_ref.conformance.teeth [FILE]")
+        return 2
     text = json.dumps(measured(), indent=1) + "\n"
     if words:
         Path(words[0]).write_text(text, encoding="utf-8")

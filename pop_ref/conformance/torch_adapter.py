@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from hypothesis import reject
 
-from pop_ref.conformance.adapter import TOLD_OF_DOMINANCE, Adapter, View, stage_function
+from pop_ref.conformance.adapter import TOLD_OF_DOMINANCE, Adapter, View, stage_function, under, within_bands
 from pop_ref.conformance.calls import Call, Called, unpacked
 from pop_ref.conformance.capabilities import (
     ANTIALIASING,
@@ -30,8 +30,9 @@ from pop_ref.conformance.capabilities import (
     same_constants,
 )
 from pop_ref.conformance.cases import BY_NAME, Case, with_own_lists
-from pop_ref.conformance.scenes import Scene, golden_scene
+from pop_ref.conformance.scenes import Scene, golden_scene, rounded_to
 from pop_ref.conformance.torch_autograd import Ask, Differentiated, differentiated
+from pop_ref.conformance.views import refuses_on_purpose
 from pop_ref.constants import PAPER, Profile
 
 
@@ -135,6 +136,22 @@ class TorchAdapter(Adapter):
         if self._rasterization is None or self.takes("tile_size") or seen.profile.extent == "square":
             return seen
         return seen.with_overrides(tile_size=self.own_tile_size)
+
+    @functools.cached_property
+    def sh_degree(self) -> int:  # type: ignore[override]
+        """Give the highest degree of harmonics that the rasterizer does not refuse; it is asked once."""
+        scene = under(golden_scene(), self.profile)
+        sh = np.pad(scene.gaussians.sh, ((0, 0), (0, 12), (0, 0)))
+        for degree in (3, 2, 1, 0) if self._rasterization is not None else ():
+            asked = rounded_to(within_bands(scene.with_overrides(sh=sh), degree), self.dtype)
+            try:
+                self._call(asked, self._leaves(asked, grad=False), dominance=False, counts=False)
+            except Exception as error:
+                if refuses_on_purpose(error):
+                    continue
+            return degree
+        # what draws nothing, or fails otherwise, is for the laws to find
+        return 3
 
     @functools.cached_property
     def own_tile_size(self) -> int | None:

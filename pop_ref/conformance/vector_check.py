@@ -419,8 +419,7 @@ def entry(role: str, shape: str, meaning: str, dtype: str = "float64", compare: 
 
 def close(key: str, error_bound: str, where: str | None = None, **more: str) -> Rule:
     """Return the rule that a result differs by rounding at most, with the tolerance of that key."""
-    units = tolerances.TABLE[key].units
-    limit = {"float32": units * float(np.finfo(np.float32).eps), "float64": tolerances.AGREEMENT_FLOAT64}
+    limit = {name: tolerances.agreement(key, getattr(np, name)) for name in ("float32", "float64")}
     return {"rule": "close", "error_bound": error_bound, "limit": limit, "where": where, **more}
 
 

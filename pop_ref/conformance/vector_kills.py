@@ -181,8 +181,9 @@ def _image(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
 
 
 def _same(seen: Scene, scene: Scene) -> bool:
-    # a backend of one profile, or without a principal point, reads another scene than the vector holds
-    return seen.profile == scene.profile and np.array_equal(seen.gaussians.means, scene.gaussians.means)
+    # a backend of one profile, without a principal point or of fewer bands reads another scene than the vector holds
+    same = (np.array_equal(getattr(seen.gaussians, name), getattr(scene.gaussians, name)) for name in ("means", "sh"))
+    return seen.profile == scene.profile and all(same)
 
 
 def _call(backend: Any, arrays: Arrays, options: dict[str, Any]) -> Arrays:
@@ -274,6 +275,7 @@ def _frames(arrays: Arrays, options: dict[str, Any], profile: Profile, plain: bo
 def _needs(call: Call) -> list[str]:
     """Return what a rasterizer has to offer to be asked for a call."""
     asked = {
+        capabilities.ALL_BANDS: call.first.scene.gaussians.sh.shape[1] > 1,
         capabilities.COLORS: call.sh_degree is None,
         capabilities.CHANNELS: call.sh_degree is None,
         capabilities.CAMERA_COLORS: call.camera_colors,

@@ -43,7 +43,7 @@ def graded(work: Work) -> dict[str, Any]:
 
 def _stage_graded(work: Work, stage: Stage) -> dict[str, Any]:
     verdict = Verdict(unwritten=stage.names)
-    if work.written[stage.name]:
+    if work.written[stage.name] or stage.name in work.unreadable:
         try:
             verdict = judge(work, stage)
         except ValueError as error:

@@ -75,7 +75,7 @@ def judge(work: Work, stage: Stage) -> Verdict:
     """Try a student's stage, with the oracle's functions for all others.
 
     Raises:
-        ValueError: the file cannot be run.
+        ValueError: the file is not Python or cannot be run.
     """
     written = work.written[stage.name]
     with borrowing(work, (stage,)) as borrowed:

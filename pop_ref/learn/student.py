@@ -46,10 +46,12 @@ class Work:
     Attributes:
         folder: of the stubs.
         written: names of the functions that have a body, by stage.
+        unreadable: what is wrong with a file that is not Python, file and line among it, by stage; none is written.
     """
 
     folder: Path
     written: dict[str, tuple[str, ...]]
+    unreadable: dict[str, str] = field(default_factory=dict)
 
     def is_whole(self, stage: Stage) -> bool:
         """Tell whether every function of a stage is written."""
@@ -109,16 +111,22 @@ class Borrowed:
 
 
 def read_work(folder: Path) -> Work:
-    """Read a student's folder without running it.
+    """Read a student's folder without running it; a file that is not Python spoils its own stage only.
 
     Raises:
-        ValueError: the folder has no stubs, or a file is not Python; the message names file and line.
+        ValueError: the folder has no stubs.
     """
     if not any((folder / stage.file).exists() for stage in COURSE):
         if any(Path(stage.file).exists() for stage in COURSE):
             raise ValueError(f"{folder} has no stubs; you are in a folder that has some: write . for it, at the end")
         raise ValueError(f"{folder} has no stubs; 'pop-learn start {folder}' writes them")
-    return Work(folder, {stage.name: _written(stage, folder / stage.file) for stage in COURSE})
+    work = Work(folder, {stage.name: () for stage in COURSE})
+    for stage in COURSE:
+        try:
+            work.written[stage.name] = _written(stage, folder / stage.file)
+        except ValueError as error:
+            work.unreadable[stage.name] = str(error)
+    return work
 
 
 def _written(stage: Stage, path: Path) -> tuple[str, ...]:
@@ -153,8 +161,11 @@ def borrowing(work: Work, stages: Sequence[Stage] = COURSE) -> Iterator[Borrowed
     """Bring the oracle to life with the student's functions of some stages in place of its own.
 
     Raises:
-        ValueError: a file of the student cannot be run; the message names file and line.
+        ValueError: a file of these stages is not Python or cannot be run; the message names file and line.
     """
+    for stage in stages:
+        if stage.name in work.unreadable:
+            raise ValueError(work.unreadable[stage.name])
     finder = _Copies()
     _forget()
     sys.meta_path.insert(0, finder)

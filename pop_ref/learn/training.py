@@ -182,7 +182,7 @@ def train(work: Work, subject: Subject, steps: int = 120, every: int = 10, seed:
     """
     if steps < 0:
         raise ValueError(f"--steps is {steps}; give 0, for the start alone, or more")
-    missing = [stage.name for stage in COURSE if not work.is_whole(stage)]
+    missing = [stage.name for stage in COURSE if not work.is_whole(stage) and stage.name not in work.unreadable]
     if missing:
         raise ValueError(f"not all is written yet: {', '.join(missing)}; 'pop-learn check' says what each lacks")
     with borrowing(work) as borrowed:

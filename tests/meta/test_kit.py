@@ -33,6 +33,7 @@ from pop_ref.conformance.adapter import OracleAdapter, View
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.backends import shipped
 from pop_ref.conformance.calls import Call, call_as_code
+from pop_ref.conformance.capabilities import ALL_BANDS
 from pop_ref.conformance.failure_report import failure_report
 from pop_ref.conformance.hypothesis_profiles import EXAMPLES
 from pop_ref.conformance.law import is_crash, missing
@@ -48,7 +49,8 @@ from pop_ref.conformance.scenes import (
     save_scene,
     scene_as_code,
 )
-from pop_ref.conformance.scorecard import Entry, Scorecard, outcomes
+from pop_ref.conformance.scorecard import Entry, Scorecard, introduction, outcomes
+from pop_ref.conformance.short_training import _assert_whose
 from pop_ref.conformance.signature import made
 from pop_ref.conformance.strategies import FLOOR, corners, scenes
 from pop_ref.conformance.tolerances import TABLE
@@ -131,13 +133,20 @@ def test_rounding_a_scene_twice_is_rounding_it_once() -> None:
         # one wrong entry among a million
         (np.where(np.arange(10**6) == 123_456, 1e-6, 0.0), np.zeros(10**6), 1.0, np.float32, r"first at \[123456\]"),
         *(([bad], [1.0], 1e300, np.float64, "not finite") for bad in (np.nan, np.inf, -np.inf)),
+        ([1.0], [np.nan], 1.0, np.float64, "got 1.0, expected nan is not finite"),
+        ([1.0], [2.0], np.nan, np.float64, "got 1.0, expected 2.0"),
         (np.zeros(2), np.zeros((2, 1)), 1.0, np.float64, "shape"),
     ],
-    ids=["index", "values", "million", "nan", "inf", "-inf", "shape"],
+    ids=["index", "values", "million", "nan", "inf", "-inf", "expected", "magnitude", "shape"],
 )
 def test_what_differs_is_told_with_index_values_and_units(actual, expected, scale, dtype, said):
     with pytest.raises(AssertionError, match=said):
         assert_close("alpha.sigma", np.array(actual), np.array(expected), scale, dtype)
+
+
+def test_a_row_without_numbers_is_another_row() -> None:
+    with pytest.raises(AssertionError, match="step 0 left another Gaussian at row 1"):
+        _assert_whose(np.array([[0.0], [np.nan]]), np.zeros((2, 1)), "step 0")
 
 
 def test_bits_of_other_shapes_are_not_the_same() -> None:
@@ -612,6 +621,23 @@ def drawn(count: int = 400) -> list[float]:
 
     collect()
     return found
+
+
+@pytest.mark.parametrize("highest", [0, 1, 2])
+def test_a_rasterizer_of_fewer_bands_is_judged_by_those_it_has(highest: int) -> None:
+    def rasterization(*args: Any, sh_degree: int | None = None, **options: Any) -> Any:
+        if (sh_degree or 0) > highest:
+            raise ValueError(f"sh_degree is {sh_degree}; it must be <= {highest}")
+        return fast(*args, sh_degree=sh_degree, **options)
+
+    backend = TorchAdapter("of few bands", rasterization, dtype="float32")
+    assert backend.first_error() is None
+    assert f"harmonics up to degree {highest}" in " ".join(introduction(backend))
+    assert ALL_BANDS in missing(backend, law_named("test_scale:the_image_of_fifty_is_the_oracles").needs)
+    several = "test_signature_arguments:several_cameras_in_one_call_see_what_each_sees_alone"
+    for law in ("test_agreement:gradients_are_the_oracles", several):
+        assert obeys(law_named(law), backend, 1) is None
+    assert {"colors=harmonics of degree 3", "colors=degree 1 of 3"} <= accepted(backend).refused.keys()
 
 
 def test_the_constants_of_a_local_module_are_not_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -341,6 +341,19 @@ def test_a_tile_size_of_zero_is_refused() -> None:
         tiles.grid_size(4, 4, 0)
 
 
+@pytest.mark.parametrize("floor", [0.0, -1.0])
+def test_an_alpha_floor_under_which_nothing_falls_is_refused(floor: float) -> None:
+    open_, round_ = replace(PAPER, alpha_floor=floor), np.array([1.0, 0.0, 1.0])
+    one, seen_by = grey([0.5]), dyadic_camera(3, 3)
+    for draw in (
+        lambda: render(one, seen_by, profile=open_),
+        lambda: margins(one, seen_by, profile=open_),
+        lambda: accutile(round_[:2], round_, 1.0, (0, 0, 4, 4), 4, open_),
+    ):
+        with pytest.raises(ValueError, match=rf"profile 'paper': alpha_floor is {floor}; it must be in \(0, 1\)"):
+            draw()
+
+
 def test_a_conic_that_vanished_is_everywhere_and_an_ellipse_that_is_a_point_in_its_tile() -> None:
     assert len(accutile(np.array([9.0, 9.0]), np.zeros(3), 1.0, (1, 1, 3, 4), 4)) == 6
     # at the floor itself nothing but the centre is left; in profile inria it is listed, and blended at the centre

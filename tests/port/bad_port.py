@@ -18,6 +18,7 @@ HELLO = "ok name=bad dtype=float32 profile=paper offers=image,T_final,dominant_i
 GREETINGS = {
     "nameless": "ok dtype=float32 profile=paper offers=image,T_final",
     "half": "ok name=bad dtype=float16 profile=paper offers=image,T_final",
+    "striped": "ok name=bad dtype=float32 profile=paper sh_degree=4 offers=image,T_final",
     "elsewhere": "ok name=bad dtype=float32 profile=mine offers=image,T_final",
     "stranger": "ok name=bad dtype=float32 profile=paper offers=image,T_final,colour",
     "lonely": "ok name=bad dtype=float32 profile=paper offers=image",

@@ -1,6 +1,7 @@
 """The oracle as a program that answers the kit's protocol: what crosses the pipe must cost no bit.
 
-Words after the script's name break it: `losses`, `density`, `cameras` and `depth` each bring one error in.
+Words after the script's name break it: `losses`, `density`, `cameras` and `depth` each bring one error in, `quats` and
+`centres` leave a gradient out and add one. `bands` refuses harmonics beyond the first degree, and says so.
 """
 
 import math
@@ -74,6 +75,8 @@ def frames(given: dict[str, Any]) -> Iterator[tuple[tuple[int, int], dict[str, A
     B, C = math.prod(batch), given["viewmats"].shape[-3]
     profile = decoded(Profile, given, "profile")
     degree = None if given["sh_degree"] == NONE else int(given["sh_degree"])
+    if "bands" in BROKEN and (degree or 0) > 1:
+        raise NotImplementedError("harmonics beyond the first degree are not supported")
     of = {name: value.reshape(B, *value.shape[len(batch) :]) for name, value in given.items() if name in ARRAYS}
     for b, c in np.ndindex(B, C):
         # colours of N Gaussians: channels, or coefficients and channels; before them may stand a camera's
@@ -136,7 +139,9 @@ def rasterization_vjp(given: dict[str, Any]) -> Iterator[tuple[str, Any]]:
         whole["viewmats"][b, c] = g.viewmat
         if options["background"] is not None:
             whole["backgrounds"][b, c] = g.background
-    yield from ((f"v_{name}", value) for name, value in v.items())
+    if "centres" in BROKEN:
+        v["means2d"] = v["means"]
+    yield from ((f"v_{name}", value) for name, value in v.items() if name not in BROKEN)
 
 
 def offered() -> str:
@@ -149,7 +154,8 @@ def main() -> None:
     while line := sys.stdin.buffer.readline().decode():
         verb, *words = line.split()
         if verb == "hello":
-            write(f"ok name=oracle dtype=float64 profile=any offers={offered()}", [])
+            bands = " sh_degree=1" * ("bands" in BROKEN)
+            write(f"ok name=oracle dtype=float64 profile=any{bands} offers={offered()}", [])
             continue
         name, given = words[0], given_by(words[1:])
         try:

@@ -18,12 +18,14 @@ from hypothesis import example, given
 from cuda_ext.toolkit import find_compiler, no_compiler
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.assertions import assert_same_image
+from pop_ref.conformance.capabilities import ALL_BANDS
 from pop_ref.conformance.corpus import corpus_scene
 from pop_ref.conformance.error_bounds import pixel_error_bounds
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.program_adapter import ProgramAdapter, ProgramError
 from pop_ref.conformance.scenes import Record, Scene, cotangents, golden_scene, pack
 from pop_ref.conformance.strategies import corners, scenes
+from pop_ref.conformance.views import call_for
 from pop_ref.constants import PAPER, Profile
 from pop_ref.records import Camera
 
@@ -103,6 +105,28 @@ def test_losses_density_control_adam_and_calls_with_several_cameras_cross_a_pipe
     # packed rows, and what only meta tells, are skipped
     assert n_passed(done) >= 90, done.stdout
     assert "refuses the request call rasterization: covariances are not supported" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("broken", "words"),
+    [
+        ("quats", "v_viewmats, v_backgrounds, without v_quats"),
+        ("centres", "v_means2d is the gradient of no argument"),
+    ],
+)
+def test_gradients_of_a_call_are_of_all_its_gaussians_arguments_and_of_nothing_else(broken: str, words: str) -> None:
+    scene = golden_scene()
+    with pytest.raises(ProgramError, match=words):
+        ProgramAdapter(oracle_port(broken)).gradients(scene, *cotangents(scene))
+
+
+def test_a_program_of_fewer_bands_says_so_and_is_judged_by_those_it_has() -> None:
+    backend = ProgramAdapter(oracle_port("bands"))
+    backend.call(call_for(backend, degree=3))
+    seen = backend.sees(corners(3)[0]["scene"])
+    assert (backend.sh_degree, seen.degree) == (1, 1)
+    assert not backend.has(ALL_BANDS)
+    backend.render(seen)
 
 
 @pytest.mark.parametrize(
@@ -302,6 +326,7 @@ def test_an_answer_that_does_not_come_is_not_waited_for_twice() -> None:
     [
         ("nameless", "without name; it must say ok name=NAME"),
         ("half", "dtype=float16; it must be one of float32, float64"),
+        ("striped", "sh_degree=4; it must be one of 0, 1, 2, 3"),
         ("elsewhere", "profile=mine; it must be one of paper"),
         ("stranger", "offers 'colour'; what may be offered is image, T_final"),
         ("lonely", "offers no T_final; image, T_final belong together"),

@@ -29,7 +29,7 @@ from pop_ref.learn import stubs
 from pop_ref.learn.course import BY_NAME, COURSE, NOT_TAUGHT, Stage
 from pop_ref.learn.diagnosis import diagnose
 from pop_ref.learn.drawing import HEAD, ORACLES, SIDE, YOURS, drawn_counterexample, lettered
-from pop_ref.learn.grading import read_grade
+from pop_ref.learn.grading import graded, read_grade
 from pop_ref.learn.judge import Verdict, judge, told
 from pop_ref.learn.mistakes import MISTAKES, Mistake
 from pop_ref.learn.probes import oracle, probes
@@ -410,6 +410,7 @@ def test_the_answer_is_shown_when_asked_twice_or_after_a_pass(mine: Path, capsys
             ["check", "alpha"],
             "alpha.py, line 3: the file cannot be run: SystemExit: 0",
         ),
+        ({"alpha.py": "1 +\n"}, ["map"], "alpha.py, line 1: this is not Python yet"),
         ({}, ["train"], "not all is written yet: activations"),
         ({}, ["train", "--steps", "-5"], "--steps is -5; give 0, for the start alone, or more"),
         ({}, ["check", "alpha", "--json"], "--json belongs to --all"),
@@ -430,6 +431,16 @@ def test_bad_input_gets_one_line(
     told_to = capsys.readouterr().err
     assert message in told_to
     assert told_to.count("\n") == 1
+
+
+def test_a_file_that_is_not_python_spoils_its_own_stage_only(mine: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write(mine, "activations")
+    (mine / "alpha.py").write_text("def falloff(sigma):\n    return (1\n")
+    assert main(["learn", "check", "activations", str(mine)]) == 0
+    grade = graded(read_work(mine))
+    assert grade["passed"] == ["activations"]
+    (alpha,) = (stage for stage in grade["stages"] if stage["broken"])
+    assert "alpha.py, line 2: this is not Python yet" in alpha["sentence"]
 
 
 def test_a_file_with_a_mark_before_its_text_is_read_and_what_is_no_number_is_named(
@@ -563,6 +574,7 @@ def test_a_class_is_graded_whatever_one_submission_does(tmp_path: Path, capsys: 
     lie = "print('pop learn graded: {\"score\": 66}')\nimport os, sys\nsys.__stdout__.write('pop learn graded: [')\n"
     end = "sys.__stdout__.flush()\nos._exit(0)\ndef falloff(sigma):\n    return 1\n"
     (tmp_path / "dora" / "alpha.py").write_text(lie + end)
+    write(tmp_path / "emil", "activations")
     (tmp_path / "emil" / "alpha.py").write_text("def falloff(sigma):\n    return (1\n")
     (tmp_path / "notes").mkdir()
     assert main(["learn", "class", str(tmp_path), "--seconds", "12"]) == 0
@@ -572,7 +584,8 @@ def test_a_class_is_graded_whatever_one_submission_does(tmp_path: Path, capsys: 
     assert "- bert: it runs for longer than 12 s; is there an endless loop?" in report
     assert "- cleo: it ended with status 7" in report
     assert "- dora: its output cannot be distinguished from a grade" in report
-    assert "- emil: it ended with status 1" in report
+    # a file that is not Python spoils its own stage only
+    assert "| emil | 6 | passed |" in report
     assert "alpha.py, line 2: this is not Python yet" in report
     assert "notes" not in report
     assert main(["learn", "class", str(tmp_path / "notes")]) == 2

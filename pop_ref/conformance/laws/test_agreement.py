@@ -17,6 +17,7 @@ from pop_ref.conformance.assertions import (
     with_error_bounds,
 )
 from pop_ref.conformance.capabilities import (
+    ALL_BANDS,
     ANTIALIASING,
     DOMINANCE,
     DOMINANT_WEIGHTS,
@@ -46,6 +47,10 @@ def _first(case):
     return [{"inputs": inputs} for inputs in case.first]
 
 
+def _needs(case):
+    return (ALL_BANDS,) if case.stage == "harmonics" else ()
+
+
 def _agreement(case):
     def sentence(backend, inputs):
         inputs = rounded(inputs, backend.dtype)
@@ -56,7 +61,7 @@ def _agreement(case):
             assert_close(f"agreement.{case.name}", a, e, c, backend.dtype, against_oracle=True)
 
     sentence.__name__ = f"test_{case.name}_is_the_oracles"
-    return law(case.stage, case.name, first=_first(case), inputs=case.inputs)(sentence)
+    return law(case.stage, case.name, *_needs(case), first=_first(case), inputs=case.inputs)(sentence)
 
 
 def _transpose_agreement(case):
@@ -74,7 +79,7 @@ def _transpose_agreement(case):
             assert_close(f"agreement.{name}", a, e, c, backend.dtype, against_oracle=True)
 
     sentence.__name__ = f"test_{name}_is_the_oracles"
-    return law(case.stage, name, first=_first(case), inputs=case.inputs)(sentence)
+    return law(case.stage, name, *_needs(case), first=_first(case), inputs=case.inputs)(sentence)
 
 
 def _adjoint(case):
@@ -97,7 +102,8 @@ def _adjoint(case):
         assert_close("adjoint", slopes[1], stated, size * 2.0**33, backend.dtype)
 
     sentence.__name__ = f"test_{name}_is_the_transpose"
-    return law(case.stage, case.name, name, DOUBLE, inputs=case.inputs, direction=st.integers(0, 2**16))(sentence)
+    drawn = {"inputs": case.inputs, "direction": st.integers(0, 2**16)}
+    return law(case.stage, case.name, name, DOUBLE, *_needs(case), **drawn)(sentence)
 
 
 def _with_true_gradient(value):

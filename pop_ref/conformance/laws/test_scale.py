@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
-from pop_ref.conformance.capabilities import DOMINANCE, EXTENTS, GRADIENTS, INRIAS, PRINCIPAL_POINT, RENDER, SCALE
+from pop_ref.conformance.capabilities import (
+    ALL_BANDS,
+    DOMINANCE,
+    EXTENTS,
+    GRADIENTS,
+    INRIAS,
+    PRINCIPAL_POINT,
+    RENDER,
+    SCALE,
+)
 from pop_ref.conformance.corpus import (
     GRADIENTS as ROWS,
 )
@@ -68,7 +77,8 @@ def _gradients(name, *needs):
 
 for _name, _plan in PLANS.items():
     _needs = (INRIAS,) if _plan.profile == INRIA else (EXTENTS, PRINCIPAL_POINT)
+    _needs = (*_needs, *((ALL_BANDS,) if _plan.degree else ()), *(() if _plan.small else (SCALE,)))
     for _make in (_image, _integers, _gradients):
-        _test = _make(_name, *_needs, *(() if _plan.small else (SCALE,)))
+        _test = _make(_name, *_needs)
         globals()[_test.law.sentence.__name__] = _test
 del _name, _plan, _needs, _make, _test
