@@ -39,8 +39,7 @@ def run(argv: Sequence[str]) -> int:
     args = parse(Args, argv, "frames", examples=_EXAMPLES)
     from pop_fast.data.unpack import frames_folder, take_frames
 
-    # a video that is not there is refused by name
-    out = args.out or (frames_folder(args.video) if args.video.is_file() else args.video.with_name("frames"))
+    out = args.out or frames_folder(args.video)
     with bars() as progress:
         found = take_frames(args.video, out, args.count, args.max_size, progress, overwrite=args.overwrite)
     resting = f"; the camera rested in {found.alike} stretches" if found.alike else ""

@@ -68,9 +68,9 @@ def frames_folder(video: Path) -> Path:
 
     Otherwise `walk.mov` would be trained on by the frames of `walk.mp4`.
     """
-    beside = (other for other in video.absolute().parent.iterdir() if other.suffix.lower() in VIDEO_SUFFIXES)
+    beside = (other for other in video.absolute().parent.glob("*") if other.suffix.lower() in VIDEO_SUFFIXES)
     alone = not any(other.stem == video.stem and other.name != video.name for other in beside)
-    return video.with_name(f"{video.stem if alone else video.name}_frames")
+    return video.parent / f"{video.stem if alone else video.name}_frames"
 
 
 def _made_before(path: Path, target: Path) -> bool:

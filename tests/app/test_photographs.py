@@ -468,6 +468,8 @@ def test_the_command_writes_next_to_the_video_and_says_what_comes_next(clip: Pat
     assert "of 80 frames" in done.out
     says(pop("frames", video, "--count", "4"), str(folder))
     pop.done("frames", video, "--count", "4", "--overwrite")
+    for absent in (".", str(tmp_path / "no" / "walk.avi")):
+        says(pop("frames", absent), f"{absent}: no such file; give a video")
     assert len(list_images(folder)) <= 4
     (folder / "mine.jpg").write_bytes(b"mine")
     assert pop("frames", video, "--overwrite").status == 2
