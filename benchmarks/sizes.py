@@ -193,12 +193,12 @@ def sizes_table() -> str:
 
 def budgets_table() -> str:
     """Make the table of captures within budgets: by fewer Gaussians, by rounding too, and tuned."""
-    rows = []
-    for name, found in read_json(RESULTS / "budgets.json")["captures"].items():
+    rows, captures = [], read_json(RESULTS / "budgets.json")["captures"]
+    for name, found in captures.items():
         for row in found["rows"]:
             cells = [f"{row[kind]['psnr'] - found['psnr']:+.2f} dB" for kind in ("fewer", "spent", "tuned")]
             rows.append([name, f"`{row['format']}`", f"{row['bytes'] / 1e6:.2f} MB, 1/{row['share']}", *cells])
-    steps = f"and tuned, {read_json(RESULTS / 'budgets.json')['steps']} steps"
+    steps = f"and tuned, {' or '.join(map(str, sorted({of['steps'] for of in captures.values()})))} steps"
     return markdown(["capture", "format", "bytes", "fewer Gaussians alone", "harmonics and digits too", steps], rows)
 
 
@@ -228,8 +228,9 @@ def main() -> int:
             whole = measured(result, Path(scratch))
         found = within_budgets(result, whole, args.formats) if args.budgets else in_whole(result, whole)
         for entry in found:
-            captures[Path(resolved(result)["data"]).name] = entry
-            write_json(args.json, {"machine": machine(), "ply_bytes": PLY_BYTES, **steps, "captures": captures})
+            # with every result, because others are kept that were measured elsewhere
+            captures[Path(resolved(result)["data"]).name] = {"machine": machine(), **steps, **entry}
+            write_json(args.json, {"ply_bytes": PLY_BYTES, "captures": captures})
     return 0
 
 

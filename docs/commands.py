@@ -179,18 +179,19 @@ RUNS = (
     Run("vectors", "pop vectors check vectors vectors"),
     Run("completion", "pop completion bash | head -12"),
 )
+# none reads the package's results: the page would be an old one with each row that is trained
 REPRO = (
     Run("run", "pop-repro run pop demo --scale toy --results results --work work"),
     Run("queue", "pop-repro queue --scale toy --rows pop gsplat l2_blur --results results --work work"),
     Run("verify", "pop-repro verify pop demo --scale toy --results results --work work --steps 100"),
-    Run("status", "pop-repro status --scale small"),
+    Run("status", "pop-repro status --scale toy --results results --work work"),
     Run("table", "pop-repro table 4 --scale toy --results results --out tables"),
     Run(
         "figure",
         "pop-repro figure 7 --scale toy --results results --work work --out figures",
         tiles("figures/*.png", 1),
     ),
-    Run("claims", "pop-repro claims --scale small"),
+    Run("claims", "pop-repro claims --scale toy --results results"),
     Run("data check", "pop-repro data check --data ."),
 )
 

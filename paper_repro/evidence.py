@@ -407,10 +407,13 @@ def verdict_over(verdicts: Iterable[Verdict]) -> Verdict:
     return "holds" if found == {"holds"} else "not decided"
 
 
-def command(scale: str, rows: Iterable[str], scenes: Iterable[str], seeds: int) -> str:
-    """Give the command that trains rows on scenes with so many seeds; what is finished of it is not trained again."""
+def command(scale: str, rows: Iterable[str], scenes: Iterable[str], seeds: int, where: str = "") -> str:
+    """Give the command that trains rows on scenes with so many seeds; what is finished of it is not trained again.
+
+    `where` is the machine, engine and threads on which alone that decides something; empty where any would do.
+    """
     words = f"pop-repro queue --scale {scale} --data DATA --rows {' '.join(rows)} --scenes {' '.join(scenes)}"
-    return words + (f" --seeds {seeds}" if seeds > 1 else "")
+    return words + (f" --seeds {seeds}" if seeds > 1 else "") + (f"  # on {where}" if where else "")
 
 
 def groups(results: Iterable[Result]) -> Groups:

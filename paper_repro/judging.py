@@ -24,6 +24,7 @@ from paper_repro.evidence import (
     is_shortened,
     told,
 )
+from paper_repro.jobs import SEED
 from paper_repro.paper import paper
 from paper_repro.results import most_timed_on
 from paper_repro.scenes import scale_named
@@ -115,18 +116,42 @@ def judge(question: Question, found: Groups, noise: Noise, scale: str) -> Claim:
 
 @dataclass(frozen=True)
 class _At:
-    """One scene: the groups that a question uses, what could be compared, the rows that lack, and seeds for those."""
+    """One scene: what a question uses there, what could be compared, and what lacks.
+
+    Attributes:
+        scene: its name.
+        rows: the groups that are used, by the question's row.
+        unused: of each of the question's rows, seeds of the runs that are there and do not count.
+        asked: what could be compared, or why not.
+        missing: names of the rows that lack.
+        where: the machine on which further runs have to be timed; empty where any would do.
+    """
 
     scene: str
     rows: Mapping[str, Group]
+    unused: Mapping[str, set[int]]
     asked: Asked
     missing: tuple[str, ...]
-    seeds: int
+    where: str = ""
 
     @property
     def made(self) -> tuple[Comparison, ...]:
         """The comparisons that could be made."""
         return tuple(c for c in self.asked if isinstance(c, Comparison))
+
+    def queued(self, runs: int, is_missing: bool = False) -> int:
+        """Say for how many seeds a queue has to be asked so that each row, or each that lacks, has so many runs.
+
+        A run that is there is not trained again, whether it counts or not.
+        """
+        rows = [row for row in self.unused if not (is_missing and row in self.rows)]
+        return max((self._queued(row, runs) for row in rows), default=runs)
+
+    def _queued(self, row: str, runs: int) -> int:
+        seeds = runs
+        while len(_seeds(self.rows, row) | (set(range(SEED, SEED + seeds)) - self.unused[row])) < runs:
+            seeds += 1
+        return seeds
 
 
 def _under(reading: str, question: Question, found: Groups, noise: Noise, scale: str, rows: Mapping[str, str]) -> Told:
@@ -134,21 +159,19 @@ def _under(reading: str, question: Question, found: Groups, noise: Noise, scale:
     at: list[_At] = []
     for scene in _scenes(question, found, scale):
         by_row = found.get(scene, {})
-        used = {row: by_row[name] for row, name in rows.items() if name in by_row}
-        if question.of_times:
-            used = _on_one_machine(used)
+        there = {row: by_row[name] for row, name in rows.items() if name in by_row}
+        where, used = _on_one_machine(there) if question.of_times else ("", there)
         missing = tuple(name for row, name in rows.items() if row not in used)
-        # a run that is there and not used, since it was timed elsewhere, is not trained again
-        have = max((len(by_row[name].runs) for name in missing if name in by_row), default=0)
-        seeds = max(_seeds_at_first(noise), have + 1)
         asked = [ask(used, noise) for ask in question.asks] if used else []
-        at.append(_At(scene, used, asked, missing, seeds))
+        unused = {row: _seeds(there, row) - _seeds(used, row) for row in rows}
+        at.append(_At(scene, used, unused, asked, missing, where))
     together = sum(c.asked != "nothing" for one in at for c in one.made)
     names = tuple(rows.values())
     evidence, judged, deciders = [], list[_At](), _Deciders(scale)
     for one in at:
         if not any(one.asked) and one.missing:
-            deciders.add(one.missing or names, one.scene, one.seeds, bool(found.get(one.scene)))
+            seeds = one.queued(_seeds_at_first(noise), is_missing=True)
+            deciders.add(one.missing or names, one, seeds, bool(found.get(one.scene)))
             continue
         judged.append(one)
         verdict, why = _verdict(question, one, together)
@@ -161,7 +184,7 @@ def _under(reading: str, question: Question, found: Groups, noise: Noise, scale:
             Evidence(one.scene, said, verdict, why, conditions(groups), runs, _nearest(one, together), is_whole)
         )
         if verdict == "not decided":
-            _decide(deciders, question, one, names, together)
+            _decide(deciders, question, one, names, together, _seeds_at_first(noise))
     is_open = [one for one, e in zip(judged, evidence, strict=True) if e.is_whole and e.verdict == "not decided"]
     return told(reading, evidence, deciders.commands(), _enough(scale, names, is_open, together))
 
@@ -202,16 +225,18 @@ def _nearest(at: _At, together: int) -> str:
     return min(asked, key=lambda c: c.margin / (c.error or 1.0)).text(together) if asked else ""
 
 
-def _decide(deciders: _Deciders, question: Question, at: _At, names: tuple[str, ...], together: int) -> None:
-    """Add the runs that would decide a scene."""
+def _decide(
+    deciders: _Deciders, question: Question, at: _At, names: tuple[str, ...], together: int, at_first: int
+) -> None:
+    """Add the runs that would decide a scene; rows that lack get so many seeds at first."""
     if question.of_duration and is_shortened(r for group in at.rows.values() for r in group.runs):
         deciders.elsewhere(names, at.scene)
     elif at.missing:
-        deciders.add(at.missing, at.scene, at.seeds)
+        deciders.add(at.missing, at, at.queued(at_first, is_missing=True))
     elif len(at.made) == len(at.asked):
         seeds = _seeds_to_decide(at, together)
         if seeds is not None:
-            deciders.add(names, at.scene, seeds)
+            deciders.add(names, at, at.queued(seeds))
 
 
 def _enough(scale: str, names: tuple[str, ...], is_open: Sequence[_At], together: int) -> list[str] | None:
@@ -223,11 +248,12 @@ def _enough(scale: str, names: tuple[str, ...], is_open: Sequence[_At], together
     if not margins or [] in margins.values():
         return None
     needed = {at.scene: _seeds_to_decide(at, together) for at in is_open}
-    failing = [(seeds, scene) for scene, seeds in needed.items() if seeds and min(margins[scene]) < 0.0]
+    queued = [(at.queued(seeds), at.scene, at.where) for at in is_open if (seeds := needed[at.scene])]
+    failing = [one for one in queued if min(margins[one[1]]) < 0.0]
     if not failing and None in needed.values():
         return []
-    chosen = [min(failing)] if failing else [(seeds, scene) for scene, seeds in needed.items() if seeds]
-    return [command(scale, names, [scene], seeds) for seeds, scene in chosen]
+    chosen = [min(failing)] if failing else queued
+    return [command(scale, names, [scene], seeds, where) for seeds, scene, where in chosen]
 
 
 class _Deciders:
@@ -235,22 +261,22 @@ class _Deciders:
 
     def __init__(self, scale: str) -> None:
         self.scale = scale
-        self.begun: dict[tuple[str, tuple[str, ...], int], list[str]] = {}
-        self.others: dict[tuple[str, tuple[str, ...], int], list[str]] = {}
+        self.begun: dict[tuple[str, tuple[str, ...], int, str], list[str]] = {}
+        self.others: dict[tuple[str, tuple[str, ...], int, str], list[str]] = {}
 
-    def add(self, rows: tuple[str, ...], scene: str, seeds: int, is_begun: bool = True) -> None:
+    def add(self, rows: tuple[str, ...], at: _At, seeds: int, is_begun: bool = True) -> None:
         asked = self.begun if is_begun else self.others
-        asked.setdefault((self.scale, rows, seeds), []).append(scene)
+        asked.setdefault((self.scale, rows, seeds, at.where), []).append(at.scene)
 
     def elsewhere(self, rows: tuple[str, ...], scene: str) -> None:
         """Ask for the whole schedule, at the scale that has it, on this scene or on all of its scenes."""
         scenes = tuple(scale_named(JUDGE).factors)
         for one in (scene,) if scene in scenes else scenes:
-            self.begun.setdefault((JUDGE, rows, _FIRST_SEEDS), []).append(one)
+            self.begun.setdefault((JUDGE, rows, _FIRST_SEEDS, ""), []).append(one)
 
     def commands(self) -> list[str]:
         asked = [*self.begun.items(), *self.others.items()]
-        return [command(scale, rows, dict.fromkeys(scenes), seeds) for (scale, rows, seeds), scenes in asked]
+        return [command(scale, rows, dict.fromkeys(of), seeds, where) for (scale, rows, seeds, where), of in asked]
 
 
 def _seeds_at_first(noise: Noise) -> int:
@@ -267,8 +293,12 @@ def _scenes(question: Question, found: Groups, scale: str) -> list[str]:
     return list(dict.fromkeys(named))
 
 
-def _on_one_machine(used: Mapping[str, Group]) -> dict[str, Group]:
-    """Keep the runs on that machine, engine and number of threads on which most rows were timed."""
-    best = most_timed_on((row, run) for row, group in used.items() for run in group.runs)
-    kept = {row: tuple(r for r in group.runs if r.is_timed and r.trained_on == best) for row, group in used.items()}
-    return {row: Group(runs) for row, runs in kept.items() if runs}
+def _on_one_machine(there: Mapping[str, Group]) -> tuple[str, dict[str, Group]]:
+    """Name the machine, engine and number of threads on which most rows were timed, and keep the runs there."""
+    best = most_timed_on((row, run) for row, group in there.items() for run in group.runs)
+    kept = {row: tuple(r for r in group.runs if r.is_timed and r.trained_on == best) for row, group in there.items()}
+    return best or "", {row: Group(runs) for row, runs in kept.items() if runs}
+
+
+def _seeds(groups: Mapping[str, Group], row: str) -> set[int]:
+    return {run.seed for run in groups[row].runs} if row in groups else set()

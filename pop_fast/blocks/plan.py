@@ -151,7 +151,7 @@ def make_plan(capture: Capture, job: Job, test_every: int) -> Plan:
         test_every: which views are held out; see `Capture.test_views`.
 
     Raises:
-        PopError: there are no sparse points, or a block has no training view or no point.
+        PopError: there are no sparse points, or a block has no training view, no second view or no point.
     """
     if len(capture.points) == 0:
         raise PopError(
@@ -185,6 +185,11 @@ def make_plan(capture: Capture, job: Job, test_every: int) -> Plan:
             )
         outside = _evenly(np.flatnonzero(seen_by[number] & ~own[number]), len(inside))
         names = frozenset(view.name for view, place in zip(test, places, strict=True) if place == number)
+        if len(views[number]) + len(names) < 2:
+            raise PopError(
+                f"{capture.name}: block {name} of --blocks {job.blocks} has one view alone, and a training needs two; "
+                "ask for fewer blocks, a wider --blocks-margin or a smaller --blocks-share"
+            )
         points = np.concatenate([inside, outside])
         here = int(np.count_nonzero(stands == number))
         blocks.append(Block(name, frozenset(views[number]), here, names, points, len(outside)))

@@ -198,8 +198,10 @@ def write_round_block(
     had = [shot for shot in own.shots if shot.split == "train"]
     draw = np.random.default_rng([config.seed, number, names.index(name)])
     drawn = draw.permutation(len(showing))[: len(had)]
-    chosen = [shots[showing[index]] for index in sorted(drawn)] or had
-    write_block(place, replace(own, shots=[*chosen, *(shot for shot in own.shots if shot.split == "test")]))
+    chosen, out = [shots[showing[index]] for index in sorted(drawn)], [s for s in own.shots if s.split == "test"]
+    # a capture of one view is none
+    enough = chosen and len(chosen) + len(out) > 1
+    write_block(place, replace(own, shots=[*(chosen if enough else had), *out]))
 
 
 def hold_last(engine: Engine, rows: Mapping[str, Tensor]) -> Engine:

@@ -37,9 +37,9 @@ class Args:
 
 def run(argv: Sequence[str]) -> int:
     args = parse(Args, argv, "frames", examples=_EXAMPLES)
-    from pop_fast.data.unpack import take_frames
+    from pop_fast.data.unpack import frames_folder, take_frames
 
-    out = args.out or args.video.with_name(f"{args.video.stem}_frames")
+    out = args.out or frames_folder(args.video)
     with bars() as progress:
         found = take_frames(args.video, out, args.count, args.max_size, progress, overwrite=args.overwrite)
     resting = f"; the camera rested in {found.alike} stretches" if found.alike else ""

@@ -33,7 +33,7 @@ class Args:
     camera_model: str = SfmOptions.camera_model
     """COLMAP's name of the lens model: SIMPLE_RADIAL, OPENCV, OPENCV_FISHEYE, ..."""
     single_camera: bool | None = SfmOptions.single_camera
-    """All photographs share one camera; by default if all have the same size."""
+    """All photographs share one camera; by default if all have the same size and, by EXIF, the same lens."""
     matcher: Literal["auto", "exhaustive", "sequential"] = SfmOptions.matcher
     """Compare all pairs of photographs, or each with its neighbours by name; "auto" compares up to 60 with all."""
     seed: int = SfmOptions.seed
@@ -52,8 +52,8 @@ def run(argv: Sequence[str]) -> int:
         options = {field.name: getattr(args, field.name) for field in fields(SfmOptions)}
         found = run_sfm(args.photos, args.out, progress, overwrite=args.overwrite, **options)
     left = unreadable_photographs(photo_folder(args.photos))
-    if left:
-        print(f"note: {left}")
+    for note in (*found.notes, *([left] if left else [])):
+        print(f"note: {note}")
     print(
         f"{found.registered} of {found.photographs} photographs placed, {found.points:,} points, "
         f"mean reprojection error {found.reprojection_error:.2f} px -> {found.capture}"

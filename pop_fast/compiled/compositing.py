@@ -16,7 +16,6 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from pop_fast.compiled.library import PROJECTION_CONSTANTS, call_library, this_library
 from pop_fast.stages import compositing
@@ -27,7 +26,7 @@ from pop_fast.stages.harmonics import check_bands
 from pop_fast.stages.projection import intrinsics, view_dirs_vjp
 from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of
 from pop_fast.stages.tiles import TileLists, grid_size, listed_rows, tile_rects
-from pop_fast.stages.types import Camera
+from pop_fast.stages.types import Camera, way_back
 from pop_ref.constants import PAPER, Profile
 
 P = ParamSpec("P")
@@ -102,7 +101,7 @@ class _Composite(torch.autograd.Function):
         return (*results.values(), n_pairs.sum())
 
     @staticmethod
-    @once_differentiable
+    @way_back
     def backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
         options: BlendOptions = ctx.options
         inputs, kept, sink = ctx.saved_tensors[:4], ctx.saved_tensors[4:], options.absgrad_sink
@@ -203,7 +202,7 @@ class _Covariances(torch.autograd.Function):
         return covars
 
     @staticmethod
-    @once_differentiable
+    @way_back
     def backward(ctx: Any, v_covars: Tensor) -> tuple[Tensor, Tensor]:
         quats, scales = ctx.saved_tensors
         v_quats, v_scales = quats.new_empty(quats.shape), scales.new_empty(scales.shape)
@@ -234,7 +233,7 @@ class _Projection(torch.autograd.Function):
         return tuple(results.values())
 
     @staticmethod
-    @once_differentiable
+    @way_back
     def backward(
         ctx: Any,
         v_means2d: Tensor,
@@ -282,7 +281,7 @@ class _Colors(torch.autograd.Function):
         return colors.T
 
     @staticmethod
-    @once_differentiable
+    @way_back
     def backward(ctx: Any, v_colors: Tensor) -> tuple[Tensor | None, ...]:
         sh, means, viewmat, visible = ctx.saved_tensors
         v_sh, v_dirs = torch.empty_like(sh, memory_format=torch.contiguous_format), sh.new_empty((len(sh), 3))

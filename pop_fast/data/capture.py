@@ -384,7 +384,7 @@ class SfmOptions:
     Attributes:
         max_size: longest side at which features are looked for, px; cameras are always in full size.
         camera_model: COLMAP's name of the lens model.
-        single_camera: all photographs share one camera; by default when they are all of one size.
+        single_camera: all photographs share one camera; by default when they are of one size and, by EXIF, of one lens.
         matcher: "exhaustive" matches all photographs with all, "sequential" each with its neighbours by name; "auto"
             matches up to 60 exhaustively.
         seed: of every random choice.

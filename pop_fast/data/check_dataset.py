@@ -24,7 +24,7 @@ from pop_fast.data.photo_quality import (
     CaptureFinding,
     Shown,
     State,
-    about_mixed_sizes,
+    about_mixed_cameras,
     about_number,
     about_use,
     bad,
@@ -333,7 +333,7 @@ def about_bare(root: Path, shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     if enough:
         yield from about_number(len(sound))
     yield from about_use(sound)
-    mixed = about_mixed_sizes(sound)
+    mixed = about_mixed_cameras(sound)
     if mixed is not None:
         yield mixed
     left = unreadable_photographs(photo_folder(root))

@@ -273,14 +273,30 @@ def about_use(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
         yield bad("photographs", f"no cameras could be found: {text}; {FIX}")
 
 
-def about_mixed_sizes(shown: Sequence[Shown]) -> CaptureFinding | None:
-    """Tell that photographs of several sizes are taken to be of several cameras; None where they are of one."""
+def lens_numbers(shown: Sequence[Shown]) -> list[int]:
+    """Number the lenses of photographs: those of one size are of one, but for what their cameras noted. [P]"""
+    kinds = [_lens(one) for one in shown]
+    return [kinds.index(kind) for kind in kinds]
+
+
+def _lens(one: Shown) -> tuple[object, ...]:
+    focal = one.exif.focal
+    return one.size, one.exif.camera, None if focal is None else round(focal, 1), one.exif.focal_35
+
+
+def about_mixed_cameras(shown: Sequence[Shown]) -> CaptureFinding | None:
+    """Tell that photographs of several sizes or focal lengths are taken to be of several lenses; None where of one."""
     sizes = Counter(one.size for one in shown)
-    if len(sizes) < 2:
+    count = len(set(lens_numbers(shown)))
+    if count < 2:
         return None
-    listed = ", ".join(f"{count} of {w}x{h} px" for (w, h), count in sizes.most_common(3))
-    more = f" and {len(sizes) - 3} more" if len(sizes) > 3 else ""
-    text = f"mixed cameras: the photographs have {len(sizes)} sizes ({listed}{more}), each treated as another lens"
+    if len(sizes) > 1:
+        listed = ", ".join(f"{count} of {w}x{h} px" for (w, h), count in sizes.most_common(3))
+        more = f" and {len(sizes) - 3} more" if len(sizes) > 3 else ""
+        what = f"have {len(sizes)} sizes ({listed}{more})"
+    else:
+        what = f"are of {count} cameras or focal lengths by their EXIF"
+    text = f"mixed cameras: the photographs {what}, each treated as another lens"
     return warn("cameras", f"{text}; one camera, not zoomed or cropped, is placed more reliably")
 
 

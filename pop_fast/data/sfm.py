@@ -41,7 +41,7 @@ from pop_fast.data.cameras import require_colmap
 from pop_fast.data.capture import Progress, SfmOptions
 from pop_fast.data.colmap import quiet_colmap
 from pop_fast.data.exports import photographs_of_polycam
-from pop_fast.data.photo_quality import FIX, Shown, about_mixed_sizes, about_use, measure, number
+from pop_fast.data.photo_quality import FIX, Shown, about_mixed_cameras, about_use, lens_numbers, measure, number
 from pop_fast.errors import CaptureError
 from pop_fast.io.atomic import check_folder, folder_atomically
 from pop_fast.io.image_header import HEIF_SUFFIXES, is_heif, read_exif
@@ -104,7 +104,7 @@ def run_sfm(
         progress: called with (stage, done, total) while features, matches and cameras are found.
         max_size: as `SfmOptions`, and so the four below.
         camera_model: COLMAP's name.
-        single_camera: all photographs share one camera; by default when they are all of one size.
+        single_camera: all photographs share one camera; by default when they are of one size and, by EXIF, of one lens.
         matcher: which photographs are compared.
         seed: of every random choice.
         overwrite: replace an existing result, where it is nothing but that.
@@ -141,11 +141,12 @@ def run_sfm(
     hopeless = [finding.text for finding in about_use(shown) if finding.state == "bad"]
     if hopeless:
         raise CaptureError(f"{photos}: {'; '.join(hopeless)}")
-    mixed = about_mixed_sizes(shown)
+    mixed = about_mixed_cameras(shown)
     lenses: list[int] = []
     if single_camera is None:
         options = replace(options, single_camera=mixed is None)
-        lenses = [] if mixed is None else _lenses(shown)
+        # left to itself, COLMAP takes each photograph that says nothing of its camera to be of a lens of its own
+        lenses = [] if mixed is None else lens_numbers(shown)
     with folder_atomically(target, overwrite, recognise=own) as folder:
         sparse = folder if in_place else folder / "sparse"
         with tempfile.TemporaryDirectory(prefix="pop_sfm_") as work, quiet_colmap():
@@ -214,15 +215,6 @@ def _looked_at(photos: Path, names: list[Path], progress: Progress | None) -> li
             "checking photographs",
             progress,
         )
-
-
-def _lenses(shown: Sequence[Shown]) -> list[int]:
-    """Number the lenses of photographs: those of one size are of one, but for what their cameras noted.
-
-    Left to itself, COLMAP takes each photograph that says nothing of its camera to be of a lens of its own.
-    """
-    kinds = [(one.size, one.exif.camera, one.exif.focal) for one in shown]
-    return [kinds.index(kind) for kind in kinds]
 
 
 def _write_upright(sparse: Path, photos: Path, names: list[Path]) -> None:

@@ -49,7 +49,7 @@ def capture_folder(path: Path, progress: Progress | None = None) -> tuple[Path, 
     if not path.is_file():
         return path, None
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        target = path.with_name(f"{path.stem}_frames")
+        target = frames_folder(path)
         if _made_before(path, target):
             return target, f"{path}: its photographs are in {target} already"
         taken = take_frames(path, target, progress=progress)
@@ -61,6 +61,16 @@ def capture_folder(path: Path, progress: Progress | None = None) -> tuple[Path, 
             unpack(path, target)
         return _inmost(target), f"{path}: unpacked in {target}"
     return path, None
+
+
+def frames_folder(video: Path) -> Path:
+    """Name the folder of a video's frames beside it; by its whole name where another video differs in its suffix alone.
+
+    Otherwise `walk.mov` would be trained on by the frames of `walk.mp4`.
+    """
+    beside = (other for other in video.absolute().parent.glob("*") if other.suffix.lower() in VIDEO_SUFFIXES)
+    alone = not any(other.stem == video.stem and other.name != video.name for other in beside)
+    return video.parent / f"{video.stem if alone else video.name}_frames"
 
 
 def _made_before(path: Path, target: Path) -> bool:

@@ -80,7 +80,7 @@ _WIDTHS: Final = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 7: 1, 9: 4, 10: 8}
 _LETTERS: Final = {1: "B", 3: "H", 4: "I", 9: "i"}
 _WIDTH, _HEIGHT, _MAKE, _MODEL, _ORIENTATION, _EXIF_IFD = 0x100, 0x101, 0x10F, 0x110, 0x112, 0x8769
 _BITS, _SAMPLES = 0x102, 0x115
-_EXPOSURE, _ISO, _FOCAL = 0x829A, 0x8827, 0x920A
+_EXPOSURE, _ISO, _FOCAL, _FOCAL_35 = 0x829A, 0x8827, 0x920A, 0xA405
 # a JPEG holds its tags in segments of 64 kB before its pixels; TIFF and WebP may hold them anywhere
 _HEAD: Final = 2**20
 
@@ -96,6 +96,8 @@ class Exif:
     exposure: float | None = None  # seconds
     iso: float | None = None  # sensitivity
     focal: float | None = None  # focal length, mm
+    # of the lens that sees as much on 35 mm film, mm: a digital zoom changes this one alone
+    focal_35: float | None = None
 
 
 def read_size(path: Path) -> tuple[int, int] | None:
@@ -179,7 +181,7 @@ def read_exif(path: Path) -> Exif:
     # what libheif decodes has been turned already
     turned = 1 if upright else tags.get(_ORIENTATION, 1)
     orientation = int(turned) if turned in range(1, 9) else 1
-    return Exif(orientation, camera or None, *(_number(own, key) for key in (_EXPOSURE, _ISO, _FOCAL)))
+    return Exif(orientation, camera or None, *(_number(own, key) for key in (_EXPOSURE, _ISO, _FOCAL, _FOCAL_35)))
 
 
 def _number(tags: dict[int, Any], key: int) -> float | None:

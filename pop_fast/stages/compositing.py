@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from pop_fast.stages.blend import Blender, GroupBlend
 from pop_fast.stages.tile_groups import (
@@ -23,6 +22,7 @@ from pop_fast.stages.tile_groups import (
     tile_groups,
 )
 from pop_fast.stages.tiles import TileLists, check_grid
+from pop_fast.stages.types import way_back
 from pop_ref.constants import PAPER, Profile
 
 
@@ -124,7 +124,7 @@ class _Composite(torch.autograd.Function):
         return (*outputs, torch.tensor(pairs))
 
     @staticmethod
-    @once_differentiable
+    @way_back
     def backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
         saved: _Saved = ctx.saved
         options: BlendOptions = ctx.options

@@ -10,12 +10,15 @@ many columns it has, and then an invisible Gaussian would change the bits of tho
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import wraps
 from itertools import product
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,21 @@ class Camera:
     K: Tensor  # intrinsics, px. [3, 3]
     width: int  # px
     height: int  # px
+
+
+def way_back(backward: Callable[..., Any]) -> Callable[..., Any]:
+    """Make the way back of an autograd function: differentiable once, and in full precision.
+
+    A loss that goes back inside `torch.autocast` would have its matrix products in half precision: the mode is that of
+    the thread, whatever the way forth was in.
+    """
+
+    @wraps(backward)
+    def exact(ctx: Any, *cotangents: Tensor | None) -> Any:
+        with torch.autocast("cpu", enabled=False):
+            return backward(ctx, *cotangents)
+
+    return once_differentiable(exact)
 
 
 def columns(tensor: Tensor) -> tuple[Tensor, ...]:

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import conditions, estimates
+from benchmarks import conditions, estimates, sizes
 from benchmarks.few_photographs import left_of, table_of
 from benchmarks.record import read_json, write_json
 from paper_repro.results import read_all
@@ -397,6 +397,22 @@ def test_a_row_that_is_measured_again_has_its_own_machine_and_leaves_what_others
     known = read_json(path)
     assert known["one, 1"] == {"machine": {"cpu": "new", "commit": "b"}, **row}
     assert (known["machine"]["commit"], known["two, 1"]["steps"]) == ("a", 2)
+
+
+def test_sizes_that_are_kept_keep_their_machine_and_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, kept = tmp_path / "budgets.json", {"machine": {"cpu": "old"}, "steps": 7, "psnr": 20.0}
+    write_json(path, {"ply_bytes": 248, "captures": {"one": kept}})
+    for name, made in (
+        ("measured", lambda *_: {}),
+        ("resolved", lambda _: {"data": "two"}),
+        ("within_budgets", lambda *_: iter([{"psnr": 30.0}])),
+        ("machine", lambda: {"cpu": "new"}),
+    ):
+        monkeypatch.setattr(sizes, name, made)
+    monkeypatch.setattr(sys, "argv", ["sizes.py", "out", "--budgets", "--json", str(path)])
+    assert sizes.main() == 0
+    new = {"machine": {"cpu": "new"}, "steps": 300, "psnr": 30.0}
+    assert read_json(path) == {"ply_bytes": 248, "captures": {"one": kept, "two": new}}
 
 
 def test_what_was_foretold_of_four_captures_came_within_thirty_percent() -> None:

@@ -32,7 +32,7 @@ from pop_fast.blocks.rounds import write_round_block
 from pop_fast.blocks.run import TAKEN
 from pop_fast.children import module_command
 from pop_fast.cli import main
-from pop_fast.data.capture import Capture
+from pop_fast.data.capture import Capture, View
 from pop_fast.data.load import in_picture, list_capture, load_capture, write_block
 from pop_fast.errors import PopError
 from pop_fast.train.checkpoint import load_splats, save_checkpoint
@@ -467,6 +467,12 @@ def test_a_block_without_points_a_capture_without_any_and_numbers_out_of_range_a
     assert_one_line(lambda: planned(far), "has no sparse point", "fewer blocks")
     none = replace(capture, points=capture.points[:0], points_rgb=capture.points_rgb[:0])
     assert_one_line(lambda: planned(none), "no sparse points", "pop sfm")
+    # before anything is trained, since no capture has one view
+    few = tiny_capture(n_views=4)
+    places = np.concatenate([few.points, few.camera_centers])
+    around = replace(few, points=places, points_rgb=np.zeros(places.shape, np.uint8))
+    alone = partial(make_plan, around, Job(blocks="2x2", margin=0.0, share=1.0), 0)
+    assert_one_line(alone, "block 0_0", "one view alone", "--blocks-share")
     for name, value in (("margin", -0.1), ("margin", 1.5), ("share", 0.0), ("share", 1.1)):
         assert_one_line(partial(Job, blocks="2x2", **{name: value}), f"--blocks-{name} is {value}")
 
@@ -520,6 +526,11 @@ def test_a_round_draws_as_many_views_as_the_block_has_from_all_that_show_its_cor
     assert not names(1, "1_0") | names(2, "1_0") <= names(0, "1_0")
 
 
+def all_of(folder: Path) -> list[View]:
+    listed = [load_capture(block_folder(folder, name), photographs="none").train_views() for name in NAMES]
+    return list({view.name: view for views in listed for view in views}.values())
+
+
 def test_views_that_show_nothing_of_a_core_are_not_drawn(rounds):
     config, record = read_config(rounds), read_record(rounds) or CaptureRecord()
     every = load_capture(block_folder(rounds, "0_0", 0)).train_views()
@@ -531,6 +542,15 @@ def test_views_that_show_nothing_of_a_core_are_not_drawn(rounds):
     write_round_block(rounds, config, record, list(NAMES), "0_0", 7, alone)
     drawn = load_capture(block_folder(rounds, "0_0", 7), photographs="none")
     assert {view.name for view in drawn.train_views()} == showing
+    # one view, and none held out, would be no capture: the block keeps its own
+    place = block_folder(rounds, "0_0", 0) / "block.json"
+    listed = json.loads(place.read_text())
+    listed["photographs"] = [one for one in listed["photographs"] if one["split"] == "train"]
+    place.write_text(json.dumps(listed))
+    anywhere = np.random.default_rng(0).uniform(-9.0, 9.0, (999, 3)).astype(np.float32)
+    shown = np.sum([in_picture(anywhere.astype(np.float64), view) for view in all_of(rounds)], axis=0)
+    write_round_block(rounds, config, record, list(NAMES), "0_0", 8, anywhere[shown == 1][:1])
+    assert len(load_capture(block_folder(rounds, "0_0", 8), photographs="none").train_views()) == 7
 
 
 def test_the_merge_takes_a_share_of_what_every_block_has_changed(shared_rounds):

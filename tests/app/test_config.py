@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import zipfile
 from dataclasses import fields, replace
 from pathlib import Path
@@ -756,6 +757,13 @@ def test_a_video_is_a_folder_of_its_frames_the_second_time_too(tmp_path: Path) -
     again, said = capture_folder(film)
     assert (again, sorted(again.iterdir())) == (folder, taken)
     assert "already" in said
+    # another video of that name has frames of its own, and the first one its own, too
+    shutil.copy(film, tmp_path / "walk.avi")
+    assert [capture_folder(tmp_path / name)[0].name for name in ("walk.avi", "walk.webm")] == [
+        "walk.avi_frames",
+        "walk.webm_frames",
+    ]
+    (tmp_path / "walk.avi").unlink()
     os.utime(film, (folder.stat().st_mtime + 60.0,) * 2)
     with pytest.raises(CaptureError, match="is older than"):
         capture_folder(film)

@@ -299,6 +299,7 @@ def test_exposures_and_lenses_that_differ_are_told(check: Check, tmp_path: Path,
         Image.fromarray(picture).save(tmp_path / f"{i}.jpg", exif=exif, quality=95)
     lines = check(tmp_path)
     assert said(lines, "8 x Maker X; focal length 4 mm, 5 mm: several lenses")
+    assert said(lines, "mixed cameras: the photographs are of 2 cameras or focal lengths by their EXIF")
     assert said(lines, "exposures differ by 2.0 stops; lock the exposure, or train with --exposure")
     assert not said(lines, "no focal length")
     write_photograph(tmp_path / "edited.jpg", photograph(1, 160, 120))

@@ -169,7 +169,7 @@ def save(path: Path, orientation: int | None = None) -> Path:
     if orientation is not None:
         exif[0x10F], exif[0x110], exif[0x112] = "Maker", "Maker X", orientation
         if path.suffix != ".tif":  # Pillow copies the directory of the exposure into no TIFF
-            exif[0x8769] = {0x829A: IFDRational(1, 125), 0x8827: 400, 0x920A: IFDRational(17, 4)}
+            exif[0x8769] = {0x829A: IFDRational(1, 125), 0x8827: 400, 0x920A: IFDRational(17, 4), 0xA405: 26}
     lossless = {"lossless": True} if "lossless" in path.name else {}
     Image.fromarray(photograph(0, 61, 37)).save(path, exif=exif, **lossless)
     return path
@@ -183,7 +183,7 @@ def test_size_and_exif_are_read_of_every_format_no_orientation_is_obeyed_and_dam
     assert read_size(plain) == (61, 37)
     assert read_exif(plain) == Exif()
     stored = read_image(plain)
-    exposure = () if name.endswith("tif") else (0.008, 400.0, 4.25)
+    exposure = () if name.endswith("tif") else (0.008, 400.0, 4.25, 26.0)
     for orientation in range(1, 9):
         found = read_exif(save(tmp_path / name, orientation))
         assert found == Exif(orientation, "Maker X", *exposure) or name.endswith("bmp")
@@ -468,6 +468,8 @@ def test_the_command_writes_next_to_the_video_and_says_what_comes_next(clip: Pat
     assert "of 80 frames" in done.out
     says(pop("frames", video, "--count", "4"), str(folder))
     pop.done("frames", video, "--count", "4", "--overwrite")
+    for absent in (".", str(tmp_path / "no" / "walk.avi")):
+        says(pop("frames", absent), f"{absent}: no such file; give a video")
     assert len(list_images(folder)) <= 4
     (folder / "mine.jpg").write_bytes(b"mine")
     assert pop("frames", video, "--overwrite").status == 2

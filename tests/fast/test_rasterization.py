@@ -60,6 +60,23 @@ def cameras(count: int = 1, dtype: torch.dtype = torch.float64) -> dict[str, Ten
     return {"viewmats": viewmats, "Ks": K.repeat(count, 1, 1), "width": WIDTH, "height": HEIGHT}
 
 
+@pytest.mark.parametrize("backend", ["fast", "compiled"])
+def test_a_loss_that_goes_back_inside_autocast_has_the_same_gradients(backend: str) -> None:
+    def gradients(inside: bool) -> list[Tensor]:
+        given = {name: value.float() for name, value in scene().items()}
+        given |= {"colors": torch.rand((N, 9, 3), generator=torch.Generator().manual_seed(0)) - 0.5}
+        seen = cameras(dtype=torch.float32)
+        given["viewmats"] = seen.pop("viewmats")
+        leaves = {name: value.requires_grad_() for name, value in given.items()}
+        image = program(**leaves, **seen, sh_degree=2, backend=backend)[0]
+        with torch.autocast("cpu", enabled=inside):
+            (image * torch.linspace(-1.0, 1.0, image.numel()).view_as(image)).sum().backward()
+        return [value.grad for value in leaves.values()]
+
+    skip_without(backend)
+    assert all(map(torch.equal, gradients(True), gradients(False)))
+
+
 def test_packed_rows_cameras_and_batches_have_the_bits_of_each_alone() -> None:
     first, second, two = scene(1), scene(2), cameras(2)
     alone, _, meta = rasterization(**first, **two, packed=False)

@@ -112,7 +112,7 @@ def test_every_command_that_would_decide_is_one(capsys: pytest.CaptureFixture[st
     for claim in claims("small", found):
         for told in (claim.told, *claim.others):
             for line in told.deciders:
-                words = shlex.split(line)
+                words = shlex.split(line, comments=True)
                 assert words[:2] == ["pop-repro", "queue"]
                 assert main([*words[1:], *empty, "--list"]) == 0
                 assert capsys.readouterr().out.strip(), line
@@ -303,9 +303,31 @@ def test_times_compare_on_one_machine_and_not_by_the_clock_of_a_cpu() -> None:
     assert (told.verdict, told.told.evidence) == ("not decided", ())
     # two seeds of gsplat are there, and a queue would not train them again
     assert told.told.deciders[0].startswith("pop-repro queue --scale small --data DATA --rows 3dgs gsplat pup ")
-    assert told.told.deciders[0].endswith("--scenes fox --seeds 3")
+    assert told.told.deciders[0].endswith(f"--scenes fox --seeds 3  # on {pop[0].trained_on}")
     by_clock = [replace(r, seconds={k: v for k, v in r.seconds.items() if k != "cpu"}) for r in other]
     assert judged("fast", [*pop, *by_clock]).verdict == "not decided"
+
+
+def test_the_runs_that_are_told_to_decide_which_is_faster_do_so_where_seeds_were_timed_elsewhere() -> None:
+    def timed(row: str, seed: int, cpu: float) -> Result:
+        return whole(row, seed=seed, seconds={"load": 1.0, "evaluate": 1.0, "train": cpu, "cpu": cpu})
+
+    pop = [timed("pop", seed, cpu) for seed, cpu in ((42, 95.0), (43, 105.0))]
+    others = [timed(row, seed, cpu) for row in METHODS for seed, cpu in ((42, 101.0), (43, 111.0))]
+    # seeds that the queue finds done, and that do not count
+    elsewhere = [replace(timed("taming", seed, 50.0), machine="another") for seed in range(44, 60)]
+    found = [*pop, *others, *elsewhere]
+    told = judged("fast", found).told
+    assert (told.verdict, told.evidence[0].why) == ("not decided", "within the noise of the seeds")
+    (enough,) = told.enough
+    assert enough == told.deciders[0]
+    line, _, where = enough.partition("  # on ")
+    assert where == pop[0].trained_on
+    seeds = int(line.rpartition(" --seeds ")[2])
+    done = {(r.row, r.seed) for r in found}
+    new = [(row, seed) for row in ("pop", *METHODS) for seed in range(42, 42 + seeds) if (row, seed) not in done]
+    more = [timed(row, seed, 100.0 if row == "pop" else 106.0) for row, seed in new]
+    assert judged("fast", [*found, *more]).verdict == "holds"
 
 
 def test_comparable_is_read_off_the_papers_own_differences() -> None:
