@@ -70,10 +70,8 @@ def _visible(folder: Path) -> list[Path]:
     """List the files of a folder and its subfolders, which may be links to elsewhere, without what is hidden."""
     known, found = [folder.resolve()], list[Path]()
     for place, folders, files in os.walk(folder, followlinks=True):
-        found += [Path(place, name) for name in files if not name.startswith(".")]
-        folders[:] = [
-            name for name in sorted(folders) if not name.startswith(".") and _leads_on(Path(place, name), known)
-        ]
+        found += [Path(place, name) for name in files if name[0] != "."]
+        folders[:] = [name for name in sorted(folders) if name[0] != "." and _leads_on(Path(place, name), known)]
     return found
 
 
