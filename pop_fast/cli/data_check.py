@@ -64,11 +64,12 @@ def run(argv: Sequence[str]) -> int:
 def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
     """Examine a capture, or photographs alone; all findings in reading order."""
     from pop_fast.data import check_dataset
+    from pop_fast.data.load import find_listing
     from pop_fast.data.photo_quality import CaptureFinding, about_quality, bad, measure_file, number, warn
+    from pop_fast.data.read_images import find_photographs
     from pop_fast.data.sfm import photo_folder, photographs
-    from pop_fast.io.images import find_image
 
-    listing = check_dataset.read_listing(root, images)
+    listing = find_listing(root, images=images)
     if listing is None:
         folder = photo_folder(root)
         files = photographs(folder)
@@ -86,11 +87,12 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
     findings += check_dataset.about_cameras(shots)
     findings += check_dataset.about_places(shots, cloud)
     findings += check_dataset.about_spacing(shots)
-    paths = {id(shot): find_image(root / shot.folder, shot.file) for shot in shots}
+    found = find_photographs(root, shots, images)
+    paths = {id(shot): path for shot, path in zip(shots, found, strict=True)}
     photos, damage = _each(
         shots, lambda shot: check_dataset.read_photo(shot, paths[id(shot)], cloud), lambda shot: paths[id(shot)]
     )
-    findings += check_dataset.about_photos(photos, root)
+    findings += check_dataset.about_photos(photos, root, images)
     findings += [bad("photographs", problem) for problem in damage]
     findings += about_quality([photo.shown for photo in photos if photo.shown is not None])
     findings += check_dataset.about_drift(photos)

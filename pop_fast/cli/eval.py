@@ -81,7 +81,8 @@ def measured(splat: Splat, options: CaptureOptions, nets: Sequence[LPIPS]) -> tu
     capture, config = open_with_bars(splat, options, "held out")
     views = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
     if not views:
-        raise PopError(f"{capture.name}: no view is held out; give --test-every 8 or another number over 0")
+        fix = "its own lists name none" if capture.has_own_split else "give --test-every 8 or another number over 0"
+        raise PopError(f"{capture.name}: no view is held out; {fix}")
     small = too_small(views)
     if small is not None:
         raise PopError(f"{capture.name}: {small}; use larger images (a lower --factor)")

@@ -165,7 +165,7 @@ class Limited:
         before, after = len(kept), int(kept.sum())
         self.said.append(f"{what}: {after:,} of {before:,} Gaussians kept")
         if after == 0 and before > 0:
-            raise PopError(f"{what} leaves no Gaussian of {before:,}; ask for less")
+            raise PopError(f"{what} leaves no Gaussian of {before:,}; loosen that limit")
         self.params = {name: value[kept] for name, value in self.params.items()}
 
     def write(self, out: Path, output: Output) -> None:

@@ -299,16 +299,14 @@ def with_size(config: TrainConfig, options: Any) -> TrainConfig:
 def photographs_of(config: TrainConfig, options: Any) -> list[Path]:
     """List the photographs that a run will read, at their full size."""
     from pop_fast.data.load import find_listing
+    from pop_fast.data.read_images import find_photographs
     from pop_fast.data.sfm import photo_folder, photographs
-    from pop_fast.io.images import find_image
 
     root = Path(config.data)
     listing = find_listing(root, options.source, options.images)
     if listing is None:
         return photographs(photo_folder(root))
-    folder = options.images
-    found = (find_image(root / (shot.folder if folder is None else folder), shot.file) for shot in listing.shots)
-    return [path for path in found if path is not None]
+    return [path for path in find_photographs(root, listing.shots, options.images) if path is not None]
 
 
 def with_length(config: TrainConfig, capture: Capture, options: Any) -> tuple[TrainConfig, tuple[str, ...]]:

@@ -144,4 +144,8 @@ class LiveView:
 def check_viewer(options: Any) -> None:
     """Refuse a viewer that cannot be before the minutes of loading, not after."""
     if options.view:
-        check_address(options.view_host, options.view_port)
+        try:
+            check_address(options.view_host, options.view_port)
+        except PopError as error:
+            # a training's options have longer names
+            raise PopError(str(error).replace("--host", "--view-host").replace("--port", "--view-port")) from error

@@ -144,9 +144,14 @@ class Capture:
         centers = self.camera_centers
         return float(1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
 
+    @property
+    def has_own_split(self) -> bool:
+        """Whether the capture's own lists say which views are held out, and `test_every` says nothing."""
+        return any(view.split is not None for view in self.views)
+
     def train_views(self, test_every: int = 8) -> tuple[View, ...]:
         """Select the views to train on: all that `test_views` leaves, validation views apart."""
-        if any(view.split is not None for view in self.views):
+        if self.has_own_split:
             return tuple(view for view in self.views if view.split == "train")
         return tuple(view for i, view in enumerate(self.views) if test_every <= 0 or i % test_every != 0)
 

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from pop_fast.data.capture import (
     FAR_APART,
-    Listing,
     PosedImage,
     SparsePoints,
     nearest_cameras,
     normalizing_transform,
 )
 from pop_fast.data.colmap import find_model
-from pop_fast.data.load import find_listing
 from pop_fast.data.photo_quality import (
     UNEVEN,
     CaptureFinding,
@@ -35,10 +33,10 @@ from pop_fast.data.photo_quality import (
     ok,
     warn,
 )
-from pop_fast.data.read_images import fix_of_absent, read_fitting_mask, undistortion
+from pop_fast.data.read_images import find_masks, fix_of_absent, read_fitting_mask, undistortion
 from pop_fast.data.sfm import photo_folder
 from pop_fast.errors import CaptureError
-from pop_fast.io.images import find_image, list_images, read_image, read_mask, unreadable_photographs
+from pop_fast.io.images import list_images, read_image, read_mask, unreadable_photographs
 
 # bytes of a Gaussian in training: 59 float32 numbers, each with its gradient and two moments of Adam
 BYTES_IN_TRAINING = 59 * 4 * 4
@@ -60,14 +58,6 @@ class Photo:
     shown: Shown | None = None
     # brightness at the points that the shot sees, stops; None where that is not known
     levels: np.ndarray | None = None
-
-
-def read_listing(root: Path, images: str | None = None) -> Listing | None:
-    """Read where photographs were taken, as training does; `images` is their folder in place of the listed one."""
-    listing = find_listing(root, images=images)
-    if listing is None or images is None:
-        return listing
-    return replace(listing, shots=[replace(shot, folder=images) for shot in listing.shots])
 
 
 def read_photo(shot: PosedImage, path: Path | None, cloud: SparsePoints | None = None) -> Photo:
@@ -143,13 +133,16 @@ def about_spacing(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:
     yield warn("spacing", f"{apart}: far; photographs between these would help most: {wide}")
 
 
-def about_photos(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding]:
-    """Tell which photographs are absent, damaged, of another size, rotated by EXIF, or not listed."""
+def about_photos(photos: Sequence[Photo], root: Path, images: str | None = None) -> Iterator[CaptureFinding]:
+    """Tell which photographs are absent, damaged, of another size, rotated by EXIF, or not listed.
+
+    They are those in the folder `images` in place of the listed ones if given.
+    """
     yield _listed(photo.size for photo in photos if photo.size != (0, 0))
     absent = [photo for photo in photos if photo.path is None]
     if absent:
         names = ", ".join(photo.shot.name for photo in absent[:3])
-        fix = fix_of_absent(root, [photo.shot for photo in absent], len(photos))
+        fix = fix_of_absent(root, [photo.shot for photo in absent], [photo.shot for photo in photos])
         yield bad("photographs", f"{len(absent)} of {len(photos)} listed are absent, first {names}; {fix}")
     for photo in photos:
         if photo.path is not None and photo.problem:
@@ -166,7 +159,7 @@ def about_photos(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding
     with_alpha = sum(photo.alpha for photo in photos)
     if with_alpha:
         yield ok("alpha", f"{with_alpha} photographs have it: composited over the background, no mask")
-    yield from _about_unlisted(photos, root)
+    yield from _about_unlisted(photos, root, {images} if images else {photo.shot.folder for photo in photos})
 
 
 def _listed(sizes: Iterable[tuple[int, int]]) -> CaptureFinding:
@@ -198,9 +191,9 @@ def _about_sizes(photos: Sequence[Photo]) -> Iterator[CaptureFinding]:
         yield bad("sizes", f"{count}, {fix}; first {odd[0]}")
 
 
-def _about_unlisted(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding]:
+def _about_unlisted(photos: Sequence[Photo], root: Path, folders: set[str]) -> Iterator[CaptureFinding]:
     used = {photo.path.resolve() for photo in photos if photo.path is not None}
-    for folder in sorted({photo.shot.folder for photo in photos}):
+    for folder in sorted(folders):
         if folder and (root / folder).is_dir():
             spare = [path.name for path in list_images(root / folder) if path.resolve() not in used]
             if spare:
@@ -212,8 +205,8 @@ def about_masks(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding]
     folder = root / "masks"
     kept: list[float] = []
     lone: list[str] = []
-    for photo in photos:
-        path = photo.shot.mask or (find_image(folder, photo.shot.file) if folder.is_dir() else None)
+    found = find_masks(folder if folder.is_dir() else None, [photo.shot for photo in photos])
+    for photo, path in zip(photos, found, strict=True):
         if path is None:
             lone.append(photo.shot.name)
             continue

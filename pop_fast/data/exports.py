@@ -460,9 +460,23 @@ def _read_listing(path: Path, listing: dict[str, Any], split: Split | None) -> l
         fields = _fields(listing, frame)
         angle = _angle(where, fields)
         camera = None if angle is not None else _camera(where, fields, index + 1)
-        folder, file = name.split("/", 1) if "/" in name and not name.startswith("/") else ("", name)
-        shots.append(PosedImage(name, folder, file, camera, _transform_viewmat(where, frame), angle, mask, own))
+        shots.append(PosedImage(name, *_placed(name), camera, _transform_viewmat(where, frame), angle, mask, own))
     return shots
+
+
+def _placed(name: str) -> tuple[str, str]:
+    """Split the name of a photograph into the folder that may be replaced by another one, and the name in there.
+
+    That is the first folder below the list, or below folders above it; of an absolute name all but the file's own.
+    """
+    if name.startswith("/"):
+        folder, _, file = name.rpartition("/")
+        return folder or "/", file
+    parts = name.split("/")
+    first = 1 + next((i for i, part in enumerate(parts) if part != ".."), 0)
+    return (
+        ("/".join(parts[:first]), "/".join(parts[first:])) if len(parts) > first else ("/".join(parts[:-1]), parts[-1])
+    )
 
 
 def _fields(listing: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:

@@ -16,9 +16,11 @@ from __future__ import annotations
 
 import math
 import threading
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from os.path import splitext
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,7 +32,7 @@ from pop_fast.data.cameras import make_camera
 from pop_fast.data.capture import PosedImage, Progress, View
 from pop_fast.errors import CaptureError
 from pop_fast.io.image_header import read_size
-from pop_fast.io.images import find_image, in_threads, read_image, read_mask, sound_jpegs
+from pop_fast.io.images import IMAGE_SUFFIXES, find_image, in_threads, read_image, read_mask, sound_jpegs
 
 
 @dataclass(frozen=True)
@@ -100,27 +102,26 @@ def _locate(
 ) -> tuple[list[_Photo], list[str]]:
     """Pair every listed name with its file and its mask, by name."""
     photos: list[_Photo] = []
-    absent: list[PosedImage] = []
-    masks = root / "masks" if options.masks and (root / "masks").is_dir() else None
-    for shot in shots:
+    absent: list[tuple[PosedImage, Path]] = []
+    folder = root / "masks" if options.masks and (root / "masks").is_dir() else None
+    masks = find_masks(folder, shots) if options.masks else [None] * len(shots)
+    elsewhere = names_elsewhere(shots)
+    for shot, mask in zip(shots, masks, strict=True):
         chosen, shrink = _image_folder(root, shot.folder, options)
-        path = find_image(root / chosen, shot.file)
+        names = [shot.file] if options.images is None else elsewhere(shot)
+        path = _find_first(root / chosen, names)
         if path is None:
-            absent.append(replace(shot, folder=chosen))
+            absent.append((shot, root / chosen / names[-1]))
             continue
-        mask = None
-        if options.masks:
-            mask = shot.mask or (find_image(masks, shot.file) if masks else None)
         photos.append(_Photo(shot, path, mask, shrink))
     if absent and (options.missing == "error" or not photos):
-        first = root / absent[0].folder / absent[0].file
         raise CaptureError(
-            f"{listing}: lists {len(shots)} images, {len(absent)} of them absent, first {first}; "
-            f"{fix_of_absent(root, absent, len(shots))}"
+            f"{listing}: lists {len(shots)} images, {len(absent)} of them absent, first {absent[0][1]}; "
+            f"{fix_of_absent(root, [shot for shot, _ in absent], shots)}"
         )
-    if masks and not options.part and not any(photo.mask for photo in photos):
+    if folder and not options.part and not any(photo.mask for photo in photos):
         raise CaptureError(
-            f"{masks}: holds no mask named like a photograph (<name>.png or <name>.jpg.png); rename them"
+            f"{folder}: holds no mask named like a photograph (<name>.png or <name>.jpg.png); rename them"
         )
     notes = [f"{len(absent)} of {len(shots)} listed images are absent and were skipped"] if absent else []
     notes += _about_folders(root, shots, options)
@@ -132,15 +133,58 @@ def _locate(
     return photos, notes
 
 
-def fix_of_absent(root: Path, absent: Sequence[PosedImage], listed: int) -> str:
-    """Say what helps against photographs that are not where their list says, of so many that it lists.
+def names_elsewhere(shots: Sequence[PosedImage]) -> Callable[[PosedImage], list[str]]:
+    """Tell under which names the mask of a shot of a list, or a copy of its photograph, is looked for in its folder.
+
+    That of the file alone, where it is in one folder of the list only: cameras with a folder each name their
+    photographs alike. Else, or besides, behind its folder's own name.
+    """
+
+    def stem(shot: PosedImage) -> str:
+        # an extension is what files are not told apart by
+        return splitext(shot.file)[0] if shot.file.lower().endswith(IMAGE_SUFFIXES) else shot.file
+
+    folders = Counter(name for _, name in {(shot.folder, stem(shot)) for shot in shots})
+
+    def names(shot: PosedImage) -> list[str]:
+        last = Path(shot.folder).name
+        alone = folders[stem(shot)] < 2 or not last
+        return [*([shot.file] if alone else []), *([f"{last}/{shot.file}"] if last not in ("", "..") else [])]
+
+    return names
+
+
+def _find_first(folder: Path, names: Sequence[str]) -> Path | None:
+    return next((path for name in names if (path := find_image(folder, name)) is not None), None)
+
+
+def find_photographs(root: Path, shots: Sequence[PosedImage], images: str | None = None) -> list[Path | None]:
+    """Find the photographs of a list at their full size, in the folder `images` in place of the listed ones if given.
+
+    None where one is absent.
+    """
+    if images is None:
+        return [find_image(root / shot.folder, shot.file) for shot in shots]
+    elsewhere = names_elsewhere(shots)
+    return [_find_first(root / images, elsewhere(shot)) for shot in shots]
+
+
+def find_masks(folder: Path | None, shots: Sequence[PosedImage]) -> list[Path | None]:
+    """Find the mask of each shot of a list: the one that the list names, else one in a folder of masks, if any."""
+    elsewhere = names_elsewhere(shots)
+    return [shot.mask or (_find_first(folder, elsewhere(shot)) if folder else None) for shot in shots]
+
+
+def fix_of_absent(root: Path, absent: Sequence[PosedImage], shots: Sequence[PosedImage]) -> str:
+    """Say what helps against photographs that are not where their list says, of all shots that it lists.
 
     Where all are absent, the folder that holds one of that name: the capture's own, or one in it.
     """
-    if len(absent) < listed:
+    if len(absent) < len(shots):
         return "restore them or pass --missing skip"
+    names = names_elsewhere(shots)(absent[0])
     for folder in (root, *sorted(path for path in root.iterdir() if path.is_dir())):
-        if find_image(folder, absent[0].file) is not None:
+        if _find_first(folder, names) is not None:
             return f"{absent[0].file} lies in {folder}: pass --images {folder.relative_to(root).as_posix()}"
     return "restore them"
 

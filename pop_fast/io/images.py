@@ -67,8 +67,23 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def _visible(folder: Path) -> list[Path]:
-    """List what is in a folder and its subfolders, without what is hidden."""
-    return [file for file in folder.rglob("*") if not any(p.startswith(".") for p in file.relative_to(folder).parts)]
+    """List the files of a folder and its subfolders, which may be links to elsewhere, without what is hidden."""
+    known, found = [folder.resolve()], list[Path]()
+    for place, folders, files in os.walk(folder, followlinks=True):
+        found += [Path(place, name) for name in files if name[0] != "."]
+        folders[:] = [name for name in sorted(folders) if name[0] != "." and _leads_on(Path(place, name), known)]
+    return found
+
+
+def _leads_on(folder: Path, known: list[Path]) -> bool:
+    """Tell whether a subfolder is to be listed: a link into, around or again to what is `known` lists nothing twice."""
+    if not folder.is_symlink():
+        return True
+    target = folder.resolve()
+    if any(target.is_relative_to(other) or other.is_relative_to(target) for other in known):
+        return False
+    known.append(target)
+    return True
 
 
 def _files_ending(suffixes: Sequence[str], paths: Sequence[Path]) -> list[Path]:

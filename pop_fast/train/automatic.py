@@ -247,10 +247,15 @@ def _said(config: TrainConfig) -> Mapping[str, Any]:
 
 
 def about_held_out(capture: Capture, config: TrainConfig) -> str | None:
-    """Say what holding out costs where photographs are few and it was not requested; else None."""
+    """Say what holding out costs where photographs are few and it was not requested, or that a request is void."""
     held_out, count = len(capture.test_views(config.test_every)), len(capture.views)
-    own = any(view.split is not None for view in capture.views)
-    if own or not held_out or count > FEW or "test_every" in _said(config):
+    asked = "test_every" in _said(config)
+    if asked and capture.has_own_split:
+        return (
+            f"the capture's own lists hold out {held_out} of {count} photographs; --test-every {config.test_every} "
+            "changes nothing, so edit these lists instead"
+        )
+    if capture.has_own_split or not held_out or count > FEW or asked:
         return None
     are = "is" if held_out == 1 else "are"
     return (

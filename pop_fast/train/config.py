@@ -87,7 +87,8 @@ class TrainConfig:
             Mip-NeRF 360 brings (A32).
         coarse_stop_iters: coarse to fine: the steps before each of these see the photographs shrunk by 2 once more, so
             that (300, 600) shrinks by 4 until step 300 and by 2 until step 600; none in preset "paper".
-        test_every: every n-th view by file name is held out; 0 holds nothing out.
+        test_every: every n-th view by file name is held out, 0 for none; of a capture that lists those views itself,
+            the listed ones.
         background: colour behind everything, and behind photographs with alpha. [0, 1]
         normalize: move the capture into gsplat's normalised world.
         sh_degree: highest band of the colours.

@@ -57,7 +57,7 @@ class CaptureOptions:
     factor: int | None = None
     """Photographs are shrunk by this factor."""
     test_every: int | None = None
-    """Every n-th view by file name is held out."""
+    """Every n-th view by file name is held out; of a capture that lists those views itself, the listed ones."""
     images: str | None = None
     """Read the photographs from this folder of the capture."""
     missing: Literal["error", "skip"] | None = None

@@ -135,7 +135,10 @@ class TrainingRun:
         self._train = [ViewTensors.of(view, dtype, points) for view in capture.train_views(config.test_every)]
         self._test = [ViewTensors.of(view, dtype) for view in capture.test_views(config.test_every)]
         if not self._train:
-            raise PopError(f"{capture.name}: has no view to train on; lower test_every or set it to 0")
+            fix = "--test-every 1 holds all out: use 8, or 0 for none"
+            if capture.has_own_split:
+                fix = "its own lists hold all out: name photographs to train on there"
+            raise PopError(f"{capture.name}: has no view to train on; {fix}")
         check_views(config, capture.name, self._train, self._test)
         self._nets = load_nets(config.lpips_vgg, config.lpips_alex, [(view.height, view.width) for view in self._test])
         self.appearance = Appearance(config, self._train)

@@ -112,7 +112,8 @@ def planned_views(capture: Capture, config: TrainConfig, path: str, frames: int)
     if path == "views":
         views = [ViewTensors.of(view) for view in capture.test_views(config.test_every)]
         if not views:
-            raise PopError(f"{capture.name}: no view is held out; give --test-every 8, or --path orbit")
+            instead = "--path orbit" if capture.has_own_split else "--test-every 8, or --path orbit"
+            raise PopError(f"{capture.name}: no view is held out; give {instead}")
         return views
     if frames < 1:
         raise PopError(f"frames is {frames}; give --frames 1 or more")

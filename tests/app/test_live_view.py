@@ -228,9 +228,10 @@ def test_without_viser_one_line_says_how_to_get_it(pop, shared_result, shared_ca
     assert not (tmp_path / "r").exists()
 
 
-def test_a_port_that_cannot_be_is_refused(pop: Pop, shared_result: Path) -> None:
+def test_a_port_that_cannot_be_is_refused(pop: Pop, shared_result: Path, shared_capture: Path) -> None:
     for port in (0, 65536):
         says(pop("view", shared_result, "--port", port), f"port is {port}; give --port")
+    says(pop("train", shared_capture, "--view", "--view-port", 0), "port is 0; give --view-port a number")
 
 
 @pytest.mark.parametrize("lone", [False, True])

@@ -62,6 +62,17 @@ def test_masks_are_found_under_all_usual_names_and_white_means_keep(tmp_path: Pa
     assert np.array_equal(small, mask[::2, ::2] > 0)
 
 
+def test_folders_that_are_links_are_listed_once(tmp_path: Path) -> None:
+    photos, disk = tmp_path / "photos", tmp_path / "disk"
+    for path in (photos / "cam0" / "1.png", disk / "cam1" / "1.png", disk / ".hidden" / "1.png"):
+        write_photograph(path, photograph(1))
+    for name, target in {"cam1": disk / "cam1", "cam2": disk / "cam1", "own": photos / "cam0", "up": tmp_path}.items():
+        (photos / name).symlink_to(target)
+    (photos / "broken.png").symlink_to(tmp_path / "nothing.png")
+    found = [path.relative_to(photos).as_posix() for path in list_images(photos)]
+    assert found == ["cam0/1.png", "cam1/1.png"]
+
+
 def test_masks_that_fit_no_photograph_or_hide_all_of_it_are_refused(root: Path) -> None:
     write_photograph(root / "masks" / "elsewhere.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
     assert_one_line(lambda: raw(root), "masks", "no mask named like a photograph")

@@ -20,7 +20,8 @@ from pop_fast.errors import PopError
 from pop_fast.io import heartbeat
 from pop_fast.io.heartbeat import Heartbeat, bars, duration
 from pop_fast.io.ply import load_ply
-from pop_fast.train import TrainingRun
+from pop_fast.train import TrainConfig, TrainingRun
+from pop_fast.train.automatic import about_held_out
 from pop_fast.train.evaluate import average, measure, population, psnr
 from pop_fast.train.model import KEYS, adam_step, first_non_finite, make_optimizers
 from pop_fast.train.schedule import steady_updates
@@ -270,7 +271,14 @@ def test_a_capture_without_points_or_views_and_an_impossible_opacity_are_refused
     assert_one_line(lambda: initialize_params(empty), "scene", "no points")
     assert_one_line(lambda: initialize_params(capture, init_opacity=1.0), "init_opacity", "between 0 and 1")
     all_held_out = tiny_config(tmp_path, test_every=1)
-    assert_one_line(lambda: TrainingRun(all_held_out, tiny_capture()), "no view to train on")
+    assert_one_line(lambda: TrainingRun(all_held_out, tiny_capture()), "no view to train on", "use 8, or 0")
+    # the capture's own lists go before test_every, and that is said
+    views = [replace(view, split="test") for view in tiny_capture().views]
+    own = replace(tiny_capture(), views=tuple(views))
+    assert_one_line(lambda: TrainingRun(tiny_config(tmp_path), own), "no view to train on", "its own lists")
+    given = TrainConfig.of(test_every=0)
+    assert "5 of 5 photographs; --test-every 0 changes nothing" in str(about_held_out(own, given))
+    assert about_held_out(own, tiny_config(tmp_path)) is None
 
 
 # What is measured: PSNR, SSIM, counts of the Gaussians, and averages.

@@ -231,6 +231,53 @@ def test_masks_named_by_a_frame_are_read(root: Path) -> None:
     assert_one_line(lambda: raw(root), "absent.png")
 
 
+def in_folders(root: Path, names: list[str]) -> None:
+    """Move the photographs to other places, by names from the capture's folder, and list them there."""
+
+    def moved(listing: dict[str, Any]) -> None:
+        for frame, name in zip(listing["frames"], names, strict=True):
+            (root / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.move(root / frame["file_path"], root / name)
+            frame["file_path"] = name
+
+    edit_transforms(root, moved)
+
+
+def test_cameras_with_a_folder_each_may_name_their_photographs_alike(root: Path) -> None:
+    names = [f"cam{i % 2}/{i // 2}.png" for i in range(len(list((root / "images").iterdir())))]
+    in_folders(root, names)
+    keep = {name: np.full((HEIGHT, WIDTH), 255, np.uint8) for name in names}
+    for i, (name, mask) in enumerate(keep.items()):
+        mask[:, : 5 * i] = 0
+        write_photograph(root / "masks" / name, mask)
+        write_photograph(root / "small" / name, photograph(20 + i))
+    views = {view.name: view for view in raw(root, images="small").views}
+    for i, (name, mask) in enumerate(keep.items()):
+        assert np.array_equal(views[name].mask, mask > 0)
+        assert np.array_equal(views[name].image, photograph(20 + i))
+    # what lies there without the cameras' folders could be anyone's
+    for folder in ("masks", "small"):
+        shutil.copytree(root / folder / "cam0", root / f"{folder}_of_one")
+    assert_one_line(lambda: raw(root, images="small_of_one"), "small_of_one/cam0/0.png", "pass --images .")
+    shutil.rmtree(root / "masks")
+    (root / "masks_of_one").rename(root / "masks")
+    assert_one_line(lambda: raw(root), "masks", "no mask named like a photograph")
+
+
+@pytest.mark.parametrize("place", ["", "../", "absolute"])
+def test_a_photograph_is_not_its_own_mask_wherever_it_lies(tmp_path: Path, place: str) -> None:
+    root = transforms_capture(tmp_path / "scene")
+    folder = f"{root.resolve()}/images/" if place == "absolute" else f"{place}images/"
+    in_folders(root, names := [f"{folder}{path.name}" for path in sorted((root / "images").iterdir())])
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, :10] = 0
+    for name in names:
+        write_photograph(root / "masks" / Path(name).name, mask)
+        write_photograph(root / "small" / Path(name).name, photograph(33))
+    assert all(np.array_equal(view.mask, mask > 0) for view in raw(root).views)
+    assert all(np.array_equal(view.image, photograph(33)) for view in raw(root, images="small").views)
+
+
 def test_every_name_of_a_list_from_windows_may_have_backslashes(root: Path) -> None:
     write_photograph(root / "masks of it" / "m.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
     (root / "points").mkdir()
