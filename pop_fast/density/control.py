@@ -127,8 +127,9 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         return weighs and self.pop_start_iter <= step < self.pop_stop_iter
 
     def collects(self, step: int) -> bool:
-        """Tell whether screen gradients are collected at this step."""
-        return step < self.refine_stop_iter
+        """Tell whether a window's statistics are collected at this step: while a change or the POP loss reads them."""
+        read_by_prior = self.pop_views == "window" and step < self.pop_stop_iter
+        return read_by_prior or step < self.refine_stop_iter
 
     def collects_blur(self, step: int) -> bool:
         """Tell whether the blur flags of the window are collected at this step."""
@@ -214,7 +215,7 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         return self.change(params, optimizers, state, step)
 
     def collect(self, params: Params, state: State, step: int, info: Info, packed: bool = False) -> None:
-        """Add what a view has shown to the window's statistics, which lie in `state`; none from `refine_stop_iter` on.
+        """Add what a view has shown to the window's statistics, which lie in `state`, where `collects` says so.
 
         Args:
             params: raw parameters, after the optimizers' step.
