@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import importlib
 import itertools
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -101,8 +102,8 @@ def gsplat_torch(name: str, dtype: str) -> TorchAdapter:
 
 
 def constants_of(version: str) -> Profile:
-    """Return the constants of a version of gsplat, written as 1.5.3."""
-    return GSPLAT_1_6 if tuple(int(part) for part in version.split(".")[:2]) >= (1, 6) else GSPLAT_1_5
+    """Return the constants of a version of gsplat, written as 1.5.3 or 1.6rc1."""
+    return GSPLAT_1_6 if tuple(int(part) for part in re.findall(r"\d+", version)[:2]) >= (1, 6) else GSPLAT_1_5
 
 
 def gsplat_cuda(name: str) -> TorchAdapter:

@@ -58,7 +58,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--program-timeout", metavar="SECONDS", type=float, default=60.0, help="for each of its answers, default 60"
     )
     group.addoption("--stages", metavar="PACKAGE", help="a package whose stage modules carry the oracle's names")
-    group.addoption("--dtype", default="float32", choices=["float32", "float64"], help="precision of --rasterizer")
+    group.addoption(
+        "--dtype", choices=["float32", "float64"], help="precision of --rasterizer and --strategy; default float32"
+    )
     group.addoption(
         "--device", help="torch device of --rasterizer; by default the CPU, or a GPU where it draws on that alone"
     )
@@ -109,7 +111,9 @@ def pytest_report_header(config: pytest.Config) -> list[str]:
         return []
     from pop_ref.conformance.scorecard import introduction
 
-    return [line for backend in _chosen_backends(config) for line in introduction(backend)]
+    backends, option = _chosen_backends(config), config.getoption
+    of_options = backends[-1] if option("--rasterizer") or option("--stages") else None
+    return [line for backend in backends for line in introduction(backend, backend is of_options)]
 
 
 def _chosen(config: pytest.Config) -> str:
@@ -167,6 +171,16 @@ def _chosen_backends(config: pytest.Config) -> list[Any]:
     return cached
 
 
+def _require_a_reader(option: Any) -> None:
+    """Raise ValueError where an option is given that nothing of what is chosen reads."""
+    if option("--rasterizer") or option("--stages"):
+        return
+    own = ("--profile", "--device", "--unordered-sums", *([] if option("--strategy") else ["--dtype"]))
+    unread = [name for name in own if option(name)]
+    if unread:
+        raise ValueError(f"{unread[0]} is read with --rasterizer; backends, adapters and programs say it themselves")
+
+
 def _make_backends(config: pytest.Config) -> list[Any]:
     from pop_ref.conformance.backends import (
         Unavailable,
@@ -183,19 +197,21 @@ def _make_backends(config: pytest.Config) -> list[Any]:
 
     try:
         option: Any = config.getoption
+        dtype = option("--dtype") or "float32"
+        _require_a_reader(option)
         chosen = [shipped_or_absent(name) for name in option("--backend")] + [
             made_by(path) for path in option("--adapter")
         ]
-        chosen += [strategy_named(path, option("--dtype")) for path in option("--strategy")]
+        chosen += [strategy_named(path, dtype) for path in option("--strategy")]
         chosen += [ProgramAdapter(command, option("--program-timeout")) for command in option("--program")]
         path, package = option("--rasterizer"), option("--stages")
         if path or package:
-            own_profile, own_device = usual(path, option("--dtype")) if path else ("paper", "cpu")
+            own_profile, own_device = usual(path, dtype) if path else ("paper", "cpu")
             profile = profile_named(option("--profile") or own_profile)
             name, device = path or package, option("--device") or own_device
             # whoever was found to draw on a GPU alone adds by atomics, as far as anybody knows
             ordered = not option("--unordered-sums") and (device == "cpu" or bool(option("--device")))
-            chosen.append(adapter_for(path, name, package, option("--dtype"), device, profile, ordered))
+            chosen.append(adapter_for(path, name, package, dtype, device, profile, ordered))
             require_a_picture(chosen[-1])
     except (Unavailable, ProgramError, ValueError) as error:
         raise pytest.UsageError(str(error)) from error
@@ -307,7 +323,7 @@ class _Recorder:
             raise pytest.UsageError(f"scorecard {self.path} cannot be written: {error.strerror}") from error
         single = option("--rasterizer") or option("--stages")
         profile = getattr(_chosen_backends(config)[-1], "profile", None) if single else None
-        how = f", {option('--dtype')}, profile {profile.name if profile else 'any'}" if single else ""
+        how = f", {option('--dtype') or 'float32'}, profile {profile.name if profile else 'any'}" if single else ""
         self.card = Scorecard(f"{_chosen(config) or 'oracle'}{how}")
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:

@@ -243,8 +243,13 @@ dt{{margin-top:.5rem}} dd{{margin-left:1rem}}
 </style><h1>{title}</h1>"""
 
 
-def introduction(backend: Any) -> list[str]:
-    """Return the lines that a session begins with: what is judged, as what, by how many laws, and what is not."""
+def introduction(backend: Any, of_options: bool = False) -> list[str]:
+    """Return the lines that a session begins with: what is judged, as what, by how many laws, and what is not.
+
+    Args:
+        backend: an adapter, or an `Absent`.
+        of_options: whether options say its precision, constants and device.
+    """
     if hasattr(backend, "reason"):
         return [f"conformance: {backend.name} is not judged: {backend.reason}"]
     laws = list(every_law().values())
@@ -252,7 +257,7 @@ def introduction(backend: Any) -> list[str]:
     degree = getattr(backend, "sh_degree", 3)
     as_what += [f"harmonics up to degree {degree}"] if degree < 3 else []
     as_what += [f"on {backend.device}"] if hasattr(backend, "device") else []
-    otherwise = "" if backend.profile is None else " (--dtype, --profile, --device say otherwise)"
+    otherwise = " (--dtype, --profile, --device say otherwise)" if of_options and backend.profile else ""
     lines = [f"conformance: {backend.name}, {', '.join(as_what)}{otherwise}"]
     judged = [law for law in laws if not missing(backend, law.needs)]
     lines.append(f"  judged: {len(judged)} of {len(laws)} laws, of {_listed({law.stage for law in judged})}")

@@ -33,7 +33,7 @@ from pop_ref.conformance.backends import (
     shipped_or_absent,
 )
 from pop_ref.conformance.failure_report import failure_report
-from pop_ref.conformance.foreign_adapters import inria
+from pop_ref.conformance.foreign_adapters import constants_of, inria
 from pop_ref.conformance.law import missing
 from pop_ref.conformance.laws.test_whole import test_an_empty_scene_is_the_background as empty_scene_law
 from pop_ref.conformance.mutants import MUTANTS, living
@@ -276,6 +276,11 @@ def fixed(profile: str) -> TorchAdapter:
         return image, alphas, {"means2d": meta["means2d"], "radii": meta["radii"]}
 
     return TorchAdapter(f"fixed {profile}", rasterization, profile=PROFILES[profile])
+
+
+def test_a_version_of_gsplat_that_is_no_release_has_constants() -> None:
+    of = [constants_of(version) for version in ("1.5.3+pt24", "1.6rc1", "2.0a1", "1.10.0")]
+    assert of == [GSPLAT_1_5, GSPLAT_1_6, GSPLAT_1_6, GSPLAT_1_6]
 
 
 @pytest.mark.parametrize("profile", ["gsplat_1_6", "inria"])

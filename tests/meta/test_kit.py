@@ -256,6 +256,18 @@ REFUSED = {
     ("--rasterizer", "numpy"): "'numpy' must be written module:name, as my.module:rasterization",
     ("--rasterizer", "math:exp"): "math:exp draws nothing on cpu: a first small picture raises TypeError",
     ("--rasterizer", "math:exp", "--profile", "gsplat_2"): "profile 'gsplat_2' is unknown; use one of paper",
+    (
+        "--backend",
+        "oracle",
+        "--profile",
+        "inria",
+    ): "--profile is read with --rasterizer; backends,",
+    (
+        "--program",
+        "true",
+        "--dtype",
+        "float64",
+    ): "--dtype is read with --rasterizer; backends,",
     ("--adapter", "pathlib:Path"): "pathlib:Path makes no adapter: it has no dtype",
     ("--backend", "gsplt"): "backend 'gsplt' is unknown; use one of oracle, fast64",
     ("--scorecard", "card.txt"): "scorecard card.txt must end in .json or .html",
