@@ -52,6 +52,8 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 # what cameras write and nothing here reads: HEIF without pillow-heif, and raw formats
 _UNREADABLE = (".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
 VIDEO_SUFFIXES = (".mov", ".mp4", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp")
+# what `pop train` writes tells a result
+_OF_A_RESULT: Final = ("cfg.json", "capture.json")
 FIX = "copy it again from its source, or remove it from the capture"
 
 
@@ -67,7 +69,10 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def _visible(folder: Path) -> list[Path]:
-    """List the files of a folder and its subfolders, which may be links to elsewhere, without what is hidden."""
+    """List the files of a folder and its subfolders, which may be links to elsewhere.
+
+    Left out is what is hidden, and subfolders that are results of a training.
+    """
     known, found = [folder.resolve()], list[Path]()
     for place, folders, files in os.walk(folder, followlinks=True):
         found += [Path(place, name) for name in files if name[0] != "."]
@@ -76,7 +81,13 @@ def _visible(folder: Path) -> list[Path]:
 
 
 def _leads_on(folder: Path, known: list[Path]) -> bool:
-    """Tell whether a subfolder is to be listed: a link into, around or again to what is `known` lists nothing twice."""
+    """Tell whether a subfolder is to be listed.
+
+    A link into, around or again to what is `known` would list files twice. The renders of a result are no photographs,
+    and may lie among them, as `pop train .` writes `out` where it is called.
+    """
+    if all((folder / name).is_file() for name in _OF_A_RESULT):
+        return False
     if not folder.is_symlink():
         return True
     target = folder.resolve()

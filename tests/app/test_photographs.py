@@ -62,6 +62,16 @@ def test_masks_are_found_under_all_usual_names_and_white_means_keep(tmp_path: Pa
     assert np.array_equal(small, mask[::2, ::2] > 0)
 
 
+def test_renders_of_a_result_among_the_photographs_are_none_of_them(tmp_path: Path) -> None:
+    for name in ("1.png", "out/run/renders/1.png", "more/1.png"):
+        write_photograph(tmp_path / name, photograph(1))
+    for name in ("out/run/cfg.json", "out/run/capture.json", "more/capture.json"):
+        (tmp_path / name).write_text("{}")
+    assert [path.relative_to(tmp_path).as_posix() for path in list_images(tmp_path)] == ["1.png", "more/1.png"]
+    # given itself, it is a folder as any other
+    assert len(list_images(tmp_path / "out" / "run")) == 1
+
+
 def test_folders_that_are_links_are_listed_once(tmp_path: Path) -> None:
     photos, disk = tmp_path / "photos", tmp_path / "disk"
     for path in (photos / "cam0" / "1.png", disk / "cam1" / "1.png", disk / ".hidden" / "1.png"):
