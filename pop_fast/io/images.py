@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import unicodedata
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -128,6 +129,11 @@ def unreadable_photographs(folder: Path) -> str | None:
     return "; ".join(changes) or None
 
 
+def composed(name: str) -> str:
+    """Write a name as everywhere but on a Mac, whose files have an umlaut as two characters: a letter and its dots."""
+    return unicodedata.normalize("NFC", name)
+
+
 def find_image(folder: Path, name: str) -> Path | None:
     """Find the file of an image by its relative name, under another image extension where the exact one is absent.
 
@@ -142,11 +148,11 @@ def find_image(folder: Path, name: str) -> Path | None:
     # nerfstudio and blender name frames with and without their extension, and raw photographs have been developed
     suffixes = readable_suffixes()
     named = exact.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES, *_UNREADABLE)
-    stems = {exact.stem, exact.name} if named else {exact.name}
+    stems = {composed(stem) for stem in ({exact.stem, exact.name} if named else {exact.name})}
     found = sorted(
         path
         for path in exact.parent.iterdir()
-        if path.stem in stems and path.suffix.lower() in suffixes and path.is_file()
+        if composed(path.stem) in stems and path.suffix.lower() in suffixes and path.is_file()
     )
     if len(found) > 1:
         raise CaptureError(
