@@ -45,7 +45,7 @@ from pop_fast.data.sfm import photo_folder, photographs, read_upright, run_sfm
 from pop_fast.errors import CaptureError, PopError
 from pop_fast.io.atomic import write_atomically, write_json
 from pop_fast.io.image_header import read_size
-from pop_fast.io.images import VIDEO_SUFFIXES, find_image, unreadable_photographs
+from pop_fast.io.images import VIDEO_SUFFIXES, composed, find_image, unreadable_photographs
 from pop_fast.io.read_back import read_arrays, read_json
 
 # the mean of the cameras' viewing directions, as unit vectors, is this long where they all look about the same way
@@ -67,9 +67,9 @@ def about_other_models(root: Path, models: Sequence[tuple[Path, int]]) -> list[s
 def about_unplaced(folder: Path, shots: Sequence[PosedImage]) -> tuple[int, list[str]]:
     """Count the photographs of a folder that have no camera among the shots that the model lists, and tell which."""
     # by stem too, because a photograph may have been converted since the model was made
-    placed = {name for shot in shots for name in (shot.file, splitext(shot.file)[0])}
+    placed = {composed(name) for shot in shots for name in (shot.file, splitext(shot.file)[0])}
     names = [path.relative_to(folder).as_posix() for path in photographs(folder)]
-    left = [name for name in names if not placed & {name, splitext(name)[0]}]
+    left = [name for name in names if not placed & {composed(name), composed(splitext(name)[0])}]
     if not left:
         return 0, []
     more = f" and {len(left) - _NAMED} more" if len(left) > _NAMED else ""

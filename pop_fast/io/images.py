@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import unicodedata
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -52,6 +53,8 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 # what cameras write and nothing here reads: HEIF without pillow-heif, and raw formats
 _UNREADABLE = (".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
 VIDEO_SUFFIXES = (".mov", ".mp4", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp")
+# what `pop train` writes tells a result
+_OF_A_RESULT: Final = ("cfg.json", "capture.json")
 FIX = "copy it again from its source, or remove it from the capture"
 
 
@@ -67,7 +70,10 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def _visible(folder: Path) -> list[Path]:
-    """List the files of a folder and its subfolders, which may be links to elsewhere, without what is hidden."""
+    """List the files of a folder and its subfolders, which may be links to elsewhere.
+
+    Left out is what is hidden, and subfolders that are results of a training.
+    """
     known, found = [folder.resolve()], list[Path]()
     for place, folders, files in os.walk(folder, followlinks=True):
         found += [Path(place, name) for name in files if name[0] != "."]
@@ -76,7 +82,13 @@ def _visible(folder: Path) -> list[Path]:
 
 
 def _leads_on(folder: Path, known: list[Path]) -> bool:
-    """Tell whether a subfolder is to be listed: a link into, around or again to what is `known` lists nothing twice."""
+    """Tell whether a subfolder is to be listed.
+
+    A link into, around or again to what is `known` would list files twice. The renders of a result are no photographs,
+    and may lie among them, as `pop train .` writes `out` where it is called.
+    """
+    if all((folder / name).is_file() for name in _OF_A_RESULT):
+        return False
     if not folder.is_symlink():
         return True
     target = folder.resolve()
@@ -117,6 +129,11 @@ def unreadable_photographs(folder: Path) -> str | None:
     return "; ".join(changes) or None
 
 
+def composed(name: str) -> str:
+    """Write a name as everywhere but on a Mac, whose files have an umlaut as two characters: a letter and its dots."""
+    return unicodedata.normalize("NFC", name)
+
+
 def find_image(folder: Path, name: str) -> Path | None:
     """Find the file of an image by its relative name, under another image extension where the exact one is absent.
 
@@ -131,11 +148,11 @@ def find_image(folder: Path, name: str) -> Path | None:
     # nerfstudio and blender name frames with and without their extension, and raw photographs have been developed
     suffixes = readable_suffixes()
     named = exact.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES, *_UNREADABLE)
-    stems = {exact.stem, exact.name} if named else {exact.name}
+    stems = {composed(stem) for stem in ({exact.stem, exact.name} if named else {exact.name})}
     found = sorted(
         path
         for path in exact.parent.iterdir()
-        if path.stem in stems and path.suffix.lower() in suffixes and path.is_file()
+        if composed(path.stem) in stems and path.suffix.lower() in suffixes and path.is_file()
     )
     if len(found) > 1:
         raise CaptureError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 import tracemalloc
+import unicodedata
 from pathlib import Path
 
 import cv2
@@ -60,6 +61,28 @@ def test_masks_are_found_under_all_usual_names_and_white_means_keep(tmp_path: Pa
     assert raw(root, masks=False).views[1].mask is None
     small = raw(root, factor=2).views[1].mask
     assert np.array_equal(small, mask[::2, ::2] > 0)
+
+
+def test_names_with_umlauts_are_found_whether_a_mac_wrote_the_files_or_their_list(tmp_path: Path) -> None:
+    listed, stored = ([unicodedata.normalize(form, f"Tür {i}.png") for i in range(3)] for form in ("NFC", "NFD"))
+    assert listed != stored
+    for one, other in ((listed, stored), (stored, listed)):
+        root = colmap_capture(tmp_path / one[0], names=one)
+        for old, new in zip(one, other, strict=True):
+            (root / "images" / old).rename(root / "images" / new)
+        capture = raw(root)
+        assert [view.name for view in capture.views] == one
+        assert capture.unplaced == 0
+
+
+def test_renders_of_a_result_among_the_photographs_are_none_of_them(tmp_path: Path) -> None:
+    for name in ("1.png", "out/run/renders/1.png", "more/1.png"):
+        write_photograph(tmp_path / name, photograph(1))
+    for name in ("out/run/cfg.json", "out/run/capture.json", "more/capture.json"):
+        (tmp_path / name).write_text("{}")
+    assert [path.relative_to(tmp_path).as_posix() for path in list_images(tmp_path)] == ["1.png", "more/1.png"]
+    # given itself, it is a folder as any other
+    assert len(list_images(tmp_path / "out" / "run")) == 1
 
 
 def test_folders_that_are_links_are_listed_once(tmp_path: Path) -> None:
