@@ -125,7 +125,7 @@ def _name(written: object) -> str:
 
 _HEAD = 4096
 _EXPORT_XML = "export the cameras again (Agisoft XML)"
-_RADIAL = ("k1", "k2", "k3", "k4")
+_RADIAL, _TANGENTIAL = ("k1", "k2", "k3", "k4"), ("p1", "p2")
 
 
 def find_metashape(root: Path) -> Path | None:
@@ -569,6 +569,13 @@ def _focal(number: Numbers, focal: str, angle: str, size: float) -> float | None
 def _lens(
     where: str, model: str, number: Numbers
 ) -> tuple[Literal["PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"], list[float]]:
+    own = {"PINHOLE": (), "SIMPLE_PINHOLE": (), "OPENCV_FISHEYE": _RADIAL}.get(model, (*_RADIAL, *_TANGENTIAL))
+    foreign = (name for name in (*_RADIAL, *_TANGENTIAL) if name not in own)
+    if told := [name for name in foreign if number(name, 0.0)]:
+        raise CaptureError(
+            f"{where}: {told[0]} is {number(told[0])}, but camera_model {model} has no such term; "
+            f"remove {', '.join(told)} if the photographs are undistorted, else name the model OPENCV"
+        )
     if model.endswith("PINHOLE"):
         return "PINHOLE", []
     k1, k2, k3, k4 = (number(k, 0.0) for k in _RADIAL)
@@ -578,4 +585,5 @@ def _lens(
         raise CaptureError(
             f"{where}: k4 is {k4}; OPENCV's fourth radial term is not supported, calibrate with k1 to k3"
         )
-    return brown_lens((k1, k2, k3), (number("p1", 0.0), number("p2", 0.0)))
+    p1, p2 = (number(p, 0.0) for p in _TANGENTIAL)
+    return brown_lens((k1, k2, k3), (p1, p2))

@@ -121,7 +121,7 @@ def test_fields_of_a_frame_count_before_those_of_the_file(root: Path, own: dict[
         ({"k1": 0.1, "k3": 0.5, "p1": 0.3}, "FULL_OPENCV", [0.1, 0.0, 0.3, 0.0, 0.5, 0.0, 0.0, 0.0]),
         ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k4": 0.4}, "OPENCV_FISHEYE", [0.1, 0.0, 0.0, 0.4]),
         ({"is_fisheye": True, "k2": 0.1}, "OPENCV_FISHEYE", [0.0, 0.1, 0.0, 0.0]),
-        ({"camera_model": "PINHOLE", "k1": 0.1}, "PINHOLE", []),
+        ({"camera_model": "PINHOLE", "k1": 0.0, "p2": 0.0}, "PINHOLE", []),
     ],
 )
 def test_lenses_become_colmap_models(tmp_path: Path, fields: dict[str, Any], model: str, terms: list[float]) -> None:
@@ -389,6 +389,8 @@ BAD_FIELDS: dict[str, tuple[Edit, tuple[str, ...]]] = {
     "no height": (without("h"), ("frames[0]", "h is None")),
     "unknown lens": (frame(camera_model="PANINI"), ("frames[1]", "camera_model is 'PANINI'", "OPENCV")),
     "fourth radial term": (frame(k4=0.1), ("frames[1]", "k4 is 0.1")),
+    "terms of a pinhole": (frame(camera_model="PINHOLE", k1=0.1), ("frames[1]", "k1 is 0.1", "PINHOLE", "OPENCV")),
+    "p2 of a fisheye": (frame(camera_model="OPENCV_FISHEYE", p2=0.1), ("frames[1]", "p2 is 0.1")),
     "focal length of 400 digits": (frame(fl_x=10**400), ("frames[1]", "fl_x is 1000", "finite")),
     "matrix of 400 digits": (matrix(lambda m: [[10**400] * 4] * 4), ("frames[1]", "4x4")),
     "camera beyond the stars": (entry(0, 3, 1e200), ("frames[1]", "[0][3] is 1e+200", "within")),
