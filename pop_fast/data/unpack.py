@@ -114,8 +114,16 @@ def _left_out(member: zipfile.ZipInfo) -> bool:
     return member.is_dir() or any(part in _LEFT_OUT for part in PurePosixPath(member.filename).parts)
 
 
+def _name(member: zipfile.ZipInfo) -> str:
+    """Return a member's name: macOS writes UTF-8 without the flag that says so, and Python reads that as cp437."""
+    try:
+        return member.filename if member.flag_bits & 0x800 else member.filename.encode("cp437").decode()
+    except UnicodeError:
+        return member.filename
+
+
 def _inside(path: Path, member: zipfile.ZipInfo) -> str:
-    name = PurePosixPath(member.filename.replace("\\", "/"))
+    name = PurePosixPath(_name(member).replace("\\", "/"))
     if not name.parts or name.is_absolute() or ".." in name.parts or ":" in name.parts[0]:
         raise CaptureError(f"{path}: {member.filename!r} would be unpacked outside of its folder; {_FIX}")
     return str(name)

@@ -5,6 +5,7 @@ A run chooses where no schedule is said; its photographs may come as a video or 
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
@@ -712,6 +713,20 @@ def test_an_archive_trains_without_a_second_command(pop: Pop, shared_capture: Pa
     assert not (tmp_path / "toy_unpacked" / "__MACOSX").exists()
     # a second time it is there
     assert capture_folder(packed)[0] == folder
+
+
+def test_a_zip_of_macos_keeps_its_umlauts(tmp_path: Path) -> None:
+    names = ("Tür/ä 1.jpg", "plain.jpg")
+    for flag, name in itertools.product((True, False), names):
+        with zipfile.ZipFile(tmp_path / "a.zip", "w") as file:
+            file.writestr(name, b"x")
+        if not flag:  # macOS writes UTF-8, and does not say so: in the local header, and in the directory
+            data = bytearray((tmp_path / "a.zip").read_bytes())
+            for at in (6, data.index(b"PK\x01\x02") + 8):
+                data[at + 1] &= ~0x08
+            (tmp_path / "a.zip").write_bytes(data)
+        unpack(tmp_path / "a.zip", tmp_path / f"{flag}_{name[0]}")
+        assert (tmp_path / f"{flag}_{name[0]}" / name).is_file()
 
 
 def test_an_archive_that_leads_out_of_its_folder_fills_the_disk_or_is_damaged_is_refused(tmp_path: Path) -> None:
