@@ -78,7 +78,7 @@ WAITING: Final = ShortTraining(
     seed=126,
 )
 # of some the bands beyond the first wait while others are pruned
-OUTLASTED: Final = replace(WAITING, settings={**WAITING.settings, "final_prune_iter": 3, "final_prune_opa": 0.6})
+OUTLASTED: Final = replace(WAITING, settings={**WAITING.settings, "final_prune_iter": 2, "final_prune_opa": 0.6})
 # all bands, drawn one after the other, and no band but the first
 BANDS: Final = [replace(WAITING, degree=3, seed=10), replace(PRIOR, degree=0, seed=6, order=(0, 1, 0))]
 _GROWS: Final = {

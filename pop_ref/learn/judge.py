@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 
 from pop_ref.conformance.adapter import OracleAdapter
-from pop_ref.conformance.capabilities import DOMINANCE, GRADIENTS, RENDER, capabilities_of
+from pop_ref.conformance.capabilities import ALL_BANDS, DOMINANCE, GRADIENTS, RENDER, capabilities_of
 from pop_ref.conformance.capabilities import DOUBLE as IN_DOUBLE
 from pop_ref.conformance.law import Law, missing
 from pop_ref.conformance.laws import STANDS_IN
@@ -159,7 +159,7 @@ class _Judged(OracleAdapter):
 
     def has(self, need: str) -> bool:
         """Tell that the student has written it."""
-        return need in self.written or need in self.able or need == IN_DOUBLE or need in capabilities_of(PAPER)
+        return need in self.written or need in (*self.able, IN_DOUBLE, ALL_BANDS) or need in capabilities_of(PAPER)
 
     def stage(self, name: str) -> Callable[..., Any]:
         """Return the student's function, or the oracle's where a law needs more than the stage."""
