@@ -246,7 +246,7 @@ _KIT = {
     "vectors: a result as JSON": Reader("vectors", "port/loss_l1.json", _port, "text"),
     "scene": Reader("scenes/scene.npz", "", load_scene, "zip"),
     "learn: progress": Reader("course", ".progress.json", _course, "text"),
-    "learn: a submission": Reader("course", "alpha.py", _course, "text"),
+    "learn: a submission": Reader("course", "alpha.py", _course, "text", refuses=False),
     "learn: a submission that is run": Reader("course", "alpha.py", _submission, "text"),
     "GPU check: report": Reader("records/gpu_check_1.json", "", begun_report, "text", refuses=False),
     "GPU check: outcomes": Reader("records/laws.jsonl", "", outcomes, "text", refuses=False),
