@@ -138,7 +138,7 @@ class TorchAdapter(Adapter):
         return seen.with_overrides(tile_size=self.own_tile_size)
 
     @functools.cached_property
-    def sh_degree(self) -> int:  # type: ignore[override]
+    def sh_degree(self) -> int:  # type: ignore[override]  # other adapters state it; a rasterizer is asked when it is read
         """Give the highest degree of harmonics that the rasterizer does not refuse; it is asked once."""
         scene = under(golden_scene(), self.profile)
         sh = np.pad(scene.gaussians.sh, ((0, 0), (0, 12), (0, 0)))
