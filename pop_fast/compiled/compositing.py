@@ -26,7 +26,7 @@ from pop_fast.stages.harmonics import check_bands
 from pop_fast.stages.projection import intrinsics, view_dirs_vjp
 from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of
 from pop_fast.stages.tiles import TileLists, grid_size, listed_rows, tile_rects
-from pop_fast.stages.types import Camera, way_back
+from pop_fast.stages.types import Camera, full_precision_backward
 from pop_ref.constants import PAPER, Profile
 
 P = ParamSpec("P")
@@ -101,7 +101,7 @@ class _Composite(torch.autograd.Function):
         return (*results.values(), n_pairs.sum())
 
     @staticmethod
-    @way_back
+    @full_precision_backward
     def backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
         options: BlendOptions = ctx.options
         inputs, kept, sink = ctx.saved_tensors[:4], ctx.saved_tensors[4:], options.absgrad_sink
@@ -202,7 +202,7 @@ class _Covariances(torch.autograd.Function):
         return covars
 
     @staticmethod
-    @way_back
+    @full_precision_backward
     def backward(ctx: Any, v_covars: Tensor) -> tuple[Tensor, Tensor]:
         quats, scales = ctx.saved_tensors
         v_quats, v_scales = quats.new_empty(quats.shape), scales.new_empty(scales.shape)
@@ -233,7 +233,7 @@ class _Projection(torch.autograd.Function):
         return tuple(results.values())
 
     @staticmethod
-    @way_back
+    @full_precision_backward
     def backward(
         ctx: Any,
         v_means2d: Tensor,
@@ -281,7 +281,7 @@ class _Colors(torch.autograd.Function):
         return colors.T
 
     @staticmethod
-    @way_back
+    @full_precision_backward
     def backward(ctx: Any, v_colors: Tensor) -> tuple[Tensor | None, ...]:
         sh, means, viewmat, visible = ctx.saved_tensors
         v_sh, v_dirs = torch.empty_like(sh, memory_format=torch.contiguous_format), sh.new_empty((len(sh), 3))

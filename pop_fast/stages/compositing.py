@@ -22,7 +22,7 @@ from pop_fast.stages.tile_groups import (
     tile_groups,
 )
 from pop_fast.stages.tiles import TileLists, check_grid
-from pop_fast.stages.types import way_back
+from pop_fast.stages.types import full_precision_backward
 from pop_ref.constants import PAPER, Profile
 
 
@@ -124,7 +124,7 @@ class _Composite(torch.autograd.Function):
         return (*outputs, torch.tensor(pairs))
 
     @staticmethod
-    @way_back
+    @full_precision_backward
     def backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
         saved: _Saved = ctx.saved
         options: BlendOptions = ctx.options

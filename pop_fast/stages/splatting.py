@@ -37,7 +37,7 @@ from pop_fast.stages.projection import (
     view_dirs,
     view_dirs_vjp,
 )
-from pop_fast.stages.types import way_back
+from pop_fast.stages.types import full_precision_backward
 from pop_ref.constants import PAPER, Profile
 
 
@@ -118,7 +118,7 @@ class _Covariances(torch.autograd.Function):
         return covars_from_quats_scales(quats, scales)
 
     @staticmethod
-    @way_back
+    @full_precision_backward
     def backward(ctx: Any, v_covars: Tensor) -> tuple[Tensor, Tensor]:
         quats, scales = ctx.saved_tensors
         return covars_from_quats_scales_vjp(quats, scales, v_covars)
@@ -154,7 +154,7 @@ class _Projection(torch.autograd.Function):
         return means2d, depths.clone(), conics_from_covars2d(blurred), effective_opacities, radii, factors
 
     @staticmethod
-    @way_back
+    @full_precision_backward
     def backward(
         ctx: Any,
         v_means2d: Tensor,
@@ -199,7 +199,7 @@ class _Colors(torch.autograd.Function):
         return colors.T
 
     @staticmethod
-    @way_back
+    @full_precision_backward
     def backward(ctx: Any, v_colors: Tensor) -> tuple[Tensor | None, ...]:
         sh, means, viewmat, visible = ctx.saved_tensors
         v_sh_rows, v_dirs = evaluate_sh_vjp(ctx.evaluation, v_colors.T.index_select(1, visible))

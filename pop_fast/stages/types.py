@@ -42,16 +42,17 @@ class Camera:
     height: int  # px
 
 
-def way_back(backward: Callable[..., Any]) -> Callable[..., Any]:
-    """Make the way back of an autograd function: differentiable once, and in full precision.
+def full_precision_backward(backward: Callable[..., Any]) -> Callable[..., Any]:
+    """Make the backward pass of an autograd function differentiable once, and run it in full precision.
 
-    A loss that goes back inside `torch.autocast` would have its matrix products in half precision: the mode is that of
-    the thread, whatever the way forth was in.
+    A loss whose backward pass is called inside `torch.autocast` would have its matrix products in half precision: the
+    mode is that of the thread, whatever the forward pass ran in.
     """
 
     @wraps(backward)
     def exact(ctx: Any, *cotangents: Tensor | None) -> Any:
-        with torch.autocast("cpu", enabled=False):
+        device = next((v.device.type for v in cotangents if v is not None), "cpu")
+        with torch.autocast(device, enabled=False):
             return backward(ctx, *cotangents)
 
     return once_differentiable(exact)
