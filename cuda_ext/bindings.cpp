@@ -403,22 +403,6 @@ void bind_functions(nb::module_& m) {
         POP_CUDA(cudaDriverGetVersion(&version));
         return version;
     });
-    m.def("gather_rows", [](P source, P index, P target, int n, int row_floats, P stream) {
-        gather_rows(reinterpret_cast<const float*>(source), reinterpret_cast<const long long*>(index),
-                    reinterpret_cast<float*>(target), n, row_floats, as_stream(stream));
-    });
-    m.def("split_rows", [](P means, P quats, P log_scales, P normals, float shrink, P child_means, P child_log_scales,
-                           int n, P stream) {
-        split_rows(reinterpret_cast<const float*>(means), reinterpret_cast<const float*>(quats),
-                   reinterpret_cast<const float*>(log_scales), reinterpret_cast<const float*>(normals), shrink,
-                   reinterpret_cast<float*>(child_means), reinterpret_cast<float*>(child_log_scales), n,
-                   as_stream(stream));
-    });
-    m.def("reset_opacities", [](P param, P first, P second, int n, float logit, P stream) {
-        const AdamGroup group = {reinterpret_cast<float*>(param), reinterpret_cast<float*>(first),
-                                 reinterpret_cast<float*>(second)};
-        reset_opacities(group, n, logit, as_stream(stream));
-    });
 }
 
 }  // namespace

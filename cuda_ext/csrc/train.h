@@ -121,10 +121,5 @@ void count_important(const PopTerm& term, DeviceState* state, cudaStream_t strea
 void update(const UpdateArrays& arrays, const ViewArrays& view, const ProjectSettings& settings,
             const SplatArrays& splats, DeviceState* state, cudaStream_t stream);
 void end_step(const StepRecord& record, DeviceState* state, cudaStream_t stream);
-void gather_rows(const float* source, const long long* index, float* target, int n, int row_floats,
-                 cudaStream_t stream);
-void split_rows(const float* means, const float* quats, const float* log_scales, const float* normals, float shrink,
-                float* child_means, float* child_log_scales, int n, cudaStream_t stream);
-void reset_opacities(AdamGroup opacities, int n, float logit, cudaStream_t stream);
 
 }  // namespace pop

@@ -115,10 +115,13 @@ def python_path(*folders: Path) -> str:
 
 
 def all_lines(command: list[str]) -> list[str]:
-    """Return the lines that a command says, none where there is no such command or it fails."""
+    """Return the lines that a command says, none where there is no such command, or it fails or takes a minute."""
     if shutil.which(command[0]) is None:
         return []
-    done = subprocess.run(command, cwd=ROOT, text=True, capture_output=True, check=False)
+    try:
+        done = subprocess.run(command, cwd=ROOT, text=True, capture_output=True, check=False, timeout=QUERY_LIMIT_S)
+    except subprocess.TimeoutExpired:  # nvidia-smi waits for a driver that hangs
+        return []
     return done.stdout.strip().splitlines() if done.returncode == 0 else []
 
 
@@ -146,6 +149,7 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 SHORTEST = 3.0  # seconds with which a stage is begun at all
+QUERY_LIMIT_S = 60.0  # for a question to the machine, such as the card's name
 MARGIN = 3.0  # seconds that are kept for writing down the end
 
 

@@ -185,6 +185,8 @@ def test_a_commit_is_known_without_git(tmp_path, monkeypatch):
     assert first_line(["git", "-C", str(tmp_path), "rev-parse", "HEAD"]) is None
     assert first_line(["no-such-command"]) is None
     assert first_line(["printf", "one\ntwo\n"]) == "one"
+    monkeypatch.setattr(gpu_check_tools, "QUERY_LIMIT_S", 0.1)
+    assert first_line(["sleep", "60"]) is None  # a driver that hangs
 
 
 @pytest.mark.slow
