@@ -99,29 +99,41 @@ def markdown(scale: str, results: Iterable[Result]) -> str:
 
 
 def outcome(results: Iterable[Result]) -> str:
-    """Tell the claims that the paper's summary rests on, a line each, with intervals or the run that would decide."""
+    """Tell the claims that the paper's summary rests on, a line each, with intervals, and the runs that would decide.
+
+    A cell holds a verdict with, of each scene, the number that is nearest to its bound.
+    """
     found = list(results)
     by_scale = {scale: {c.id: c for c in claims(scale, found)} for scale in telling()}
-    return "\n".join(_outcome_line([(scale, by_id[id]) for scale, by_id in by_scale.items()]) for id in HEADLINES)
+    told = [deciding([(scale, by_id[id]) for scale, by_id in by_scale.items()]) for id in HEADLINES]
+    readings = sorted({other.reading for _, claim in told for other in claim.others})
+    lines = [
+        [f"{claim.says[0].upper()}{claim.says[1:]}", scale, _outcome_cell(claim.told)]
+        + [next((_outcome_cell(other) for other in claim.others if other.reading == name), "–") for name in readings]
+        for scale, claim in told
+    ]
+    deciders = dict.fromkeys(
+        command
+        for _, claim in told
+        for answer in (claim.told, *claim.others)
+        if answer.verdict == "not decided"
+        for command in answer.enough
+    )
+    table = grid(["claim", "scale", "verdict", *(f"under {name}" for name in readings)], lines)
+    if not deciders:
+        return table
+    return f"{table}\n\nThese runs would decide what is not decided:\n\n```sh\n{chr(10).join(deciders)}\n```"
+
+
+def _outcome_cell(told: Told) -> str:
+    numbers = [f"{e.scene}: {e.nearest}" for e in told.evidence if e.is_whole and e.nearest]
+    return "<br>".join([f"**{told.verdict}**", *numbers])
 
 
 def deciding(by_scale: Sequence[tuple[str, Claim]]) -> tuple[str, Claim]:
     """Choose the most telling scale that decides a claim, or else the scale that is meant to."""
     decided = [(scale, c) for scale, c in by_scale if c.verdict != "not decided"]
     return decided[0] if decided else next((scale, c) for scale, c in by_scale if scale == JUDGE)
-
-
-def _outcome_line(by_scale: Sequence[tuple[str, Claim]]) -> str:
-    scale, claim = deciding(by_scale)
-    line = f"- {claim.says[0].upper()}{claim.says[1:]}: **{claim.verdict}** at scale {scale}"
-    for told in (claim.told, *claim.others):
-        numbers = "; ".join(f"{e.scene} {e.nearest}" for e in told.evidence if e.is_whole and e.nearest)
-        if told.reading:
-            line += f"; under {told.reading} **{told.verdict}**"
-        line += f" ({numbers})" if numbers else ""
-        if told.verdict == "not decided" and told.enough:
-            line += f"; {' and '.join(f'`{command}`' for command in told.enough)} would decide it"
-    return line + "."
 
 
 def _one(claim: Claim) -> str:
