@@ -98,31 +98,38 @@ def markdown(scale: str, results: Iterable[Result]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def outcome(results: Iterable[Result]) -> str:
-    """Tell the claims that the paper's summary rests on, a line each, with intervals, and the runs that would decide.
-
-    A cell holds a verdict with, of each scene, the number that is nearest to its bound.
-    """
+def headlines(results: Iterable[Result]) -> list[tuple[str, Claim]]:
+    """Give the claims that the paper's summary rests on, each with the scale that says most about it."""
     found = list(results)
     by_scale = {scale: {c.id: c for c in claims(scale, found)} for scale in telling()}
-    told = [deciding([(scale, by_id[id]) for scale, by_id in by_scale.items()]) for id in HEADLINES]
+    return [deciding([(scale, by_id[id]) for scale, by_id in by_scale.items()]) for id in HEADLINES]
+
+
+def outcome(told: Sequence[tuple[str, Claim]]) -> str:
+    """Lay `headlines` out, a line each: a verdict with, of each scene, the number nearest to its bound."""
     readings = sorted({other.reading for _, claim in told for other in claim.others})
     lines = [
         [f"{claim.says[0].upper()}{claim.says[1:]}", scale, _outcome_cell(claim.told)]
         + [next((_outcome_cell(other) for other in claim.others if other.reading == name), "–") for name in readings]
         for scale, claim in told
     ]
-    deciders = dict.fromkeys(
+    return grid(["claim", "scale", "verdict", *(f"under {name}" for name in readings)], lines)
+
+
+def settled(told: Sequence[tuple[str, Claim]]) -> str:
+    """Lay `headlines` out, with the runs that would decide what is not decided."""
+    commands = dict.fromkeys(
         command
         for _, claim in told
         for answer in (claim.told, *claim.others)
         if answer.verdict == "not decided"
         for command in answer.enough
     )
-    table = grid(["claim", "scale", "verdict", *(f"under {name}" for name in readings)], lines)
-    if not deciders:
-        return table
-    return f"{table}\n\nThese runs would decide what is not decided:\n\n```sh\n{chr(10).join(deciders)}\n```"
+    parts = [outcome(told)]
+    if commands:
+        lines = "\n".join(["```sh", *commands, "```"])
+        parts += ["These runs would decide what is not decided:", lines]
+    return "\n\n".join(parts)
 
 
 def _outcome_cell(told: Told) -> str:
@@ -432,9 +439,9 @@ def files(results: Iterable[Result], folder: Path = HERE) -> dict[Path, str]:
     page, front = folder.parent / "docs" / "paper.md", folder.parent / "README.md"
     # only a clone has them
     if page.is_file():
-        told = outcome(found)
-        made[page] = with_part(with_part(_read(page), "reproduction", table), "settled", told)
-        made[front] = with_part(_read(front), "outcome", told)
+        told = headlines(found)
+        made[page] = with_part(with_part(_read(page), "reproduction", table), "settled", settled(told))
+        made[front] = with_part(_read(front), "outcome", outcome(told))
     return made
 
 

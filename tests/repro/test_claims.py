@@ -42,7 +42,18 @@ from paper_repro.jobs import ROWS, job_named, load_row
 from paper_repro.judging import OTHERS, judge
 from paper_repro.paper import paper
 from paper_repro.results import Result
-from paper_repro.status import READINGS, Answer, answers, columns, experiments, markdown, outcome, telling
+from paper_repro.status import (
+    READINGS,
+    Answer,
+    answers,
+    columns,
+    experiments,
+    headlines,
+    markdown,
+    outcome,
+    settled,
+    telling,
+)
 from tests.repro.made import WHOLE, curve, whole
 
 SCHEDULE = {
@@ -417,8 +428,8 @@ def test_a_toy_is_said_to_tell_nothing_and_other_data_to_be_a_yardstick() -> Non
 
 def outcome_cells(results: list[Result]) -> list[list[str]]:
     """Take the outcome's table apart: claim, scale, verdict, verdicts under other readings."""
-    table = outcome(results).split("\n\n")[0].splitlines()
-    return [line.strip("| ").split(" | ") for line in table[2:]]
+    table = outcome(headlines(results))
+    return [line.strip("| ").split(" | ") for line in table.splitlines()[2:]]
 
 
 def test_the_outcome_is_five_lines_each_with_an_interval_or_the_run_that_decides() -> None:
@@ -426,7 +437,7 @@ def test_the_outcome_is_five_lines_each_with_an_interval_or_the_run_that_decides
     assert len(lines) == len(HEADLINES) == 5
     assert all(line[1:3] == ["small", "**not decided**"] for line in lines)
     # one for each, and one for the claim that is told under another reading even where nothing was run
-    assert outcome([]).count("\npop-repro queue --scale small") == len(HEADLINES) + 1
+    assert settled(headlines([])).count("\npop-repro queue --scale small") == len(HEADLINES) + 1
     runs = [*two("pop", psnr=30.5), *two("reset"), *two("pop_size_prune", psnr=29.5), *two("3dgs", psnr=31.0)]
     reset, comparable = outcome_cells(runs)[4], outcome_cells(runs)[3]
     assert reset[0] == "POP is no worse than opacity reset in PSNR"
