@@ -407,7 +407,7 @@ class TrainingRun:
         ckpt.prune_checkpoints(self._results.path, self.config.keep_checkpoints, milestones)
 
     def _restore(self, path: Path) -> None:
-        content = ckpt.load_checkpoint(path)
+        content = ckpt.load_checkpoint(path, self.params)
         threads = torch.get_num_threads() if self._engine.depends_on_threads else None
         given = (self.config, self._fingerprint, threads, len(self._train), self.state.keys())
         ckpt.check_fits(path, content, *given)
