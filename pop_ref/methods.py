@@ -90,7 +90,8 @@ def _recipe_of(script: Script, extras: Extras) -> Recipe:
     updates = _taken(base.updates, settings)
     restarts = base.adam_restarts
     if script.method == "pup":
-        restarts = tuple(updates.rounds_start_iter + k * updates.round_steps for k in range(len(extras.prune_shares)))
+        rounds = range(len(extras.prune_shares) if updates.rounds_start_iter > 0 else 0)
+        restarts = tuple(updates.rounds_start_iter + k * updates.round_steps for k in rounds)
     if script.method == "mini-splatting":
         restarts = (*extras.reinit_iters, extras.sample_iter, extras.prune_iter)
     return replace(

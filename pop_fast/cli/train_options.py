@@ -162,6 +162,10 @@ def check_early(config: TrainConfig, source: Source, images: str | None, ranks: 
         for file in files:
             if not Path(file).is_file():
                 raise PopError(f"{file}: there is no such file of LPIPS weights; give {name} another, or leave it out")
+    if config.antialiased:
+        from pop_fast.train.preflight import check_method
+
+        check_method(config)
     if ranks is not None or config.batch_size > 1:
         from pop_fast.train.ranks import ALONE
         from pop_fast.train.torch_stepper import check_batch

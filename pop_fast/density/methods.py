@@ -269,7 +269,8 @@ class PupStrategy(InriaStrategy):
     @property
     def adam_restarts(self) -> tuple[int, ...]:
         """Return the first step of every round: it prunes, and moves nothing."""
-        return tuple(self.rounds_start_iter + k * self.round_steps for k in range(len(self.prune_shares)))
+        rounds = range(len(self.prune_shares) if self.rounds_start_iter > 0 else 0)
+        return tuple(self.rounds_start_iter + k * self.round_steps for k in rounds)
 
     def edit(self, context: DensificationContext) -> DensificationStep:
         """Refine and reset as 3DGS; at the beginning of a round prune and start Adam anew."""

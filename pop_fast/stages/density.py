@@ -130,7 +130,9 @@ def least_mass(importance: Tensor, share: float = 0.01) -> Tensor:
     _check_share(share)
     importance = _checked_weights("importance", importance)
     ascending = importance.sort().values + _SMALLEST_MASS
-    over = (ascending.cumsum(0) / ascending.sum() > share).nonzero()
+    mass = ascending.cumsum(0)
+    # a sum of its own would depend on the number of threads
+    over = (mass / mass[-1:] > share).nonzero()
     if len(over) == 0:
         return torch.ones_like(importance, dtype=torch.bool)
     return importance <= ascending[int(over[0])]

@@ -120,13 +120,18 @@ def mean_dissimilarity(
         dissimilarity, v_band = _compare_rows(d, moments, band, None if weight is None else weight / n)
         if kept is not None:
             dissimilarity, v_band = dissimilarity.mul_(kept[band]), [v.mul_(kept[band]) for v in v_band]
-        total += dissimilarity.sum(dtype=torch.float64)
+        total += _total(dissimilarity, torch.float64)
         if partials is not None:
             inner = partials[:, margin + band.start : margin + band.stop, margin * channels : margin * channels + cols]
             for plane, v in zip(inner, v_band, strict=True):
                 plane.copy_(v)
     value = (total / n).to(d.dtype)
     return value, None if partials is None else _gather(d, moments.target, partials).reshape(difference.shape)
+
+
+def _total(values: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+    """Sum row by row, and then the rows: a sum of all at once depends on the number of threads."""
+    return values.flatten(1).sum(1, dtype=dtype).sum()
 
 
 def check_size(image: Tensor, padding: Padding) -> None:
@@ -409,7 +414,7 @@ def _value_and_gradient(
         value = value + terms.d_ssim_weight * dissimilarity
     if terms.pixel_weight is not None:
         n = image.numel() if mask is None else max(int(mask.sum()), 1) * image.shape[2]
-        total = torch.sum(difference.abs() if terms.pixel == "l1" else difference * difference)
+        total = _total(difference.abs() if terms.pixel == "l1" else difference * difference)
         per_value = terms.pixel_weight / n
         value = value + per_value * total
         if want_grad:

@@ -96,11 +96,11 @@ class Appearance:
         return {name: {"value": param.detach(), **moments[name]} for name, param in self.params.items()}
 
     def load_state_dict(self, packed: Mapping[str, Mapping[str, Tensor]]) -> None:
-        """Put back what `state_dict` returned."""
-        self.params = {name: Parameter(found["value"]) for name, found in packed.items()}
+        """Put back a copy of what `state_dict` returned."""
+        self.params = {name: Parameter(found["value"].clone()) for name, found in packed.items()}
         self._optimizers = make_optimizers(self.params)
         for name, found in packed.items():
-            moments = {key: value for key, value in found.items() if key != "value"}
+            moments = {key: value.clone() for key, value in found.items() if key != "value"}
             self._optimizers[name].state[self.params[name]] = moments
 
     def by_view(self, views: Sequence[ViewTensors]) -> dict[str, Any]:

@@ -88,8 +88,12 @@ def save_checkpoint(path: Path, content: Mapping[str, Any]) -> None:
     write_atomically(path, write)
 
 
-def load_checkpoint(path: Path) -> dict[str, Any]:
+def load_checkpoint(path: Path, like: Mapping[str, Tensor] | None = None) -> dict[str, Any]:
     """Read a checkpoint of a training run, checked.
+
+    Args:
+        like: raw parameters of the run, whose precision and colour bands those of the file must have; None stands for
+            float32 and all bands.
 
     Raises:
         PopError: the file is absent, damaged, of another format, not a checkpoint of a training run, or holds what none
@@ -106,7 +110,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         raise PopError(f"{path}: has format {shown(content['format'])}; this version reads format {FORMAT}")
     named = _NAME.fullmatch(path.name)
     try:
-        content = check_content(content)
+        content = check_content(content, like)
         if named and content["step"] != int(named[1]):
             raise ValueError(f"step is {content['step']}; it must be {named[1]}, as the file's name says")
     except ValueError as error:
@@ -269,21 +273,20 @@ _FLOATS: Final = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 _OF_PHOTOGRAPHS: Final = {"exposures": (3, 4), "cameras": (6,)}
 _MOMENTS: Final = ("step", "exp_avg", "exp_avg_sq")
 _LONGEST: Final = 40  # letters of a value that a message shows
-# a strategy's numbers with one row a Gaussian
-_ROWS: Final = {
-    "grad2d": torch.float32,
-    "count": torch.float32,
-    "radii": torch.float32,
+# a strategy's numbers with one row a Gaussian, and their types; None is that of the parameters
+_ROWS: Final[Mapping[str, torch.dtype | None]] = {
+    **dict.fromkeys(("grad2d", "count", "radii")),
     "blurred": torch.bool,
     "dominant_sum": torch.int64,
 }
 
 
-def check_splats(splats: Any, kind: torch.dtype | None = None) -> dict[str, Tensor]:
+def check_splats(splats: Any, kind: torch.dtype | None = None, n_rest: int = 15) -> dict[str, Tensor]:
     """Check the raw parameters of a checkpoint.
 
     Args:
-        kind: the type that every tensor must have; None takes any floats, and 0, 3 or 8 in place of 15 coefficients.
+        kind: the type that every tensor must have; None takes any floats, and 0, 3, 8 or 15 coefficients.
+        n_rest: coefficients beyond the first band, where a type is given.
 
     Returns:
         The tensors under `KEYS`, contiguous, of the type `kind` or else float32; others are left out.
@@ -302,8 +305,9 @@ def check_splats(splats: Any, kind: torch.dtype | None = None) -> dict[str, Tens
             raise ValueError(f"{name} is {value.dtype}; it must be a tensor of {wanted}")
         n = len(value) if n is None and value.dim() > 0 else n
         want = [n, *_TAILS[key]]
-        if key == "shN" and kind is None and value.dim() == 3 and value.shape[1] in (0, 3, 8):
-            want[1] = value.shape[1]
+        if key == "shN":
+            free = kind is None and value.dim() == 3 and value.shape[1] in (0, 3, 8)
+            want[1] = value.shape[1] if free else n_rest
         bands = " (or 0, 3 or 8 in place of 15)" if key == "shN" and kind is None else ""
         own = _own(value, want, name, bands)
         checked[key] = own.float() if kind is None else own
@@ -316,8 +320,11 @@ def check_splats(splats: Any, kind: torch.dtype | None = None) -> dict[str, Tens
     return checked
 
 
-def check_content(content: Mapping[str, Any]) -> dict[str, Any]:
+def check_content(content: Mapping[str, Any], like: Mapping[str, Tensor] | None = None) -> dict[str, Any]:
     """Check all that a run continues from, except what only the run knows: its settings, its capture, its strategy.
+
+    Args:
+        like: as `load_checkpoint`.
 
     Returns:
         The same with tensors that are contiguous and share no memory.
@@ -326,7 +333,8 @@ def check_content(content: Mapping[str, Any]) -> dict[str, Any]:
         ValueError: names the entry, what it is and what it must be.
     """
     step = _whole(content["step"], "step")
-    splats = check_splats(content["splats"], torch.float32)
+    kind, n_rest = (torch.float32, 15) if like is None else (like["means"].dtype, like["shN"].shape[1])
+    splats = check_splats(content["splats"], kind, n_rest)
     packed = _mapping(content["optimizers"], "optimizers", KEYS)
     # files of older versions do not have processor time
     seconds = {"cpu": None, **_mapping(content["seconds"], "seconds")}
@@ -341,9 +349,9 @@ def check_content(content: Mapping[str, Any]) -> dict[str, Any]:
         **content,
         "splats": splats,
         "optimizers": {key: _moments(packed[key], f"optimizers.{key}", splats[key], step + 1) for key in KEYS},
-        "strategy": _strategy(content["strategy"], list(splats["shN"].shape), drawn),
+        "strategy": _strategy(content["strategy"], splats["shN"], drawn),
         "view_order": _view_order(content["view_order"]),
-        "appearance": _appearance(content.get("appearance", {}), step + 1),
+        "appearance": _appearance(content.get("appearance", {}), step + 1, kind),
         "seconds": {
             key: None if key == "cpu" and value is None else _number(value, f"seconds.{key}")
             for key, value in seconds.items()
@@ -354,7 +362,7 @@ def check_content(content: Mapping[str, Any]) -> dict[str, Any]:
     return checked
 
 
-def _appearance(packed: Any, taken: int) -> dict[str, dict[str, Tensor]]:
+def _appearance(packed: Any, taken: int, kind: torch.dtype) -> dict[str, dict[str, Tensor]]:
     """Check what was learned of the photographs; files of older versions have none."""
     checked: dict[str, dict[str, Tensor]] = {}
     for key, found in _mapping(packed, "appearance").items():
@@ -362,7 +370,7 @@ def _appearance(packed: Any, taken: int) -> dict[str, dict[str, Tensor]]:
             raise ValueError(f"appearance.{shown(key)} is unknown; it must hold {', '.join(_OF_PHOTOGRAPHS)}")
         name = f"appearance.{key}"
         moments = dict(_mapping(found, name, ("value", *_MOMENTS)))
-        value = _tensor(moments.pop("value"), f"{name}.value", torch.float32)
+        value = _tensor(moments.pop("value"), f"{name}.value", kind)
         own = _own(value, [*value.shape[:1], *_OF_PHOTOGRAPHS[key]], f"{name}.value")
         bad = first_non_finite({f"{name}.value": own})
         if bad:
@@ -380,7 +388,7 @@ def _moments(packed: Any, name: str, param: Tensor, taken: int) -> dict[str, Ten
         most = f"a whole number of updates, at most {taken}, the steps taken"
         raise ValueError(f"{name}.step is {checked['step'].item():g}; it must be {most}")
     for key in _MOMENTS[1:]:
-        checked[key] = _own(_tensor(found[key], f"{name}.{key}", torch.float32), like, f"{name}.{key}")
+        checked[key] = _own(_tensor(found[key], f"{name}.{key}", param.dtype), like, f"{name}.{key}")
     bad = first_non_finite({"exp_avg": checked["exp_avg"]})
     if bad:
         raise ValueError(f"{name}.exp_avg{bad[1]} is {bad[2]}; every entry must be finite")
@@ -388,7 +396,7 @@ def _moments(packed: Any, name: str, param: Tensor, taken: int) -> dict[str, Ten
     return checked
 
 
-def _strategy(packed: Any, sh_rest: list[int], drawn: int) -> dict[str, Any]:
+def _strategy(packed: Any, sh_rest: Tensor, drawn: int) -> dict[str, Any]:
     found = _mapping(packed, "strategy", ("generator",), others=True)
     checked = {**found, "generator": _generator(found["generator"], "strategy.generator")}
     if "views" in found:
@@ -397,7 +405,8 @@ def _strategy(packed: Any, sh_rest: list[int], drawn: int) -> dict[str, Any]:
         checked["scene_scale"] = _number(found["scene_scale"], "strategy.scene_scale")
     for key in _ROWS.keys() & found.keys():
         if found[key] is not None:
-            checked[key] = _own(_tensor(found[key], f"strategy.{key}", _ROWS[key]), sh_rest[:1], f"strategy.{key}")
+            value = _tensor(found[key], f"strategy.{key}", _ROWS[key] or sh_rest.dtype)
+            checked[key] = _own(value, [len(sh_rest)], f"strategy.{key}")
             if checked[key].dtype != torch.bool:
                 _check_not_negative(checked[key], f"strategy.{key}")
     for key in found.keys() - _ROWS.keys() - {"generator", "views", "scene_scale", "sh_rest_sum"}:
@@ -405,8 +414,8 @@ def _strategy(packed: Any, sh_rest: list[int], drawn: int) -> dict[str, Any]:
         name = shown(key).strip("'")
         checked[key] = _plain(found[key], f"strategy.{name}")
     if found.get("sh_rest_sum") is not None:
-        waiting = _tensor(found["sh_rest_sum"], "strategy.sh_rest_sum", torch.float32)
-        checked["sh_rest_sum"] = _own(waiting, sh_rest, "strategy.sh_rest_sum")
+        waiting = _tensor(found["sh_rest_sum"], "strategy.sh_rest_sum", sh_rest.dtype)
+        checked["sh_rest_sum"] = _own(waiting, list(sh_rest.shape), "strategy.sh_rest_sum")
     if (found.get("grad2d") is None) != (found.get("count") is None):
         raise ValueError("strategy.grad2d and strategy.count must both be tensors or both be None")
     return checked

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pop_fast.api.backends import FAST
 from pop_fast.api.checks import Checks
+from pop_fast.density import PupStrategy
 from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.evaluate import too_small
@@ -24,6 +25,16 @@ ENOUGH_PIXELS: Final = 10
 ENOUGH_OFF_CENTRE: Final = 1.0
 # densification steps between two resets in 3DGS and in gsplat's default strategy: 3,000 steps, one each 100
 RECOVERY_EVENTS: Final = GSPLAT.reset_every // GSPLAT.refine_every
+
+
+def check_method(config: TrainConfig) -> None:
+    """Raise PopError where a method asks the views, later, for what it cannot be told as they are drawn."""
+    plan = config.strategy
+    if config.antialiased and isinstance(plan, PupStrategy) and any(s < config.max_steps for s in plan.adam_restarts):
+        raise PopError(
+            f"antialiased is True, but method {config.method!r} prunes after step {plan.rounds_start_iter:,} by scores "
+            "that leave out how antialiased opacities depend on scales; leave out --antialiased"
+        )
 
 
 def check_views(config: TrainConfig, name: str, train: Sequence[ViewTensors], test: Sequence[ViewTensors]) -> None:

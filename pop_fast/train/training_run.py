@@ -40,7 +40,7 @@ from pop_fast.train.environment import reproducible, run_facts, versions
 from pop_fast.train.evaluate import evaluate, population
 from pop_fast.train.lpips import load_nets
 from pop_fast.train.model import KEYS, make_optimizers, require_usable
-from pop_fast.train.preflight import check_start, check_views, facts, find_warnings
+from pop_fast.train.preflight import check_method, check_start, check_views, facts, find_warnings
 from pop_fast.train.ranks import ALONE, Ranks
 from pop_fast.train.results import ResultFolder, Segment, Times, record_of
 from pop_fast.train.schedule import ViewOrder, active_sh_degree, phase_at, reads_rows, segment_end, updates_of_strategy
@@ -105,6 +105,7 @@ class TrainingRun:
                 not know a setting.
         """
         check_batch(config, strategy is None, ranks)
+        check_method(config)
         self._ranks = ranks
         self._engine = engine_of(choose_backend(config, resume)[0], strategy is None) if engine is None else engine
         self.config = replace(config, backend=self._engine.name).in_world(capture.world_scale)
@@ -406,7 +407,7 @@ class TrainingRun:
         ckpt.prune_checkpoints(self._results.path, self.config.keep_checkpoints, milestones)
 
     def _restore(self, path: Path) -> None:
-        content = ckpt.load_checkpoint(path)
+        content = ckpt.load_checkpoint(path, self.params)
         threads = torch.get_num_threads() if self._engine.depends_on_threads else None
         given = (self.config, self._fingerprint, threads, len(self._train), self.state.keys())
         ckpt.check_fits(path, content, *given)

@@ -13,6 +13,7 @@ import shutil
 import typing
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from benchmarks.faults.corpus import ksplat_of
+from benchmarks.faults.runs import same
 from pop_fast.cli import main
 from pop_fast.cli.options import FormatName, Output
 from pop_fast.data import load_capture
@@ -36,6 +38,7 @@ from pop_fast.errors import PopError
 from pop_fast.io.formats import FORMATS, default_name, encoded, format_names, levels, load_splat_file
 from pop_fast.io.ply import Frame, frame_of, load_ply, save_ply
 from pop_fast.train import compact
+from pop_fast.train.appearance import Appearance
 from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
 from pop_fast.train.views import ViewTensors
 from tests.app.captures import assert_one_line, many
@@ -581,6 +584,18 @@ def test_coarser_levels_are_smaller_and_leave_all_but_view_dependence_as_it_is(n
     for field in ("means", "log_scales", "quats", "logits", "sh0"):
         np.testing.assert_array_equal(getattr(first, field), getattr(last, field))
     assert not np.array_equal(first.rest, last.rest)
+
+
+def test_every_tuning_begins_with_what_the_run_had_learned_of_its_photographs(shared_result: Path) -> None:
+    splat = load_splat(shared_result)
+    capture, config = open_capture(splat, CaptureOptions())
+    config = replace(config, given=None, exposure=True, refine_cameras=True)
+    views = [ViewTensors.of(view) for view in capture.train_views(config.test_every)]
+    learned = Appearance(config, views).state_dict()
+    tuner = compact.Tuner(splat.params, 3, config, capture, learned, 5, lambda *_: None)
+    first, second = (tuner.tuned(tuner.whole, 5) for _ in range(2))
+    assert all(torch.equal(first[key], value) for key, value in second.items())
+    assert same(learned, Appearance(config, views).state_dict())
 
 
 @pytest.mark.parametrize("steps", [0, 12])

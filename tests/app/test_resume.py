@@ -21,6 +21,7 @@ import pytest
 import torch
 
 import pop_fast.compiled
+from pop_fast.data.gaussians import initialize_params
 from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun, training_run
 from pop_fast.train import checkpoint as ckpt
@@ -157,6 +158,23 @@ def test_a_run_in_batches_goes_on_from_a_checkpoint_within_a_window(tmp_path):
     TrainingRun(tiny_config(tmp_path / "parts", **config), tiny_capture(), resume=True).run()
     parts, whole = (ckpt.load_splats(ckpt.checkpoint_path(tmp_path / name, 3))[0] for name in ("parts", "whole"))
     assert all(torch.equal(parts[key], value) for key, value in whole.items())
+
+
+@pytest.mark.parametrize(("dtype", "degree"), [(torch.float64, 3), (torch.float32, 2), (torch.float32, 0)])
+def test_a_run_in_double_precision_or_of_fewer_bands_goes_on_to_the_same_bits(tmp_path, dtype, degree):
+    capture = tiny_capture()
+    initial = initialize_params(capture, 7, 0.5, 0.5, dtype)
+    initial["shN"] = initial["shN"][:, : (degree + 1) ** 2 - 1]
+
+    def run(folder, stop_after=None, resume=False):
+        config = tiny_config(tmp_path / folder, sh_degree=degree, max_steps=18, exposure=True)
+        training = TrainingRun(config, capture, initial=initial, resume=resume)
+        run_until(training, stop_after)
+        return training.params
+
+    run("parts", 13)
+    parts, whole = run("parts", resume=True), run("whole")
+    assert all(value.dtype == dtype and torch.equal(parts[key], value) for key, value in whole.items())
 
 
 @pytest.mark.parametrize("engine", ["fast", "compiled"])

@@ -284,6 +284,7 @@ def test_every_method_densifies_resets_and_prunes_when_its_paper_says() -> None:
     assert config.max_steps == 40_000
     assert steps(config.strategy.needs_passes) == [30_000, 35_000]
     assert config.strategy.prune_shares == (0.8, 0.5)
+    assert TrainConfig.of(method="pup", **{"pup.rounds_start_iter": 0}).strategy.adam_restarts == ()
 
 
 @pytest.mark.parametrize("method", sorted(set(METHODS) - {"gsplat"}))
@@ -396,6 +397,13 @@ def test_a_method_that_looks_at_the_views_sees_those_of_the_run_as_they_are_draw
     assert 0 < change.pruned == gone.sum() < len(gone)
     np.testing.assert_array_equal(run.params["means"].detach().numpy(), before["means"][~gone])
     assert degrees == [1] * len(run._train) + [2] * len(run._train)
+
+
+def test_what_scores_cannot_be_taken_of_is_refused_before_the_first_step(tmp_path: Any) -> None:
+    config = tiny_method(tmp_path, "pup", antialiased=True)
+    with pytest.raises(PopError, match=r"prunes after step 20 by scores that leave out .* leave out --antialiased"):
+        TrainingRun(config, tiny_capture())
+    TrainingRun(replace(config, max_steps=20), tiny_capture())
 
 
 @pytest.mark.parametrize(

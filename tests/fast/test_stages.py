@@ -113,6 +113,13 @@ def test_the_compiled_bits_do_not_depend_on_the_number_of_threads(dtype: torch.d
     assert_alike(found, (2, 5))
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_loss_does_not_depend_on_the_number_of_threads(dtype: torch.dtype) -> None:
+    # so many values that torch shares them out
+    x, y = Case(240, 320, seed=9).tensors(dtype)
+    assert_alike(lambda: [losses.photometric_3dgs(x, y, padding="same"), losses.l2(x, y)], (2, 3, 4, 5))
+
+
 @pytest.mark.parametrize("padding", ["valid", "same"])
 def test_similarity_maps_are_the_oracles(padding: str, monkeypatch: pytest.MonkeyPatch) -> None:
     x, y = Case(20, 14, seed=3).images()
