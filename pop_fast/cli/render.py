@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from pop_fast.view.paths import VideoFile
 
 _INDEX: Final = "renders.json"
+# of a path, and of a video a second
+_FRAMES: Final = 120
+_FPS: Final = 30.0
 _EXAMPLES: Final = """
     pop render out/scene_pop --out views                     the held-out views, one PNG each
     pop render out/scene_pop --path orbit --video orbit.webm  a video around the scene
@@ -44,9 +47,9 @@ class Args(CaptureArguments):
     """Write a video: .webm, .avi, or .mp4 where OpenCV can write H.264."""
     path: Annotated[str, tyro.conf.arg(metavar="{views,orbit,ellipse,interpolate}|FILE")] = "views"
     """"views" are held out; three are made from the training cameras; a file is a path that 'pop view' recorded."""
-    frames: int = 120
+    frames: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: 120)")] = None
     """Number of frames of a path."""
-    fps: float = 30.0
+    fps: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: 30)")] = None
     """Frames per second of a video."""
     overwrite: bool = False
     """Replace the video, and a folder that holds only an earlier render."""
@@ -58,7 +61,11 @@ def run(argv: Sequence[str]) -> int:
         raise PopError("nothing to write; give --out DIR for pictures, --video FILE for a video, or both")
     # all that can be refused without a splat, before anything of torch is imported
     check_path(args.path)
-    if args.frames < 1:
+    if args.frames is not None and args.path == "views":
+        raise PopError(f"--frames {args.frames} is of a path, and every held-out view is drawn; give --path orbit")
+    if args.fps is not None and args.video is None:
+        raise PopError(f"--fps {args.fps:g} is of a video; give --video FILE")
+    if args.frames is not None and args.frames < 1:
         raise PopError(f"frames is {args.frames}; give --frames 1 or more")
     if args.out is not None:
         keeps = [args.splat] if args.capture is None else [args.splat, args.capture]
@@ -71,7 +78,7 @@ def _render(args: Args, video: VideoFile | None) -> int:
 
     splat = load_splat(args.splat)
     capture, config = open_with_bars(splat, args)
-    views = planned_views(capture, config, args.path, args.frames)
+    views = planned_views(capture, config, args.path, _FRAMES if args.frames is None else args.frames)
     if video is not None:
         check_one_size(video, views)
     frames = rendered(splat, config, views, as_measured=args.path == "views")
@@ -86,7 +93,7 @@ def _render(args: Args, video: VideoFile | None) -> int:
             index = {"splat": str(splat.path), "capture": capture.name, "path": args.path, "renders": listing}
             write_json(folder / _INDEX, index)
     targets = " and ".join(str(target) for target in (args.out, args.video) if target is not None)
-    print(f"{written} views of {capture.name} -> {targets}")
+    print(f"{written} view{'' if written == 1 else 's'} of {capture.name} -> {targets}")
     return 0
 
 
@@ -111,7 +118,7 @@ def planned_video(args: Args) -> VideoFile | None:
         return None
     from pop_fast.view.paths import VideoFile
 
-    video = VideoFile(args.video, args.fps)
+    video = VideoFile(args.video, _FPS if args.fps is None else args.fps)
     if args.out is not None and args.video.resolve().is_relative_to(args.out.resolve()):
         raise PopError(
             f"{args.video}: lies in --out {args.out}, which holds pictures only; give --video another folder"

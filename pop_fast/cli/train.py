@@ -174,6 +174,9 @@ def _asked(argv: Sequence[str]) -> tuple[TrainConfig, Any, bool]:
     config, options = arguments(["--preset", AUTOMATIC, *argv])
     folder = Path(config.result_dir)
     if options.resume and (folder / "cfg.json").exists() and begun(folder) is None:
+        if options.minutes is not None:
+            fix = "leave --minutes out, and give the schedule as it was begun (--max-steps, --preset, --steps-scaler)"
+            raise PopError(f"--minutes chooses the schedule, but the run in {folder} was begun with another; {fix}")
         return *arguments(argv), False
     return config, options, True
 

@@ -56,7 +56,8 @@ def capture_folder(path: Path, progress: Progress | None = None) -> tuple[Path, 
         return target, f"{path}: {len(taken.frames)} of {taken.of:,} frames are taken as photographs, in {target}"
     # one that was cut short is not known by its end, but by its name
     if zipfile.is_zipfile(path) or path.suffix.lower() == ".zip":
-        target = path.with_name(f"{path.stem}_unpacked")
+        # beside x.zip, what x.usdz holds has a folder of its own
+        target = path.with_name(f"{path.stem if path.suffix.lower() == '.zip' else path.name}_unpacked")
         if not _made_before(path, target):
             unpack(path, target)
         return _inmost(target), f"{path}: unpacked in {target}"

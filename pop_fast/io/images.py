@@ -69,13 +69,14 @@ def list_images(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: path.relative_to(folder).as_posix())
 
 
-def _visible(folder: Path) -> list[Path]:
+def _visible(folder: Path, denied: list[OSError] | None = None) -> list[Path]:
     """List the files of a folder and its subfolders, which may be links to elsewhere.
 
-    Left out is what is hidden, and subfolders that are results of a training.
+    Left out is what is hidden, subfolders that are results of a training, and what the system does not show; why it
+    does not is added to `denied`.
     """
     known, found = [folder.resolve()], list[Path]()
-    for place, folders, files in os.walk(folder, followlinks=True):
+    for place, folders, files in os.walk(folder, onerror=None if denied is None else denied.append, followlinks=True):
         found += [Path(place, name) for name in files if name[0] != "."]
         folders[:] = [name for name in sorted(folders) if name[0] != "." and _leads_on(Path(place, name), known)]
     return found
@@ -87,7 +88,7 @@ def _leads_on(folder: Path, known: list[Path]) -> bool:
     A link into, around or again to what is `known` would list files twice. The renders of a result are no photographs,
     and may lie among them, as `pop train .` writes `out` where it is called.
     """
-    if all((folder / name).is_file() for name in _OF_A_RESULT):
+    if all(os.path.isfile(folder / name) for name in _OF_A_RESULT):
         return False
     if not folder.is_symlink():
         return True
@@ -103,11 +104,12 @@ def _files_ending(suffixes: Sequence[str], paths: Sequence[Path]) -> list[Path]:
 
 
 def unreadable_photographs(folder: Path) -> str | None:
-    """Say how many files of a folder hold pictures in a format that is not read, and how to convert them; None if none.
+    """Say what of a folder `list_images` leaves out though it may hold photographs, and what to do; None if nothing.
 
-    Hidden files are left out, as `list_images` does.
+    That is files in a format that is not read, videos, and subfolders that cannot be looked into; not what is hidden.
     """
-    found = _visible(folder)
+    denied: list[OSError] = []
+    found = _visible(folder, denied)
     unreadable = _UNREADABLE if can_read_heif() else (*_UNREADABLE, *HEIF_SUFFIXES)
     still = [path.suffix for path in _files_ending(unreadable, found)]
     moving = _files_ending(VIDEO_SUFFIXES, found)
@@ -125,6 +127,13 @@ def unreadable_photographs(folder: Path) -> str | None:
         changes.append(
             f"{what} no photographs ({moving[0].name}): take sharp frames out first, "
             f"for example with pop frames {moving[0].name} --out photos"
+        )
+    if denied:
+        what = f"{len(denied)} folders are" if len(denied) > 1 else "1 folder is"
+        first = denied[0]
+        changes.append(
+            f"{what} left out, as the system does not show what is inside ({first.filename}: {first.strerror}): "
+            "change owner or mode where photographs are there"
         )
     return "; ".join(changes) or None
 

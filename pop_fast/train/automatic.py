@@ -367,7 +367,7 @@ def check_minutes(minutes: float | None, config: TrainConfig, automatic: bool) -
         "--max-steps": "max_steps" in given.settings,
         "--steps-scaler": given.steps_scaler is not None,
         f"--preset {given.preset}": given.preset not in (Given.preset, AUTOMATIC),
-        f"--preset {Given.preset}, --blocks, torchrun or the run that is resumed": not automatic,
+        f"--preset {Given.preset}, --blocks or torchrun": not automatic,
     }
     for option, has_another in said.items():
         if has_another:

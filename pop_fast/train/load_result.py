@@ -12,6 +12,7 @@ import numpy as np
 
 from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
+from pop_ref.constants import NEAR_IN_CAPTURE_UNITS
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -210,11 +211,15 @@ def open_capture(
 
 def _in_frame(config: TrainConfig, splat: Splat) -> TrainConfig:
     """Give the near plane of the frame that a splat is looked at in, where that is not the one it was trained in."""
-    record = read_record(splat.folder)
-    if config.near_plane is None or record is None or config.normalize or not splat.config.normalize:
+    record, frame = read_record(splat.folder), splat.frame
+    transform = None if frame is None else frame.transform
+    if transform is None and frame is not None and record is not None and splat.config.normalize:
+        transform = record.world_transform
+    of_capture = config.near_plane is None and config.profile in NEAR_IN_CAPTURE_UNITS
+    if config.normalize or transform is None or of_capture:
         return config
-    scale = np.cbrt(np.linalg.det(np.array(record.world_transform)[:3, :3]))
-    return replace(config, near_plane=config.near_plane / float(scale))
+    scale = np.cbrt(np.linalg.det(np.array(transform)[:3, :3]))
+    return replace(config, near_plane=config.renderer.near_plane / float(scale))
 
 
 def frame_of_splat(splat: Splat, options: CaptureOptions) -> Literal["capture", "training"] | None:

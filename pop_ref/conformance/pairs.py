@@ -59,7 +59,7 @@ FACTORS: Final[dict[str, tuple[Level, ...]]] = {
     "batch": _levels(("none", {}), ("[1]", {"batch": (1,)}), ("[2]", {"batch": (2,)}), ("[1, 2]", {"batch": (1, 2)})),
     "packed": _levels(("False", {}), ("True", {"packed": True})),
     "colors": _levels(
-        ("harmonics of degree 1", {}), ("harmonics of degree 0", {"degree": 0}),
+        ("harmonics of degree 1", {"degree": 1}), ("harmonics of degree 0", {"degree": 0}),
         ("harmonics of degree 3", {"degree": 3}), ("degree 1 of 3", {"degree": 3, "sh_degree": 1}),
         *((f"{n} channel{'s' * (n > 1)}", {"channels": n}) for n in (3, 1, 5, 33)),
     ),

@@ -696,7 +696,7 @@ def test_minutes_and_a_schedule_exclude_each_other(pop: Pop, shared_capture: Pat
     for schedule in (("--max-steps", "9"), ("--steps-scaler", "0.1")):
         said = f"--minutes chooses the schedule, but {schedule[0]} has another"
         says(pop(*words, "5", "--preset", "auto", *schedule), said)
-    says(pop(*words, "5", "--blocks", "2x1"), "--minutes chooses the schedule, but --preset paper, --blocks, torchrun")
+    says(pop(*words, "5", "--blocks", "2x1"), "--minutes chooses the schedule, but --preset paper, --blocks or")
     says(pop(*words, "-1"), "--minutes is -1.0")
 
 
@@ -711,8 +711,13 @@ def test_an_archive_trains_without_a_second_command(pop: Pop, shared_capture: Pa
     folder = tmp_path / "toy_unpacked" / "walk"
     assert json.loads((tmp_path / "r" / "cfg.json").read_text())["resolved"]["data"] == str(folder)
     assert not (tmp_path / "toy_unpacked" / "__MACOSX").exists()
-    # a second time it is there
+    # a second time it is there, and another archive of that name has a folder of its own
     assert capture_folder(packed)[0] == folder
+    other = Path(shutil.copy(packed, tmp_path / "toy.usdz"))
+    assert capture_folder(other)[0] == tmp_path / "toy.usdz_unpacked" / "walk"
+    # minutes would choose a schedule, and this run has one
+    asked = pop("train", packed, "--out", tmp_path / "r", "--minutes", "1", "--resume")
+    says(asked, f"the run in {tmp_path / 'r'} was begun with another; leave --minutes out")
 
 
 def test_a_zip_of_macos_keeps_its_umlauts(tmp_path: Path) -> None:

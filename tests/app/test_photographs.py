@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import os
 import shutil
 import tracemalloc
 import unicodedata
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -282,6 +285,20 @@ def test_what_is_not_read_is_named_with_the_way_to_convert_it(tmp_path: Path, mo
     words = ("3 files are HEIC", "pip install pillow-heif, or convert them to JPEG", "mogrify -format jpg *.HEIC")
     assert_one_line(lambda: load_capture(tmp_path, sfm=True), "has no photographs", *words)
     assert_one_line(lambda: run_sfm(tmp_path), "has 0 photographs;", *words)
+
+
+def test_a_subfolder_that_cannot_be_looked_into_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_photograph(tmp_path / "locked" / "a.png", photograph(1))
+    scandir, denied = os.scandir, PermissionError(errno.EACCES, "Permission denied", str(tmp_path / "locked"))
+
+    def guarded(path: str) -> Any:
+        if Path(path) == tmp_path / "locked":
+            raise denied
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", guarded)
+    assert list_images(tmp_path) == []
+    assert_one_line(lambda: load_capture(tmp_path), "1 folder is left out", f"({tmp_path}/locked: Permission denied)")
 
 
 @needs_heif

@@ -58,7 +58,7 @@ def rendered(pop: Pop, shared_result: Path) -> Render:
 
 
 def test_held_out_views_are_rendered_to_the_same_bytes_as_in_training(rendered, shared_result, tmp_path):
-    assert "1 views of toy" in rendered("--out", tmp_path / "views").out
+    assert "1 view of toy" in rendered("--out", tmp_path / "views").out
     assert sorted(os.listdir(tmp_path / "views")) == ["renders.json", "view_000.png"]
     kept = np.load(shared_result / "report_data" / "val_step29_0000.npz")
     np.testing.assert_array_equal(read(tmp_path / "views" / "view_000.png"), kept["render"])
@@ -87,6 +87,9 @@ def test_a_path_gives_as_many_pictures_and_frames_as_asked(rendered, shared_resu
     ("words", "part"),
     [
         ("", "give --out DIR for pictures, --video FILE"),
+        ("--out r --frames 3", "--frames 3 is of a path, and every held-out view is drawn; give --path orbit"),
+        ("--out r --path orbit --frames 0", "frames is 0; give --frames 1 or more"),
+        ("--out r --fps 5", "--fps 5 is of a video; give --video FILE"),
         ("--video clip.webm --fps 0", "clip.webm: fps is 0.0; it must be a number from 0.5 to 600"),
         ("--video clip.webm --fps nan", "clip.webm: fps is nan; it must be a number from 0.5 to 600"),
         ("--out r --video r/clip.webm", "r/clip.webm: lies in --out r, which holds pictures only"),
@@ -294,6 +297,15 @@ def test_a_run_writes_its_near_plane_down_and_goes_on_with_it(pop: Pop, shared_c
     # in the capture's own world it is Inria's number
     own = open_capture(splat, CaptureOptions(own_frame=True))[1]
     assert own.renderer.near_plane == pytest.approx(0.2, rel=1e-12)
+
+
+def test_an_export_is_looked_at_with_the_near_plane_of_its_run(pop, shared_capture, shared_result, tmp_path):
+    scale = load_capture(shared_capture).world_scale
+    for frame, near in {"capture": 0.01 / scale, "training": 0.01}.items():
+        pop.done("export", shared_result, "--out", tmp_path / f"{frame}.ply", "--frame", frame)
+        splat = load_splat(tmp_path / f"{frame}.ply")
+        config = open_capture(splat, CaptureOptions(capture=shared_capture))[1]
+        assert config.renderer.near_plane == pytest.approx(near, rel=1e-12)
 
 
 def test_blocks_are_trained_with_the_near_plane_of_the_whole(pop, shared_capture, tmp_path, monkeypatch):

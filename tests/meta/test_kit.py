@@ -649,7 +649,10 @@ def test_a_rasterizer_of_fewer_bands_is_judged_by_those_it_has(highest: int) -> 
     several = "test_signature_arguments:several_cameras_in_one_call_see_what_each_sees_alone"
     for law in ("test_agreement:gradients_are_the_oracles", several):
         assert obeys(law_named(law), backend, 1) is None
-    assert {"colors=harmonics of degree 3", "colors=degree 1 of 3"} <= accepted(backend).refused.keys()
+    found = accepted(backend)
+    assert {"colors=harmonics of degree 3", "colors=degree 1 of 3"} <= found.refused.keys()
+    assert ("colors=harmonics of degree 1" in found.refused) == (highest == 0)
+    assert "harmonics of degree 0" in found.levels["colors"]
 
 
 def test_the_constants_of_a_local_module_are_not_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
