@@ -165,8 +165,12 @@ COURSE: Final = (
 )
 
 BY_NAME: Final = {stage.name: stage for stage in COURSE}
-# laws of digits that no chapter teaches: o (1 - o), as chapter 1b writes it, loses them where a logit is far out
-NOT_TAUGHT: Final = ("the_slope_of_an_opacity_is_the_same_at_both_poles",)
+# laws of digits that no chapter teaches: o (1 - o), as chapter 1b writes it, loses them where a logit is far out, and
+# R S S R^T, multiplied out entry by entry, is symmetric but for rounding
+NOT_TAUGHT: Final = (
+    "the_slope_of_an_opacity_is_the_same_at_both_poles",
+    "covariances_are_symmetric_with_the_squared_scales_as_eigenvalues",
+)
 # what a student may pass and read of density control; chapter 9 teaches no other setting
 DENSITY_SETTINGS: Final = (
     "grow_grad2d",

@@ -103,10 +103,13 @@ def _misused(name: str, wrong: Sequence[Call]) -> str:
     """Name what no number shows: nothing returned, an argument changed, or one that is not."""
     for call in wrong:
         (found, changed), (expected, meant) = call.found, call.expected
-        if isinstance(expected, np.ndarray) and isinstance(found, np.ndarray) and expected.dtype == bool != found.dtype:
-            return f"{name} gives numbers, and truth values are asked for: compare, as in x > 0."
         if found is None and expected is not None:
             return f"{name} returns nothing: is a return missing?"
+        if call.wanted and same(call.found, call.expected):
+            how = {"truth values": "compare, as in x > 0", "whole numbers": "write int(x), or x.astype(int)"}
+            return f"{name} gives other numbers where {call.wanted} are asked for: {how[call.wanted]}."
+        if _of_lists(expected) and not _of_lists(found) and found != []:
+            return f"{name} must give a list of lists, one a tile: write list(x), or x.tolist(), for what is none."
         if changed and not meant:
             return f"{name} changes its argument in place; work on a copy, the caller still needs what it gave."
         if meant and not changed:
@@ -117,7 +120,6 @@ def _misused(name: str, wrong: Sequence[Call]) -> str:
 def _compared(name: str, wrong: Sequence[Call], some_right: bool) -> str:
     """Compare results part by part, then entry by entry."""
     parts: dict[str, list[Pair]] = {}
-    truths = all(_is_truth(call.expected) for call in wrong)
     for call in wrong:
         found, expected = leaves(call.found), leaves(call.expected)
         if len(found) != len(expected):
@@ -145,6 +147,8 @@ def _compared(name: str, wrong: Sequence[Call], some_right: bool) -> str:
     bad = {part: [pair for pair in pairs if not same(*pair)] for part, pairs in parts.items()}
     bad = {part: pairs for part, pairs in bad.items() if pairs}
     of_all = len(bad) == len(parts)
+    at = [k for k, part in enumerate(parts) if part in bad]
+    truths = all(_is_truth(call.expected if of_all else _taken(call.expected[0], at, len(parts))) for call in wrong)
     named = _together(list(bad))
     subject = name if of_all else f"{' and '.join(named)} {'of' if 'result' in named[0] else 'in'} {name}"
     pairs = [pair for each in bad.values() for pair in each]
@@ -152,8 +156,9 @@ def _compared(name: str, wrong: Sequence[Call], some_right: bool) -> str:
     part = "" if of_all else re.sub("the cotangent of |`", "", named[0]).removeprefix("v_").rstrip("s")
     letters = _LETTERS.get(part, _LETTERS.get(name.removesuffix("_vjp"), ()) if of_all else ())
     what = _as_a_whole(pairs, sizes, some_right, truths)
-    if not what and len(bad) == 1 and len(parts[next(iter(bad))]) == len(wrong):
-        what = factor_of_an_argument(wrong, parts[next(iter(bad))])
+    if not what and all(len(parts[part]) == len(wrong) for part in bad):
+        factors = {factor_of_an_argument(wrong, parts[part]) for part in bad}
+        what = factors.pop() if len(factors) == 1 else ""
     what = what or _in_places(pairs, letters) or _off_by(pairs)
     if not of_all and len(named) > 1:
         what = re.sub("^(is|has|goes) ", lambda verb: {"is": "are ", "has": "have ", "goes": "go "}[verb[1]], what)
@@ -181,7 +186,8 @@ def _together(parts: list[str]) -> list[str]:
         return list(results)
     if len(parts) <= 3:
         return parts
-    return list(dict.fromkeys(re.sub(r"`([^.`]*)[^`]*`", r"`\1`", part) for part in parts))[:3]
+    named = list(dict.fromkeys(re.sub(r"`([^.`]*)[^`]*`", r"`\1`", part) for part in parts))
+    return named if len(named) <= 3 else [*named[:2], f"{len(named) - 2} more parts"]
 
 
 def parts_named(name: str, call: Call) -> list[str]:
@@ -211,6 +217,11 @@ def _is_truth(value: Any) -> bool:
         kept = [each for each in value if not (isinstance(each, tuple) and not each)]
         return bool(kept) and all(map(_is_truth, kept))
     return isinstance(value, bool | np.bool_) or (isinstance(value, np.ndarray) and value.dtype == bool)
+
+
+def _taken(returned: Any, at: Sequence[int], n: int) -> Any:
+    """Take some of a result's parts, if each of its n parts is a value by itself."""
+    return tuple(returned[k] for k in at) if type(returned) is tuple and len(returned) == n else None
 
 
 def _of_lists(value: Any) -> bool:
@@ -317,15 +328,16 @@ def _of_rounding(found: np.ndarray, expected: np.ndarray) -> str:
         if off <= {0.0, 1.0}:
             return "is one too large for some inputs: it is off by one, or rounded up where it must be rounded down"
         return ""
-    if whole and np.max(np.abs(found - expected)) <= 1.0:
+    rounded = any(np.array_equal(found, way(expected)) for way in (np.round, np.floor, np.ceil))
+    # one number alone may be a limit
+    if rounded and len(np.unique(found)) > 1:
         return "is rounded to whole numbers; keep the fractions"
     size = np.max(np.abs(expected))
     error = float(np.max(np.abs(found - expected)))
     if size > 0.0 and error < 1e-3 * size:
-        return (
-            f"is right to {max(int(-np.log10(error / size)), 1)} digits and no further: something small, such as an "
-            "epsilon, is added or missing, or a constant is rounded"
-        )
+        why = "something small, such as an epsilon, is added or missing, or a constant is rounded"
+        why += ", or it is computed in float32" if error < 1e-6 * size else ""
+        return f"is right to {max(int(-np.log10(error / size)), 1)} digits and no further: {why}"
     return ""
 
 
@@ -405,7 +417,9 @@ def _off_by(pairs: Sequence[Pair]) -> str:
     # of the call that is shown
     a, b = (np.ravel(each) for each in next(pair for pair in pairs if pair[0].size))
     at = int(np.argmax(np.abs(a - b)))
-    return f"is not right yet: {a[at]:.4g} where {b[at]:.4g} is asked for"
+    # so many digits that they differ
+    digits = next((n for n in range(4, 17) if f"{a[at]:.{n}g}" != f"{b[at]:.{n}g}"), 17)
+    return f"is not right yet: {a[at]:.{digits}g} where {b[at]:.{digits}g} is asked for"
 
 
 # found and expected
@@ -438,6 +452,9 @@ def one_factor(found: np.ndarray, expected: np.ndarray) -> str:
     if np.ptp(ratios) > 1e-6 * np.max(np.abs(ratios)):
         return ""
     ratio = float(np.mean(ratios))
+    if abs(abs(ratio) - 1.0) < 1e-6:
+        # that is rounding
+        return ""
     why = next((why for each, why in _FACTORS.items() if abs(abs(ratio) - each) < 1e-6 * each), "a factor is wrong")
     sign = " and the sign is wrong, too" if ratio < 0 else ""
     return f"is {abs(ratio):.4g} times what it should be, everywhere: {why}{sign}"

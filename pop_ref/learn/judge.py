@@ -225,6 +225,10 @@ def _laws(stage: Stage) -> Iterator[Law]:
                 yield law
 
 
+class _EnoughError(BaseException):
+    """Hypothesis is to stop making a broken law's input smaller: it catches what is an Exception, and tries on."""
+
+
 @dataclass
 class _Failure:
     first: dict[str, Any]
@@ -234,7 +238,7 @@ class _Failure:
 
 def _tried(law: Law, backend: _Judged) -> tuple[_Failure | None, bool]:
     """Try a law; return the first input that broke it and the smallest that was found, and whether any was tried."""
-    from hypothesis import HealthCheck, given, settings
+    from hypothesis import HealthCheck, settings
     from hypothesis.errors import HypothesisException
 
     failure: _Failure | None = None
@@ -243,7 +247,7 @@ def _tried(law: Law, backend: _Judged) -> tuple[_Failure | None, bool]:
     def sentence(**drawn: Any) -> None:
         nonlocal failure, until, was_tried
         if time.thread_time() > until:
-            return
+            raise _EnoughError
         try:
             law.sentence(backend, **drawn)
             was_tried = True
@@ -265,9 +269,9 @@ def _tried(law: Law, backend: _Judged) -> tuple[_Failure | None, bool]:
         suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much],
     )
     try:
-        (options(given(**law.strategies)(sentence)) if law.strategies else sentence)()
-    except Exception:
-        # set aside as a whole, broken, or no longer failing once patience had run out: the last is broken too
+        (options(law.quantified(sentence)) if law.strategies else sentence)()
+    except (Exception, _EnoughError):
+        # set aside as a whole, or broken
         return failure, was_tried
     return failure, was_tried
 

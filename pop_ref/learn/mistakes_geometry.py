@@ -198,6 +198,10 @@ GEOMETRY: Final[dict[str, Known]] = {
             "np.linalg.norm(quats, axis=1, keepdims=True).",
             lambda o, quats: quats / np.linalg.norm(quats),
         ),
+        "You divide each column by its own length; a quaternion is a row.": (
+            "np.linalg.norm(quats, axis=1, keepdims=True).",
+            lambda o, quats: quats / np.linalg.norm(quats, axis=0),
+        ),
         "You divide by the square of the length: the root is missing.": (
             "|q| is the root of the sum of the squares.",
             lambda o, quats: quats / np.sum(quats * quats, axis=1, keepdims=True),
@@ -393,6 +397,12 @@ GEOMETRY: Final[dict[str, Known]] = {
             "Add (cx, cy) = (K[0, 2], K[1, 2]).",
             lambda o, means_cam, K, width, height, *profile: (
                 o["project_means"](means_cam, K, width, height, *profile) - K[:2, 2]
+            ),
+        ),
+        "You take the picture's middle for the principal point, which need not lie there.": (
+            "Add (cx, cy) = (K[0, 2], K[1, 2]).",
+            lambda o, means_cam, K, width, height, *profile: (
+                o["project_means"](means_cam, K, width, height, *profile) - K[:2, 2] + np.array([width, height]) / 2.0
             ),
         ),
         "The numbers of K for x and for y are exchanged: x goes with fx and cx, y with fy and cy.": (

@@ -246,6 +246,9 @@ def _lists(rng: np.random.Generator) -> Iterator[Probe]:
     yield "", (*_splats(rng, 5), rng.uniform(1.0, 9.0, 5), 10, 30, 8)
     equal = np.full((4, 2), 8.0), np.full((4, 2), 3), np.array([2.0, 1.0, 2.0, 1.0])
     yield "depths are equal, and the smaller index comes first", (*equal, 16, 16, 16)
+    # few enough are kept in order by a sort that does not promise it
+    many = np.full((40, 2), 8.0), np.full((40, 2), 3), rng.choice([1.0, 2.0], 40)
+    yield "depths are equal, and the smaller index comes first", (*many, 16, 16, 16)
 
 
 def _at_pixel(rng: np.random.Generator) -> Iterator[Probe]:

@@ -87,7 +87,25 @@ class Call:
         if self.function == "sh_basis_vjp" and not self.found[1]:
             # what is along the direction is removed later, and polynomials that agree on the sphere differ in it
             return same(*(_tangential(value, self.given[0]) for value, _ in (self.found, self.expected)))
-        return same(self.found, self.expected)
+        return same(self.found, self.expected) and not self.wanted
+
+    @property
+    def wanted(self) -> str:
+        """Return the kind of number that is asked for, where another came out; empty where it fits."""
+        return _wanted(self.found[0], self.expected[0])
+
+
+def _wanted(found: Any, expected: Any) -> str:
+    """Compare the kinds of numbers: a mask of 0 and 1 takes rows by their places, and no list has a place 1.0."""
+    if type(expected) is tuple and isinstance(found, tuple | list):
+        return next(filter(None, map(_wanted, found, expected)), "")
+    # one truth value is as good as 0 or 1
+    if not isinstance(expected, np.ndarray | int) or isinstance(expected, bool):
+        return ""
+    kind, fits = {"b": ("truth values", "b"), "i": ("whole numbers", "iu")}.get(
+        np.asarray(expected).dtype.kind, ("", "")
+    )
+    return kind if kind and np.asarray(found).dtype.kind not in fits else ""
 
 
 @dataclass

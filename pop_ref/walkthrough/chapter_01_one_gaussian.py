@@ -161,8 +161,8 @@ picture(
 # %% [markdown]
 # ## Opacity also decides how wide a splat is
 #
-# Since the edge lies at $\sqrt{2 \ln(255\, o)}$ standard deviations, a fainter splat is also a smaller one, though
-# slowly so: a tenth of the opacity costs less than a quarter of the reach.
+# Since the edge lies at $\sqrt{2 \ln(255\, o)}$ standard deviations, a fainter splat is also a smaller one. At first
+# this goes slowly: at an opacity of a tenth more than three quarters of an opaque splat's reach are left.
 
 # %%
 reach_of = {o: math.sqrt(2 * math.log(255 * o)) for o in (1.0, 0.5, 0.1, 0.02)}

@@ -14,23 +14,26 @@ import subprocess
 import tomllib
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from hypothesis import strategies as st
 
 from pop_fast.children import module_command
 from pop_fast.cli import main
 from pop_fast.data import load_capture
 from pop_fast.demo import make_demo
+from pop_ref.conformance.adapter import OracleAdapter
+from pop_ref.conformance.law import Law
 from pop_ref.conformance.mutants.trial import every_law
 from pop_ref.learn import stubs
 from pop_ref.learn.course import BY_NAME, COURSE, NOT_TAUGHT, Stage
 from pop_ref.learn.diagnosis import diagnose
 from pop_ref.learn.drawing import HEAD, ORACLES, SIDE, YOURS, drawn_counterexample, lettered
 from pop_ref.learn.grading import graded, read_grade
-from pop_ref.learn.judge import Verdict, judge, told
+from pop_ref.learn.judge import Verdict, _tried, judge, told
 from pop_ref.learn.mistakes import MISTAKES, Mistake
 from pop_ref.learn.probes import oracle, probes
 from pop_ref.learn.progress import PASSED, WRITTEN, course_map, note_passed, picture, state
@@ -678,3 +681,66 @@ def test_the_translation_of_a_camera_is_named_and_no_letter(tmp_path: Path) -> N
 
     sentence, _ = _told_of("camera_center_vjp", turned_back, tmp_path)
     assert "the last column, the translation's, only" in sentence
+
+
+def test_numbers_of_another_kind_are_refused_though_their_values_are_right(tmp_path: Path) -> None:
+    def floats(width, height, size):
+        # raises where it must, too
+        return tuple(map(float, oracle()["grid_size"](width, height, size)))
+
+    asked = {
+        "prune_mask": lambda *given: oracle()["prune_mask"](*given).astype(int),
+        "importance_mask": lambda counts: (counts > 0).astype(float),
+        "grid_size": floats,
+    }
+    for name, made in asked.items():
+        kind = "whole numbers" if made is floats else "truth values"
+        assert f"gives other numbers where {kind} are asked for" in _told_of(name, made, tmp_path)[0]
+    # one truth value may be 1, which no list is asked for by
+    for words, given in probes("stops"):
+        assert tried_on(lambda next_T: int(next_T <= 1e-4), oracle()["stops"], given, words).is_right
+
+
+def test_single_precision_is_told_by_its_digits_and_digits_that_are_shown_differ(tmp_path: Path) -> None:
+    def single(sigma):
+        return float(np.exp(np.float32(-sigma)))
+
+    sentence, _ = _told_of("falloff", single, tmp_path)
+    assert re.search(r"right to \d digits and no further.*float32", sentence), sentence
+    # the call that is shown is nearly right, the other is not
+    near, far = (
+        Call("falloff", ("sigma",), (1.0,), {}, (np.array(found), ()), (np.array(expected), ()))
+        for found, expected in (([1.37061, 5.0], [1.37058, 5.0]), ([1.0, 2.0], [3.0, 2.5]))
+    )
+    assert "is not right yet: 1.37061 where 1.37058 is asked for" in diagnose([near, far], Path())[0]
+
+
+def test_what_is_called_right_is_right_where_many_parts_are_wrong(tmp_path: Path) -> None:
+    def half_a_pixel_off(ids, rows, px, py, background):
+        return oracle()["composite_pixel"](ids, rows, px + 0.5, py + 0.5, background)
+
+    sentence, _ = _told_of("composite_pixel", half_a_pixel_off, tmp_path)
+    # of six parts the splats and their number are right
+    assert "`color` and `T_final` and 2 more parts in composite_pixel are not right yet" in sentence
+
+
+def test_an_argument_that_all_parts_lack_is_named(tmp_path: Path) -> None:
+    def without_v(mean2d, conic, px, py, v_sigma):
+        return oracle()["sigma_at_pixel_vjp"](mean2d, conic, px, py, 1.0)
+
+    assert _told_of("sigma_at_pixel_vjp", without_v, tmp_path)[0] == "sigma_at_pixel_vjp lacks the factor `v_sigma`."
+
+
+def test_a_law_is_given_up_once_patience_has_run_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = []
+
+    def never(backend: Any, x: list[int]) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr("pop_ref.learn.judge.PATIENCE_S", -1.0)
+    strategies = {"x": st.lists(st.integers(), min_size=4).map(lambda x: drawn.append(x) or x)}
+    failure, _ = _tried(Law("alpha", (), never, strategies), cast(Any, OracleAdapter()))
+    # the first input, and one more at which its time is over
+    assert failure is not None
+    assert failure.least == failure.first
+    assert len(drawn) == 2

@@ -553,3 +553,8 @@ def test_a_prior_ten_times_as_heavy_empties_the_middle_and_costs_quality() -> No
     middle = [sum(counts[1:14]) / n for _, n, counts in found]
     assert middle[0] > middle[2] > middle[3]
     assert found[0][0] > found[3][0] + 0.5
+
+
+def test_a_slider_that_moves_two_learning_rates_shows_both() -> None:
+    texts = _shown("train", ("slide", "learning rate of widths and rotations", 1))["texts"]
+    assert "learning rate of widths and rotations0.0300 and 0.0200" in texts

@@ -26,7 +26,7 @@ function train(root) {
   const share = (x) => (x >= 0 ? "off" : `${kit.number(100 * 10 ** x, 1)} % of the pixels`);
   kit.slider(sliders, { label: "blurred if it wins over \u03b8", min: -3, max: 0, step: 0.25, value: -2, show: share }, (x) => { settings.theta_blur = 10 ** x; });
   for (const [label, names] of [["places", ["means"]], ["widths and rotations", ["scales", "quats"]], ["opacities", ["opacities"]], ["colours", ["sh0"]]]) {
-    const show = (x) => kit.small(2 ** x * RATES[names[0]]);
+    const show = (x) => names.map((name) => kit.small(2 ** x * RATES[name])).join(" and ");
     kit.slider(sliders, { label: `learning rate of ${label}`, min: -4, max: 4, step: 0.5, value: 0, show }, (x) => {
       for (const name of names) settings.rates[name] = 2 ** x * RATES[name];
     });
