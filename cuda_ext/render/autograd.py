@@ -9,18 +9,22 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from cuda_ext import load
 from cuda_ext.arrays import Settings, empty, fill, stream_of
 from cuda_ext.render.lists import LOWER, TileBuffers, splat_struct
 
 
-def _where_the_cotangents_are(backward: Callable[..., Any]) -> Callable[..., Any]:
-    """Make a transpose run with its tensors' device as the current one, on which kernels run, whoever calls it."""
+def _transpose(backward: Callable[..., Any]) -> Callable[..., Any]:
+    """Make a transpose run with its tensors' device as the current one, on which kernels run, whoever calls it.
+
+    It refuses to be differentiated, with a RuntimeError.
+    """
 
     @functools.wraps(backward)
     def there(ctx: Any, *cotangents: Any) -> Any:
+        if torch.is_grad_enabled():
+            raise RuntimeError("there are no second derivatives here; take gradients without create_graph=True")
         with torch.cuda.device_of(next(v for v in cotangents if v is not None)):
             return backward(ctx, *cotangents)
 
@@ -59,8 +63,7 @@ class Project(torch.autograd.Function):
         return means2d, depths, conics, blended, radii, means.new_empty((n, 0)) if colors is None else colors
 
     @staticmethod
-    @once_differentiable
-    @_where_the_cotangents_are
+    @_transpose
     def backward(ctx: Any, *cotangents: Any) -> tuple[Tensor | None, ...]:
         v_means2d, v_depths, v_conics, v_opacities, _, v_colors = cotangents
         means, quats, scales, opacities, sh, viewmat, K, radii = ctx.saved_tensors
@@ -194,8 +197,7 @@ class Blend(torch.autograd.Function):
         return blended.image.detach(), blended.T_final.detach()
 
     @staticmethod
-    @once_differentiable
-    @_where_the_cotangents_are
+    @_transpose
     def backward(ctx: Any, *cotangents: Any) -> tuple[Tensor | None, ...]:
         v_image, v_T_final = cotangents
         blended = ctx.blended

@@ -92,7 +92,6 @@ class _Entropy(torch.autograd.Function):
         return entropies.sum() / max(len(logits), 1)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx, v_loss: Tensor) -> Tensor:  # type: ignore[override]
         return opacity_entropy_vjp(ctx.saved_tensors[0], v_loss)
 
@@ -116,7 +115,6 @@ class _PopLoss(torch.autograd.Function):
         return value
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx, v_loss: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
         (grad,) = ctx.saved_tensors
         return v_loss * grad, None, None
