@@ -366,7 +366,10 @@ class RasterizationCall:
 
         def overlaps() -> dict[str, Any]:
             lists = [self.stages.tile_lists(image.rows, image.settings, self.tile_size) for image in images]
-            return intersections(lists, [image.rows.depths for image in images], self.image_shape)
+            found = intersections(lists, [image.rows.depths for image in images], self.image_shape)
+            if not self.packed:
+                found["tiles_per_gauss"] = found["tiles_per_gauss"].view(*self.image_shape, n)
+            return found
 
         if dominance:
             meta.update(dominant(blends))
@@ -476,7 +479,7 @@ def intersections(lists: Sequence[TileLists], depths: Sequence[Tensor], image_sh
         image_shape: batch dimensions and cameras.
 
     Returns:
-        tiles_per_gauss, isect_ids, flatten_ids, isect_offsets.
+        tiles_per_gauss [all rows], isect_ids, flatten_ids, isect_offsets.
     """
     per_gauss: list[Tensor] = []
     ids: list[Tensor] = []

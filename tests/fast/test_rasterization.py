@@ -348,6 +348,9 @@ def test_meta_is_a_mapping_that_tells_the_truth(packed: bool) -> None:
     names = list(meta)
     assert set(names) >= GSPLAT_META | {"dominant_ids", "dominant_counts", "n_contrib", "n_traversed"}
     assert len(meta) == len(names)
+    # as gsplat shapes them
+    assert meta["tiles_per_gauss"].shape == meta["depths"].shape == ((len(meta["means2d"]),) if packed else (2, N))
+    meta = rasterization(**scene(), **cameras(2), packed=packed)[2]
     assert "to be computed when read: ['dominant_ids'" in repr(meta)
     assert list(meta.keys()) == [key for key, _ in meta.items()] == list(dict(meta)) == list({**meta}) == names
     assert all(dict(meta)[key] is meta[key] for key in names)

@@ -91,6 +91,17 @@ def test_a_render_is_the_oracles(gpu, backward):
     np.testing.assert_allclose(1.0 - alphas[0, ..., 0].cpu().numpy(), expected.T_final, atol=2e-4)
 
 
+def test_second_derivatives_of_a_render_are_refused(gpu):
+    scene = training_scene()
+    p = {name: value.to(gpu).requires_grad_() for name, value in scene.params.items()}
+    total = drawn(on_gpu, p, scene, views=[0])[0].sum()
+    (gradient,) = torch.autograd.grad(total, p["means"], retain_graph=True)
+    assert bool((gradient != 0.0).any())
+    # its cotangent requires no gradient
+    with pytest.raises(RuntimeError, match="no second derivatives"):
+        torch.autograd.grad(total, p["means"], create_graph=True)
+
+
 def test_fused_steps_launched_one_by_one_give_the_same_bits_twice_and_learn(gpu):
     found = []
     for _ in range(2):
