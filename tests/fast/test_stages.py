@@ -275,6 +275,14 @@ def test_nothing_flows_through_the_mask_and_no_graph_is_made_without_need() -> N
         assert not pop_loss(o.clone().requires_grad_(), torch.tensor([True, False])).requires_grad
 
 
+def test_counts_are_no_mask() -> None:
+    counts = torch.tensor([2, 0, 0])
+    with pytest.raises(ValueError, match=r"mask is torch.int64 \[3\]; it must be torch.bool \[3\], as importance_mask"):
+        pop_loss(torch.tensor([0.5, 0.25, 0.25]), counts)
+    with pytest.raises(ValueError, match=r"mask is torch.bool \[3\]; it must be torch.bool \[2\]"):
+        pop_loss(torch.tensor([0.5, 0.25]), importance_mask(counts))
+
+
 def test_second_derivatives_are_right_or_refused() -> None:
     x = torch.linspace(-2.0, 3.0, 7, dtype=torch.float64, requires_grad=True)
     for term in (opacity_entropy, lambda logits: pop_loss(logits.sigmoid(), torch.arange(7) < 3)):
