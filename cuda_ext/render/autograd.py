@@ -189,7 +189,8 @@ class Blend(torch.autograd.Function):
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor]:
         means2d, conics, opacities, colors, background, buffers, settings, state, stats, sink = inputs
         rows = tuple(t.detach().contiguous() for t in (means2d, conics, opacities, colors))
-        behind = None if background is None else background.detach().contiguous()
+        # a copy: the caller may have written to it before the way back
+        behind = None if background is None else background.detach().clone(memory_format=torch.contiguous_format)
         blended = BlendBuffers(rows, behind, buffers, settings)
         blended.run(stats)
         ctx.blended, ctx.state, ctx.sink = blended, state, sink

@@ -102,6 +102,20 @@ def test_second_derivatives_of_a_render_are_refused(gpu):
         torch.autograd.grad(total, p["means"], create_graph=True)
 
 
+def test_a_background_may_be_written_to_before_the_way_back(gpu):
+    scene = training_scene()
+
+    def gradient(written: bool):
+        p = {name: value.to(gpu).requires_grad_() for name, value in scene.params.items()}
+        behind = torch.full((1, 3), 0.75, device=gpu)
+        image = drawn(on_gpu, p, scene, views=[0], backgrounds=behind)[0]
+        if written:
+            behind.zero_()
+        return torch.autograd.grad(image.square().sum(), p["opacities"])[0]
+
+    assert torch.equal(gradient(True), gradient(False))
+
+
 def test_fused_steps_launched_one_by_one_give_the_same_bits_twice_and_learn(gpu):
     found = []
     for _ in range(2):
