@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from pop_fast.stages.compositing import Composite
 from pop_fast.stages.contributions import Contributions, DominantPoints
 from pop_fast.stages.splatting import ProjectionSettings, Shapes, Splats, colors_of
 from pop_fast.stages.stage_set import PassInput, Seen
 from pop_fast.stages.tiles import TileLists
+from pop_fast.stages.types import once_differentiable
 from pop_ref import compositing, splatting
 from pop_ref.chord import dominant_points
 from pop_ref.contributions import contributions
@@ -155,7 +155,8 @@ def _lists(rows: OracleSplats, settings: ProjectionSettings, tile_size: int) -> 
 
 
 def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().double().cpu().numpy()
+    # a copy: the way back may come after the caller has written to the tensor
+    return tensor.detach().cpu().numpy().astype(np.float64)
 
 
 class OracleView:

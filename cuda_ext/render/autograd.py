@@ -9,18 +9,22 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from cuda_ext import load
 from cuda_ext.arrays import Settings, empty, fill, stream_of
 from cuda_ext.render.lists import LOWER, TileBuffers, splat_struct
 
 
-def _where_the_cotangents_are(backward: Callable[..., Any]) -> Callable[..., Any]:
-    """Make a transpose run with its tensors' device as the current one, on which kernels run, whoever calls it."""
+def _transpose(backward: Callable[..., Any]) -> Callable[..., Any]:
+    """Make a transpose run with its tensors' device as the current one, on which kernels run, whoever calls it.
+
+    It refuses to be differentiated, with a RuntimeError.
+    """
 
     @functools.wraps(backward)
     def there(ctx: Any, *cotangents: Any) -> Any:
+        if torch.is_grad_enabled():
+            raise RuntimeError("there are no second derivatives here; take gradients without create_graph=True")
         with torch.cuda.device_of(next(v for v in cotangents if v is not None)):
             return backward(ctx, *cotangents)
 
@@ -59,8 +63,7 @@ class Project(torch.autograd.Function):
         return means2d, depths, conics, blended, radii, means.new_empty((n, 0)) if colors is None else colors
 
     @staticmethod
-    @once_differentiable
-    @_where_the_cotangents_are
+    @_transpose
     def backward(ctx: Any, *cotangents: Any) -> tuple[Tensor | None, ...]:
         v_means2d, v_depths, v_conics, v_opacities, _, v_colors = cotangents
         means, quats, scales, opacities, sh, viewmat, K, radii = ctx.saved_tensors
@@ -186,7 +189,8 @@ class Blend(torch.autograd.Function):
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor]:
         means2d, conics, opacities, colors, background, buffers, settings, state, stats, sink = inputs
         rows = tuple(t.detach().contiguous() for t in (means2d, conics, opacities, colors))
-        behind = None if background is None else background.detach().contiguous()
+        # a copy: the caller may have written to it before the way back
+        behind = None if background is None else background.detach().clone(memory_format=torch.contiguous_format)
         blended = BlendBuffers(rows, behind, buffers, settings)
         blended.run(stats)
         ctx.blended, ctx.state, ctx.sink = blended, state, sink
@@ -194,8 +198,7 @@ class Blend(torch.autograd.Function):
         return blended.image.detach(), blended.T_final.detach()
 
     @staticmethod
-    @once_differentiable
-    @_where_the_cotangents_are
+    @_transpose
     def backward(ctx: Any, *cotangents: Any) -> tuple[Tensor | None, ...]:
         v_image, v_T_final = cotangents
         blended = ctx.blended

@@ -212,6 +212,8 @@ def fastest_backend(device: str) -> Backend:
 def require_backend(backend: str | Backend) -> Backend:
     """Return a backend, or that of a name, which can run here; PopError says why one cannot, and what to do."""
     found = get_backend(backend) if isinstance(backend, str) else backend
+    if not callable(getattr(found, "why_not", None)):
+        raise PopError(f"backend is {backend!r}; it must be a backend or the name of one")
     reason = found.why_not()
     if reason is not None:
         raise PopError(f"backend {found.name!r} cannot run: {reason}")

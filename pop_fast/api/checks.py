@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Any, Final
 
 import numpy as np
@@ -127,10 +127,9 @@ class Checks:
         self._backend, self._dtype = backend, dtype
         self._rules: list[_Rule] = []
 
-    def tensor(self, name: str, tensor: Tensor | None, shape: tuple[int, ...]) -> Tensor:
+    def tensor(self, name: str, tensor: Any, shape: tuple[int, ...]) -> Tensor:
         """Check one tensor's presence, place, type and shape, and return it; that it is finite is asked in `values`."""
-        if tensor is None:
-            raise ValueError(f"{name} is missing")
+        check_given(**{name: tensor})
         if not self._backend.holds(tensor):
             # the backend's own device by the name of the method that moves a tensor there
             device = self._backend.device
@@ -169,6 +168,8 @@ class Checks:
         if means.dim() < 2 or means.shape[-1] != 3:
             raise ValueError(f"means has shape {list(means.shape)}; it must be [..., N, 3]")
         batch, n = tuple(means.shape[:-2]), means.shape[-2]
+        if 0 in batch:
+            raise ValueError(f"means has shape {list(means.shape)}; a batch must hold at least one scene")
         self.finite("means", self.tensor("means", means, tuple(means.shape)))
         o = self.finite("opacities", self.tensor("opacities", opacities, (*batch, n)))
 
@@ -201,6 +202,8 @@ class Checks:
         if viewmats.dim() < 3:
             raise ValueError(f"viewmats has shape {list(viewmats.shape)}; it must be [..., C, 4, 4]")
         n = viewmats.shape[-3]
+        if n == 0:
+            raise ValueError(f"viewmats has shape {list(viewmats.shape)}; there must be at least one camera")
         given = self.tensor("viewmats", viewmats, (*batch, n, 4, 4)), self.tensor("Ks", Ks, (*batch, n, 3, 3))
         check_sizes(width, height, tile_size)
         # a few numbers, of which every question is a launch on a GPU and some microseconds in torch
@@ -223,13 +226,16 @@ class Checks:
         channels = tuple(colors.shape[max(colors.dim() - tail, 0) :])
         shared, per_camera = (*batch, n, *channels), (*batch, n_cameras, n, *channels)
         if sh_degree is not None:
-            if sh_degree not in (0, 1, 2, 3):
-                raise ValueError(f"sh_degree is {sh_degree}; it must be None, 0, 1, 2 or 3")
+            if not isinstance(sh_degree, Integral) or sh_degree not in (0, 1, 2, 3):
+                raise ValueError(f"sh_degree is {sh_degree!r}; it must be None, 0, 1, 2 or 3")
             need = (sh_degree + 1) ** 2
             if len(channels) != 2 or channels[1] != 3 or channels[0] < need:
                 raise ValueError(
                     f"colors has shape {list(colors.shape)}; sh_degree={sh_degree} needs [..., N, >={need}, 3]"
                 )
+        elif colors.dim() < len(batch) + 2:
+            rows = ", ".join(map(str, (*batch, n)))
+            raise ValueError(f"colors has shape {list(colors.shape)}; it must be [{rows}, D]")
         is_per_camera = tuple(colors.shape) == per_camera
         self.finite("colors", self.tensor("colors", colors, per_camera if is_per_camera else shared))
         return is_per_camera
@@ -261,6 +267,13 @@ def check_given(**tensors: Any) -> None:
         if not isinstance(value, Tensor):
             problem = "is missing" if value is None else f"is of type {type(value).__name__}"
             raise ValueError(f"{name} {problem}; it must be a torch.Tensor")
+
+
+def check_numbers(**numbers: Any) -> None:
+    """Raise ValueError, which names the argument, for what must be a number and is none."""
+    for name, value in numbers.items():
+        if not isinstance(value, Real):
+            raise ValueError(f"{name} is {value!r}; it must be a number")
 
 
 def check_sizes(width: int, height: int, tile_size: int) -> None:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Self
+from functools import wraps
+from typing import Any, Literal, ParamSpec, Self, TypeVar
 
 import torch
 from torch import Tensor
@@ -21,6 +22,7 @@ from pop_fast.api.checks import (
     Checks,
     check_choice,
     check_given,
+    check_numbers,
     check_sizes,
     check_supported,
     resolved_profile,
@@ -30,7 +32,22 @@ from pop_fast.stages.splatting import ProjectionSettings, Splats, colors_of
 from pop_fast.stages.tiles import TileLists
 from pop_ref.constants import Profile
 
+P = ParamSpec("P")
+T = TypeVar("T")
 
+
+def _untraced(function: Callable[P, T]) -> Callable[P, T]:
+    """Make a function that `torch.compile` calls as it is: tracing all that it calls would take minutes."""
+
+    @wraps(function)
+    def called(*args: P.args, **kwargs: P.kwargs) -> T:
+        run: Any = torch.compiler.disable(function) if torch.compiler.is_compiling() else function
+        return run(*args, **kwargs)
+
+    return called
+
+
+@_untraced
 def rasterization(
     means: Tensor,
     quats: Tensor | None,
@@ -128,6 +145,7 @@ def rasterization(
     check_supported(given, drawing)
     check_choice("render_mode", render_mode, RENDER_MODES)
     check_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
+    check_numbers(near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d)
     if not radius_clip >= 0.0:
         raise ValueError(f"radius_clip is {radius_clip}; it must be >= 0 px")
     chosen = resolved_profile(profile, near_plane, far_plane, eps2d)
@@ -158,7 +176,8 @@ def rasterization(
         colors=colors.reshape(n_images if per_camera else n_scenes, *colors.shape[len(batch) + per_camera :]),
         per_camera=per_camera,
         viewmats=viewmats.reshape(n_images, 4, 4),
-        Ks=Ks.reshape(n_images, 3, 3),
+        # the way back reads them too, and may come after the caller has written others there
+        Ks=Ks.detach().reshape(n_images, 3, 3).clone(),
         n_cameras=n_cameras,
     )
     settings = ProjectionSettings(Ks, width, height, chosen, rasterize_mode == "antialiased", radius_clip)
@@ -341,12 +360,16 @@ class RasterizationCall:
             }
 
         @torch.no_grad()
+        @torch.autocast(self.scene.means.device.type, enabled=False)
         def again(with_dominance: bool) -> list[Composite]:
             return [self._blend(image, None, with_dominance, not with_dominance) for image in images]
 
         def overlaps() -> dict[str, Any]:
             lists = [self.stages.tile_lists(image.rows, image.settings, self.tile_size) for image in images]
-            return intersections(lists, [image.rows.depths for image in images], self.image_shape)
+            found = intersections(lists, [image.rows.depths for image in images], self.image_shape)
+            if not self.packed:
+                found["tiles_per_gauss"] = found["tiles_per_gauss"].view(*self.image_shape, n)
+            return found
 
         if dominance:
             meta.update(dominant(blends))
@@ -403,7 +426,7 @@ class RenderMeta(MutableMapping[str, Any]):
 
     def __getitem__(self, key: str) -> Any:
         if key in self._pending:
-            for name, value in self._pending[key]().items():
+            for name, value in _untraced(self._pending[key])().items():
                 # what has been set or computed meanwhile stays as it is
                 if self._pending.pop(name, None) is not None:
                     self._values[name] = value
@@ -456,7 +479,7 @@ def intersections(lists: Sequence[TileLists], depths: Sequence[Tensor], image_sh
         image_shape: batch dimensions and cameras.
 
     Returns:
-        tiles_per_gauss, isect_ids, flatten_ids, isect_offsets.
+        tiles_per_gauss [all rows], isect_ids, flatten_ids, isect_offsets.
     """
     per_gauss: list[Tensor] = []
     ids: list[Tensor] = []

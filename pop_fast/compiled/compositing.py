@@ -104,7 +104,9 @@ class _Composite(torch.autograd.Function):
     @full_precision_backward
     def backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None, *_: None) -> tuple[Tensor | None, ...]:
         options: BlendOptions = ctx.options
-        inputs, kept, sink = ctx.saved_tensors[:4], ctx.saved_tensors[4:], options.absgrad_sink
+        # asked for once, as checkpoints want it
+        saved, sink = ctx.saved_tensors, options.absgrad_sink
+        inputs, kept = saved[:4], saved[4:]
         # component rows, as the projection's transpose takes them
         found = {name: tensor.new_empty(tensor.shape[::-1]) for name, tensor in zip(_RESULTS, inputs, strict=True)}
         absolute = None if sink is None else sink.new_empty(sink.shape[::-1])

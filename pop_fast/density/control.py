@@ -199,6 +199,9 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
     ) -> DensificationStep | None:
         """Collect statistics; at a refine step grow, prune and start a new window; at a reset step reset.
 
+        Args:
+            packed: as gsplat's strategies take it; whether rows are packed is read from `info`.
+
         Returns:
             What happened to the Gaussians, or None where this is no step at which they change.
 
@@ -211,28 +214,32 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
                 "params['opacities']), state, step, info), where it is not None, to the loss, or set lambda_pop=0",
                 stacklevel=2,
             )
-        self.collect(params, state, step, info, packed)
+        self.collect(params, state, step, info)
         return self.change(params, optimizers, state, step)
 
-    def collect(self, params: Params, state: State, step: int, info: Info, packed: bool = False) -> None:
+    def collect(self, params: Params, state: State, step: int, info: Info) -> None:
         """Add what a view has shown to the window's statistics, which lie in `state`, where `collects` says so.
 
         Args:
             params: raw parameters, after the optimizers' step.
             info: what `rasterization()` returned last, after the backward pass.
-            packed: whether its rows are those of visible Gaussians alone.
+
+        Raises:
+            ValueError: the screen centres have no gradient, or no absolute one where `absgrad` reads it.
         """
         if self.collects(step):
             import torch
 
             with torch.no_grad():
-                self._collect(params, state, step, info, packed)
+                self._collect(params, state, step, info)
 
-    def _collect(self, params: Params, state: State, step: int, info: Info, packed: bool) -> None:
+    def _collect(self, params: Params, state: State, step: int, info: Info) -> None:
         import torch
 
-        n = len(params["means"])
+        n, packed = len(params["means"]), info.get("gaussian_ids") is not None
         means2d = info[self.key_for_gradient]
+        if self.absgrad and not hasattr(means2d, "absgrad"):
+            raise ValueError(f"{self.key_for_gradient} has no absgrad, which is read here; render with absgrad=True")
         grads = means2d.absgrad if self.absgrad else means2d.grad
         if grads is None:
             raise ValueError(f"{self.key_for_gradient} has no gradient; call step_pre_backward before loss.backward()")

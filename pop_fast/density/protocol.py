@@ -217,7 +217,7 @@ class ForeignStrategy:
     def step_pre_backward(self, params: Params, optimizers: Optimizers, state: State, step: int, info: Info) -> None:
         self.strategy.step_pre_backward(params, optimizers, state, step, info)
 
-    def collect(self, params: Params, state: State, step: int, info: Info, packed: bool = False) -> None:
+    def collect(self, params: Params, state: State, step: int, info: Info) -> None:
         """Keep what the step's render returned for `change`, in which the strategy itself collects."""
         self._info = info
 

@@ -332,7 +332,7 @@ class Blender:
         n_colors, n_rows = v.shape[1] - 1, q.shape[0] * q.shape[1]
         rows = q.new_empty((len(q), q.shape[1] // BLOCK, 6 + n_colors + 2 * absolute, BLOCK))
         # [n, D, K] and, below, [6, n K], each cut into blocks
-        by_color = torch.bmm(v[:, :-1], weight.transpose(1, 2)).view(len(q), n_colors, -1, BLOCK)
+        by_color = torch.bmm(v[:, :-1], weight.transpose(1, 2)).view(len(q), n_colors, rows.shape[1], BLOCK)
         rows[:, :, 6 : 6 + n_colors] = by_color.transpose(1, 2)
         rows = rows.view(-1, rows.shape[2], BLOCK)
         g = q.mul_(weight)
@@ -401,7 +401,9 @@ def acquire_buffer(numel: int, dtype: torch.dtype) -> Tensor:
     length = 1 << max(numel - 1, 0).bit_length()
     free = _pool.free.get((dtype, length))
     if not free:
-        return torch.empty(length, dtype=dtype)
+        # of no mode: what `torch.inference_mode` makes may not be written to after it
+        with torch.inference_mode(False):
+            return torch.empty(length, dtype=dtype)
     _pool.retained -= length * dtype.itemsize
     return free.pop()
 

@@ -49,14 +49,13 @@ class _Opacities(torch.autograd.Function):
 
 def unit_quats_from_quats(quats: Tensor) -> Tensor:
     """See `pop_ref.activations.unit_quats_from_quats`."""
-    return quats / quats.norm(dim=-1, keepdim=True)
+    return from_columns(_unit_columns(quats)[0], (4,))
 
 
 def unit_quats_from_quats_vjp(quats: Tensor, v_unit_quats: Tensor) -> Tensor:
     """See `pop_ref.activations.unit_quats_from_quats_vjp`."""
-    norms = quats.norm(dim=-1, keepdim=True)
-    unit = quats / norms
-    return (v_unit_quats - unit * (unit * v_unit_quats).sum(-1, keepdim=True)) / norms
+    unit, norms = _unit_columns(quats)
+    return _along_the_sphere(unit, norms, columns(v_unit_quats))
 
 
 def rotmats_from_quats(quats: Tensor) -> Tensor:
@@ -96,9 +95,11 @@ def covars_from_quats_scales_vjp(quats: Tensor, scales: Tensor, v_covars: Tensor
 
 
 def _unit_columns(quats: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
-    w, x, y, z = columns(quats)
-    norms = torch.sqrt(w * w + x * x + y * y + z * z)
-    return (w / norms, x / norms, y / norms, z / norms), norms
+    # divided by the largest entry first: squares of no quaternion overflow or vanish
+    largest = quats.abs().amax(-1)
+    w, x, y, z = (c / largest for c in columns(quats))
+    length = torch.sqrt(w * w + x * x + y * y + z * z)
+    return (w / length, x / length, y / length, z / length), largest * length
 
 
 def _rotation_entries(w: Tensor, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, ...]:
@@ -130,7 +131,10 @@ def _quats_vjp(unit: tuple[Tensor, ...], norms: Tensor, v: tuple[Tensor, ...]) -
     v_x = 2.0 * (w * (v[7] - v[5]) + y * (v[1] + v[3]) + z * (v[2] + v[6]) - 2.0 * x * (v[4] + v[8]))
     v_y = 2.0 * (w * (v[2] - v[6]) + x * (v[1] + v[3]) + z * (v[5] + v[7]) - 2.0 * y * (v[0] + v[8]))
     v_z = 2.0 * (w * (v[3] - v[1]) + x * (v[2] + v[6]) + y * (v[5] + v[7]) - 2.0 * z * (v[0] + v[4]))
-    along = w * v_w + x * v_x + y * v_y + z * v_z
+    return _along_the_sphere(unit, norms, (v_w, v_x, v_y, v_z))
+
+
+def _along_the_sphere(unit: tuple[Tensor, ...], norms: Tensor, v_unit: tuple[Tensor, ...]) -> Tensor:
+    along = sum_of_products(unit, v_unit)
     # the norm of a quaternion has no effect, so its gradient has no part along the quaternion
-    parts = [(v_c - c * along) / norms for c, v_c in zip(unit, (v_w, v_x, v_y, v_z), strict=True)]
-    return from_columns(parts, (4,))
+    return from_columns([(v_c - c * along) / norms for c, v_c in zip(unit, v_unit, strict=True)], (4,))

@@ -43,6 +43,7 @@ from typing import Any, Final, Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from pop_fast.stages.types import once_differentiable
 from pop_ref.settings import LAMBDA_SSIM_3DGS, Objective, Recipe
 
 Padding = Literal["valid", "same"]
@@ -376,7 +377,7 @@ class _Loss(torch.autograd.Function):
         return value
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
+    @once_differentiable
     def backward(ctx: Any, v_loss: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         (grad,) = ctx.saved_tensors
         return v_loss * grad, None, None, None, None, None

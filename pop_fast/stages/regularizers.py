@@ -61,6 +61,9 @@ def pop_loss(opacities: Tensor, mask: Tensor, visible: Tensor | None = None) -> 
 
     Optimizations: the gradient does not depend on the opacities, so it is made with the value and backward is one
     product; no data-dependent shapes, so nothing waits for a device.
+
+    Raises:
+        ValueError: the mask is not bool, as counts are not, or not of these opacities.
     """
     if not (opacities.requires_grad and torch.is_grad_enabled()):
         return _value_and_grad(opacities, mask, visible)[0]
@@ -92,12 +95,16 @@ class _Entropy(torch.autograd.Function):
         return entropies.sum() / max(len(logits), 1)
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx, v_loss: Tensor) -> Tensor:  # type: ignore[override]
         return opacity_entropy_vjp(ctx.saved_tensors[0], v_loss)
 
 
 def _value_and_grad(opacities: Tensor, mask: Tensor, visible: Tensor | None) -> tuple[Tensor, Tensor]:
+    if mask.dtype != torch.bool or mask.shape != opacities.shape:
+        raise ValueError(
+            f"mask is {mask.dtype} {list(mask.shape)}; it must be torch.bool {list(opacities.shape)}, "
+            "as importance_mask makes it of dominant counts"
+        )
     other = ~mask
     if visible is not None:
         mask, other = mask & visible, other & visible
@@ -116,7 +123,6 @@ class _PopLoss(torch.autograd.Function):
         return value
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx, v_loss: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
         (grad,) = ctx.saved_tensors
         return v_loss * grad, None, None

@@ -18,7 +18,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 
 @dataclass(frozen=True)
@@ -40,6 +39,22 @@ class Camera:
     K: Tensor  # intrinsics, px. [3, 3]
     width: int  # px
     height: int  # px
+
+
+def once_differentiable(backward: Callable[..., Any]) -> Callable[..., Any]:
+    """Make the backward pass of an autograd function refuse to be differentiated, with a RuntimeError.
+
+    Torch's own decorator refuses only where a cotangent requires a gradient and no inputs are named: the Hessian of a
+    sum was 0.
+    """
+
+    @wraps(backward)
+    def once(ctx: Any, *cotangents: Any) -> Any:
+        if torch.is_grad_enabled():
+            raise RuntimeError("there are no second derivatives here; take gradients without create_graph=True")
+        return backward(ctx, *cotangents)
+
+    return once
 
 
 def full_precision_backward(backward: Callable[..., Any]) -> Callable[..., Any]:

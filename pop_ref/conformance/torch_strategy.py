@@ -155,7 +155,7 @@ def _looked(
         more = _known(strategy.step_post_backward, more)
         strategy.step_post_backward(params, optimizers, state, step, info, **more)
         return {}
-    strategy.collect(params, state, step, info, script.packed)
+    strategy.collect(params, state, step, info)
     if not strategy.changes_after(step):
         return {}
     extras = trainer.extras(step)

@@ -72,6 +72,28 @@ def densified_at(strategy, params, optimizers, info, step: int):
     return strategy.step_post_backward(params, optimizers, state, step, info)
 
 
+def test_whether_rows_are_packed_is_read_from_info_and_absolute_gradients_are_asked_for():
+    sums, strategy = [], POPStrategy(lambda_pop=0.0)
+    for packed in (None, False, True):
+        params, optimizers = make(6, scale=0.5)
+        state, seen = strategy.initialize_state(1.0), torch.eye(4).repeat(2, 1, 1)
+        seen[:, 2, 3] = 3.0
+        K = torch.tensor([[16.0, 0.0, 16.0], [0.0, 16.0, 8.0], [0.0, 0.0, 1.0]]).repeat(2, 1, 1)
+        rows = (params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid())
+        # packed is the default of a rasterization, and not of a strategy
+        how = {} if packed is None else {"packed": packed}
+        image, _, info = rasterization(*rows, params["sh0"], seen, K, 32, 16, sh_degree=0, **how, backend="fast")
+        strategy.step_pre_backward(params, optimizers, state, 1, info)
+        image.square().sum().backward()
+        strategy.step_post_backward(params, optimizers, state, 1, info)
+        sums.append((state["grad2d"], state["count"]))
+        with pytest.raises(ValueError, match="means2d has no absgrad, which is read here; render with absgrad=True"):
+            POPStrategy(lambda_pop=0.0, absgrad=True).step_post_backward(params, optimizers, state, 1, info)
+    for found in zip(*sums, strict=True):
+        assert bool((found[0] > 0.0).any())
+        assert all(torch.equal(found[0], other) for other in found[1:])
+
+
 def test_gsplat_attribute_names_exist_with_gsplat_numbers():
     for strategy in (POPStrategy(), GsplatStrategy()):
         assert isinstance(strategy, Strategy)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 import torch.utils._pytree
+import torch.utils.checkpoint
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -75,6 +76,116 @@ def test_a_loss_that_goes_back_inside_autocast_has_the_same_gradients(backend: s
 
     skip_without(backend)
     assert all(map(torch.equal, gradients(True), gradients(False)))
+
+
+ON_THE_CPU = ("fast", "compiled", "ref")
+
+
+@pytest.mark.parametrize("backend", ON_THE_CPU)
+def test_what_is_drawn_in_another_mode_of_torch_leaves_the_rest_as_it_is(backend: str) -> None:
+    skip_without(backend)
+    blend.clear_buffers()
+    single = {name: value.float() for name, value in scene(n=8).items()}
+    drawn = partial(program, **cameras(dtype=torch.float32), backend=backend)
+    for mode in (torch.inference_mode(), torch.autocast("cpu")):
+        with mode:
+            meta = drawn(**single)[2]
+            counts = meta["dominant_counts"]
+        plain = drawn(**single)[2]
+        assert torch.equal(counts, plain["dominant_counts"])
+        assert torch.equal(meta["n_contrib"], plain["n_contrib"])
+        leaves = {name: value.clone().requires_grad_() for name, value in single.items()}
+        drawn(**leaves)[0].square().sum().backward()
+
+
+@pytest.mark.parametrize("backend", ON_THE_CPU)
+def test_what_is_written_to_inputs_before_the_way_back_changes_no_gradient_in_silence(backend: str) -> None:
+    skip_without(backend)
+
+    def gradients(written: str | None) -> list[Tensor]:
+        given = {**scene(n=8), **cameras()}
+        leaves = [given[name].requires_grad_() for name in scene()]
+        image, alphas, _ = program(**given, backend=backend)
+        if written is not None:
+            given[written].detach().mul_(0.75)
+        return list(torch.autograd.grad(image.square().sum() + alphas.sum(), leaves))
+
+    once = gradients(None)
+    for name in (*scene(), "viewmats", "Ks"):
+        try:
+            found = gradients(name)
+        except RuntimeError:
+            # autograd's own, of what it has saved
+            found = once if name != "Ks" else []
+        assert found, name
+        assert all(map(torch.equal, once, found)), name
+
+
+@pytest.mark.parametrize("backend", ON_THE_CPU)
+def test_second_derivatives_are_refused_where_first_ones_of_a_checkpoint_are_right(backend: str) -> None:
+    skip_without(backend)
+    rows = scene(n=8)
+    means = rows.pop("means").requires_grad_()
+
+    def total(means: Tensor) -> Tensor:
+        return program(means, **rows, **cameras(), backend=backend)[0].sum()
+
+    (once,) = torch.autograd.grad(total(means), means)
+    again = torch.utils.checkpoint.checkpoint(total, means, use_reentrant=False)
+    assert torch.equal(torch.autograd.grad(again, means)[0], once)
+    # the cotangent of a sum requires no gradient
+    with pytest.raises(RuntimeError, match="no second derivatives"):
+        torch.autograd.functional.hessian(total, means)
+
+
+@pytest.mark.parametrize("backend", ON_THE_CPU)
+@pytest.mark.parametrize("norm", [1e-25, 1e25])
+def test_quaternions_have_any_norm(backend: str, norm: float) -> None:
+    skip_without(backend)
+    given = {name: value.float() for name, value in scene().items()}
+    images, gradients = [], []
+    for factor in (1.0, norm):
+        quats = (given["quats"] * factor).requires_grad_()
+        images.append(program(**{**given, "quats": quats}, **cameras(dtype=torch.float32), backend=backend)[0])
+        images[-1].square().sum().backward()
+        gradients.append(quats.grad.double() * factor)
+    torch.testing.assert_close(*images)
+    torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("backend", ON_THE_CPU)
+def test_a_compiled_step_calls_the_renderer_as_it_is(backend: str) -> None:
+    skip_without(backend)
+    rows = scene(n=8)
+
+    def step(means: Tensor) -> tuple[Tensor, Tensor]:
+        image, _, meta = program(means, **rows, **cameras(), backend=backend)
+        return image.square().mean(), meta["dominant_counts"]
+
+    means, found, graphs = rows.pop("means").requires_grad_(), [], []
+
+    def kept(graph: Any, _: Any) -> Any:
+        graphs.append(graph)
+        return graph.forward
+
+    torch.compiler.reset()
+    for function in (step, torch.compile(step, backend=kept)):
+        loss, counts = function(means)
+        found.append((loss, counts, *torch.autograd.grad(loss, means)))
+    assert all(map(torch.equal, *found))
+    # the cameras, and what the step does with the image: of the renderer there would be dozens
+    assert len(graphs) <= 3
+
+
+@pytest.mark.parametrize("backend", ON_THE_CPU)
+def test_colours_may_have_no_channel(backend: str) -> None:
+    skip_without(backend)
+    given = scene(channels=0)
+    given["opacities"].requires_grad_()
+    image, alphas, _ = program(**given, **cameras(), backend=backend)
+    assert image.shape == (1, HEIGHT, WIDTH, 0)
+    alphas.sum().backward()
+    assert bool((given["opacities"].grad != 0.0).any())
 
 
 def test_packed_rows_cameras_and_batches_have_the_bits_of_each_alone() -> None:
@@ -237,6 +348,9 @@ def test_meta_is_a_mapping_that_tells_the_truth(packed: bool) -> None:
     names = list(meta)
     assert set(names) >= GSPLAT_META | {"dominant_ids", "dominant_counts", "n_contrib", "n_traversed"}
     assert len(meta) == len(names)
+    # as gsplat shapes them
+    assert meta["tiles_per_gauss"].shape == meta["depths"].shape == ((len(meta["means2d"]),) if packed else (2, N))
+    meta = rasterization(**scene(), **cameras(2), packed=packed)[2]
     assert "to be computed when read: ['dominant_ids'" in repr(meta)
     assert list(meta.keys()) == [key for key, _ in meta.items()] == list(dict(meta)) == list({**meta}) == names
     assert all(dict(meta)[key] is meta[key] for key in names)
@@ -276,6 +390,8 @@ def test_an_unknown_backend_is_an_error_that_lists_the_known() -> None:
         get_backend("metal")
     with pytest.raises(PopError, match="backend 'metal' is unknown; use one of fast, compiled, cuda, ref"):
         program(**scene(), **cameras(), backend="metal")
+    with pytest.raises(PopError, match="backend is None; it must be a backend or the name of one"):
+        program(**scene(), **cameras(), backend=None)
 
 
 # The drop-in's arguments: gsplat 1.5.3's names and defaults, and what is refused, by name.
@@ -352,6 +468,16 @@ WRONG = {
     "width is None; it must be a whole number": {"width": lambda _: None},
     "height is 2.5; it must be a whole number": {"height": lambda _: 2.5},
     "tile_size is '16'; it must be a whole number": {"tile_size": lambda _: "16"},
+    "viewmats has shape [0, 4, 4]; there must be at least one camera": {"viewmats": lambda t: t[:0]},
+    "means has shape [0, 24, 3]; a batch must hold at least one scene": {"means": lambda t: t[None][:0]},
+    "colors has shape [24]; it must be [24, D]": {"colors": lambda t: t[:, 0]},
+    "quats is of type ndarray; it must be a torch.Tensor": {"quats": lambda t: t.numpy()},
+    "backgrounds is of type list; it must be a torch.Tensor": {"backgrounds": lambda _: [0.0, 0.0, 0.0]},
+    "sh_degree is 2.0; it must be None, 0, 1, 2 or 3": {"sh_degree": lambda _: 2.0},
+    "near_plane is None; it must be a number": {"near_plane": lambda _: None},
+    "far_plane is '9'; it must be a number": {"far_plane": lambda _: "9"},
+    "eps2d is None; it must be a number": {"eps2d": lambda _: None},
+    "radius_clip is None; it must be a number": {"radius_clip": lambda _: None},
 }
 
 

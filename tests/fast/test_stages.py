@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
@@ -20,7 +21,7 @@ from pop_fast.compiled import losses as compiled_losses
 from pop_fast.density import rows as ops
 from pop_fast.stages import density as fast
 from pop_fast.stages import losses, tiles
-from pop_fast.stages.regularizers import importance_mask, pop_loss
+from pop_fast.stages.regularizers import importance_mask, opacity_entropy, pop_loss
 from pop_fast.stages.tiles import TileLists, tight_tile_lists, tile_lists
 from pop_ref import losses as oracle_losses
 from pop_ref import ssim as oracle_ssim
@@ -279,6 +280,25 @@ def test_nothing_flows_through_the_mask_and_no_graph_is_made_without_need() -> N
     assert not pop_loss(o, torch.tensor([True, False])).requires_grad
     with torch.no_grad():
         assert not pop_loss(o.clone().requires_grad_(), torch.tensor([True, False])).requires_grad
+
+
+def test_counts_are_no_mask() -> None:
+    counts = torch.tensor([2, 0, 0])
+    with pytest.raises(ValueError, match=r"mask is torch.int64 \[3\]; it must be torch.bool \[3\], as importance_mask"):
+        pop_loss(torch.tensor([0.5, 0.25, 0.25]), counts)
+    with pytest.raises(ValueError, match=r"mask is torch.bool \[3\]; it must be torch.bool \[2\]"):
+        pop_loss(torch.tensor([0.5, 0.25]), importance_mask(counts))
+
+
+def test_second_derivatives_are_right_or_refused() -> None:
+    x = torch.linspace(-2.0, 3.0, 7, dtype=torch.float64, requires_grad=True)
+    for term in (opacity_entropy, lambda logits: pop_loss(logits.sigmoid(), torch.arange(7) < 3)):
+        assert torch.autograd.gradgradcheck(term, x)
+        assert bool((torch.autograd.functional.hessian(term, x).diagonal() != 0.0).any())
+    image = torch.rand((12, 11, 3), dtype=torch.float64)
+    for module in (losses, compiled_losses) if compiled.why_not() is None else (losses,):
+        with pytest.raises(RuntimeError, match="no second derivatives"):
+            torch.autograd.functional.hessian(partial(module.photometric_pop, target=image), image)
 
 
 def test_masks_of_several_views_are_made_at_once() -> None:

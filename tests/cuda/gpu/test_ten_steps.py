@@ -91,6 +91,31 @@ def test_a_render_is_the_oracles(gpu, backward):
     np.testing.assert_allclose(1.0 - alphas[0, ..., 0].cpu().numpy(), expected.T_final, atol=2e-4)
 
 
+def test_second_derivatives_of_a_render_are_refused(gpu):
+    scene = training_scene()
+    p = {name: value.to(gpu).requires_grad_() for name, value in scene.params.items()}
+    total = drawn(on_gpu, p, scene, views=[0])[0].sum()
+    (gradient,) = torch.autograd.grad(total, p["means"], retain_graph=True)
+    assert bool((gradient != 0.0).any())
+    # its cotangent requires no gradient
+    with pytest.raises(RuntimeError, match="no second derivatives"):
+        torch.autograd.grad(total, p["means"], create_graph=True)
+
+
+def test_a_background_may_be_written_to_before_the_way_back(gpu):
+    scene = training_scene()
+
+    def gradient(written: bool):
+        p = {name: value.to(gpu).requires_grad_() for name, value in scene.params.items()}
+        behind = torch.full((1, 3), 0.75, device=gpu)
+        image = drawn(on_gpu, p, scene, views=[0], backgrounds=behind)[0]
+        if written:
+            behind.zero_()
+        return torch.autograd.grad(image.square().sum(), p["opacities"])[0]
+
+    assert torch.equal(gradient(True), gradient(False))
+
+
 def test_fused_steps_launched_one_by_one_give_the_same_bits_twice_and_learn(gpu):
     found = []
     for _ in range(2):
