@@ -229,7 +229,7 @@ def _ready(missing: Sequence[Job], args: argparse.Namespace) -> bool:
 _SHOWN: Final = 5  # differences
 _VERIFY: Final = """
     pop-repro verify pop fox --data DATA                  all steps; the same command continues after a stop
-    pop-repro verify pop fox --data DATA --steps 500      the first 500, in a minute or so
+    pop-repro verify pop fox --data DATA --steps 2000     the first 2,000, with the first look at held-out views
 """
 
 
