@@ -405,7 +405,8 @@ def test_a_toy_is_said_to_tell_nothing_and_other_data_to_be_a_yardstick() -> Non
     assert telling() == ["paper", "full", "no_floor", "small"]
     text = markdown("small", runs)
     assert "NOT the paper's protocol" in text
-    assert "PSNR 0.014 dB (2 degrees of freedom, 2 pairs of row and scene" in text
+    assert "PSNR 0.014 dB (2 degrees of freedom, 2 pairs of row and scene, on fox alone, each between" in text
+    assert "scene, on bear_512, fox, each between" in markdown("small", [*runs, *two("pop", "bear_512")])
     assert "| default | fox | N pop / l2_blur 40.0% (39.8% to 40.2%)" in text
     assert text.count("```sh") >= 12
     empty = markdown("paper", [])
@@ -427,7 +428,13 @@ def test_the_outcome_is_five_lines_each_with_an_interval_or_the_run_that_decides
         r"; under A16 on \*\*does not hold\*\* \(fox PSNR pop - reset -0\.50 ± ",
         told[4],
     )
-    assert "**holds** at scale small (fox PSNR pop - 3dgs -0.50 ± " in told[3]
+    # a difference below 0 holds by the bound that it is held to
+    assert re.search(
+        r"\*\*holds\*\* at scale small \(fox PSNR pop - 3dgs -0\.50 ± \S+ dB, where at least -1\.22 dB is asked\);",
+        told[3],
+    )
+    halved = judged("half", [*two("pop", n=40_000), *two("l2_blur", n=100_000)]).told.evidence
+    assert halved[0].nearest.endswith("%), where at most 50.0% is asked")
     # the paper's own scale is told before others that decide too
     both = [*runs, *(replace(r, scale="paper", scene="bonsai") for r in [*two("pop"), *two("reset", psnr=29.0)])]
     assert "at scale paper (bonsai PSNR" in outcome(both).splitlines()[4]
