@@ -576,7 +576,7 @@ def test_the_figure_of_the_readme_is_of_the_results_that_are_kept(tmp_path):
 
 def test_without_renders_or_a_scene_figures_say_where_they_looked(tmp_path):
     runs = [result("pop"), result("3dgs")]
-    with pytest.raises(NoDataError, match=f"whose renders are in {tmp_path}; give the folder"):
+    with pytest.raises(NoDataError, match=rf"whose renders are in {tmp_path}; give the folder .* --results NEW, and"):
         qualitative.renders_and_photographs(asked("5", runs, tmp_path))
     with pytest.raises(PopError, match=f"{tmp_path} has none of kitchen; name another --data"):
         artifact.pushed(asked("3", [], tmp_path, scale="paper"))
