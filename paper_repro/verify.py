@@ -24,6 +24,7 @@ from typing import Final
 from paper_repro.collect import curve_of, digits, file_hash, final_stats, ply_of
 from paper_repro.jobs import Job
 from paper_repro.results import Result
+from paper_repro.scenes import MADE, find_folder
 from paper_repro.train_row import Options, git
 from pop_fast.api.backend import backend_names, get_backend
 from pop_fast.children import python_command
@@ -79,13 +80,15 @@ def verify(job: Job, options: Options, steps: int | None = None) -> Verification
         steps: after so many the training is stopped; None trains all.
 
     Raises:
-        PopError: there is no result, it names no commit of this clone, or the training failed.
+        PopError: there is no result, it names no commit of this clone, its scene is absent, or the training failed.
         KeyboardInterrupt: after Ctrl-C or SIGTERM, when the training has written a checkpoint.
     """
     result = job.result(options.results)
     if result is None:
         raise PopError(f"{job.file(options.results)}: has no result of {job.scene.name}, seed {job.seed}, to verify")
     _require_commit(result, _ROOT)
+    # said before minutes of cloning and compiling
+    _ = job.scene.name in MADE or find_folder(job.scene, options.data)
     # git is run from elsewhere
     place = job.work(options.work.absolute() / "verify").with_name(f"{job.scene.name}_{job.seed}_{result.commit}")
     _check_out(str(result.commit), place / "clone")

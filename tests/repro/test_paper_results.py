@@ -290,6 +290,16 @@ def test_a_result_whose_commit_is_not_there_is_refused(named, says, tmp_path, ca
     assert says in capsys.readouterr().err
 
 
+def test_a_scene_that_is_absent_is_said_before_anything_is_cloned(tmp_path, capsys, monkeypatch):
+    if history() is None:
+        pytest.skip("this folder is not a clone with its history")
+    monkeypatch.setattr(repro_verify, "_check_out", lambda *_: pytest.fail("cloned"))
+    write(replace(PLAIN, commit=FOUND[0].commit), tmp_path)
+    words = ["verify", "pop", "fox", "--scale", PLAIN.scale, "--results", str(tmp_path), "--work", str(tmp_path)]
+    assert main([*words, "--data", str(tmp_path / "nowhere")]) == 2
+    assert "nowhere: no such folder; name the one that holds the scenes with --data" in capsys.readouterr().err
+
+
 def test_what_has_no_result_is_refused(tmp_path, capsys):
     assert main(["verify", "pop", "demo", "--scale", "toy", "--results", str(tmp_path)]) == 2
     assert "pop.jsonl: has no result of demo, seed 42, to verify" in capsys.readouterr().err
