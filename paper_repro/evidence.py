@@ -18,6 +18,7 @@ times and entries a pixel are compared by their logarithms, because they vary in
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import exp, inf, log, sqrt
@@ -431,7 +432,14 @@ def command(scale: str, rows: Iterable[str], scenes: Iterable[str], seeds: int, 
     `where` is the machine, engine and threads on which alone that decides something; empty where any would do.
     """
     words = f"pop-repro queue --scale {scale} --data DATA --rows {' '.join(rows)} --scenes {' '.join(scenes)}"
-    return words + (f" --seeds {seeds}" if seeds > 1 else "") + (f"  # on {where}" if where else "")
+    # as `Result.trained_on` ends; without it a queue trains with one
+    threads = re.search(r", (\d+) threads$", where)
+    return (
+        words
+        + (f" --seeds {seeds}" if seeds > 1 else "")
+        + (f" --threads {threads[1]}" if threads else "")
+        + (f"  # on {where}" if where else "")
+    )
 
 
 def groups(results: Iterable[Result]) -> Groups:

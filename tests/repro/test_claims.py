@@ -304,6 +304,9 @@ def test_times_compare_on_one_machine_and_not_by_the_clock_of_a_cpu() -> None:
     # two seeds of gsplat are there, and a queue would not train them again
     assert told.told.deciders[0].startswith("pop-repro queue --scale small --data DATA --rows 3dgs gsplat pup ")
     assert told.told.deciders[0].endswith(f"--scenes fox --seeds 3  # on {pop[0].trained_on}")
+    # with as many threads as what is there was timed with
+    on_two = judged("fast", [replace(r, threads=2) for r in pop] + elsewhere).told.deciders[0]
+    assert on_two.endswith("--scenes fox --seeds 3 --threads 2  # on a machine (a kind), native, 2 threads")
     by_clock = [replace(r, seconds={k: v for k, v in r.seconds.items() if k != "cpu"}) for r in other]
     assert judged("fast", [*pop, *by_clock]).verdict == "not decided"
 
