@@ -176,7 +176,7 @@ def beyond(scale: str, results: Iterable[Result], absent: Iterable[str] = ()) ->
         make = _Maker(published, None, scale, title, scenes, frozenset(absent), where)
         lines = [make.line(row, name, found) for row, name in rows.items()]
         blocks.append(Block(_titled(title, scale, found, where), _placed(lines, metrics, 1)))
-    return Table("beyond", scale, "Beyond the paper", _header(scale, found), metrics, tuple(blocks), None, {})
+    return Table("beyond", scale, "Beyond the paper", _header(scale, found, False), metrics, tuple(blocks), None, {})
 
 
 def setting(result: Result, name: str) -> float | None:
@@ -355,7 +355,7 @@ def _titled(title: str, scale: str, found: Sequence[Result], where: str | None) 
     return f"{title} ({', '.join(facts)})"
 
 
-def _header(scale: str, found: Sequence[Result]) -> tuple[str, ...]:
+def _header(scale: str, found: Sequence[Result], has_ratios: bool = True) -> tuple[str, ...]:
     about = "Ours ± the sample standard deviation over seeds; one seed has none. n is the number of seeds."
     if scale == "paper":
         first = "Scale paper: the published protocol (protocol.md)."
@@ -368,7 +368,7 @@ def _header(scale: str, found: Sequence[Result]) -> tuple[str, ...]:
                 "full": "other photographs, on the whole schedule"}[scale]  # fmt: skip
         first = (
             f"NOT the paper's protocol: scale {scale}, {what} ({names}). No number here may be compared with a number "
-            "of the paper; ratios within the table stand beside the paper's own."
+            f"of the paper{'; ratios within the table stand beside its own' if has_ratios else ''}."
         )
     if not found:
         return first, "No run of this table is finished."

@@ -555,6 +555,9 @@ def test_what_goes_beyond_the_paper_has_a_table_of_its_own() -> None:
     assert line_of(made, 0, "final_prune").cells["ckpt_mb"].ours == "6.8"
     paper_rows = {line.row for t in paper().tables for line in t.rows}
     assert set(BEYOND) & paper_rows == {"pop"}
+    # it has no ratios, and does not say that it has
+    assert made.header[0].endswith("compared with a number of the paper.")
+    assert table(1, "small", DEV).header[0].endswith("ratios within the table stand beside its own.")
 
 
 def test_a_setting_is_found_by_the_end_of_its_name() -> None:
