@@ -229,7 +229,7 @@ def _ready(missing: Sequence[Job], args: argparse.Namespace) -> bool:
 _SHOWN: Final = 5  # differences
 _VERIFY: Final = """
     pop-repro verify pop fox --data DATA                  all steps; the same command continues after a stop
-    pop-repro verify pop fox --data DATA --steps 500      the first 500, in a minute or so
+    pop-repro verify pop fox --data DATA --steps 2000     the first 2,000, with the first look at held-out views
 """
 
 
@@ -462,7 +462,8 @@ def _run(words: list[str]) -> int:
         name = " ".join(words[:length])
         if name in COMMANDS:
             return COMMANDS[name][0](words[length:])
-    near = difflib.get_close_matches(words[0], [name.split()[0] for name in COMMANDS], n=1, cutoff=0.5)
-    hint = f"did you mean 'pop-repro {near[0]}'?" if near else "see 'pop-repro --help'"
+    names = {name.split()[0]: name for name in COMMANDS}
+    near = difflib.get_close_matches(words[0], names, n=1, cutoff=0.5)
+    hint = f"did you mean 'pop-repro {names[near[0]]}'?" if near else "see 'pop-repro --help'"
     print(f"pop-repro: error: '{words[0]}' is not a subcommand; {hint}", file=sys.stderr)
     return EXIT_BAD_INPUT

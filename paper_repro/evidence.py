@@ -18,6 +18,7 @@ times and entries a pixel are compared by their logarithms, because they vary in
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import exp, inf, log, sqrt
@@ -107,6 +108,7 @@ class Spread(NamedTuple):
         groups: how many pairs of row and scene have several seeds.
         least: the smallest standard deviation of one of them.
         largest: the largest.
+        scenes: that they are of.
     """
 
     s: float
@@ -114,6 +116,7 @@ class Spread(NamedTuple):
     groups: int
     least: float
     largest: float
+    scenes: tuple[str, ...]
 
 
 class Noise:
@@ -131,7 +134,7 @@ class Noise:
         return self._known[quantity.name]
 
     def _pooled(self, quantity: Quantity) -> Spread | None:
-        squares, df, own = 0.0, 0, []
+        squares, df, own, scenes = 0.0, 0, [], dict[str, None]()
         for group in self._groups:
             # times of two machines differ by more than their seeds
             apart = _by_machine(group.runs) if quantity is SECONDS else [group.runs]
@@ -142,7 +145,8 @@ class Noise:
                     mine = sum((value - mean) ** 2 for value in values)
                     squares, df = squares + mine, df + len(values) - 1
                     own.append(sqrt(mine / (len(values) - 1)))
-        return Spread(sqrt(squares / df), df, len(own), min(own), max(own)) if own else None
+                    scenes[group.runs[0].scene] = None
+        return Spread(sqrt(squares / df), df, len(own), min(own), max(own), tuple(scenes)) if own else None
 
 
 def _by_machine(runs: Iterable[Result]) -> list[list[Result]]:
@@ -211,14 +215,28 @@ class Comparison:
         """Write the value with its interval."""
         return f"{self.says} {self._value(self.half_width(together))}"
 
+    @property
+    def condition(self) -> str:
+        """Write what is asked of the value, where the bound is another than no difference at all."""
+        if self.asked == "nothing" or self.bound == 0.0:
+            return ""
+        form, unit = self._form
+        is_ratio = self.shown_as in ("share", "factor")
+        bound = self._ratio(self.bound) if is_ratio else f"{self.bound:{form}}{unit}"
+        return f", where {self.asked} {bound} is asked"
+
     def _value(self, half: float) -> str:
         told = half < inf
         if self.shown_as in ("share", "factor"):
             ends = (self.value - half, min(self.value + half, _LARGEST))
             interval = f"({self._ratio(ends[0])} to {self._ratio(ends[1])})" if told else "(no interval)"
             return f"{self._ratio(self.value)} {interval}"
-        form, unit = ("+.2f", " dB") if self.shown_as == "dB" else ("+.4g", "")
+        form, unit = self._form
         return f"{self.value:{form}}" + (f" ± {half:.2g}{unit}" if told else f"{unit} (no interval)")
+
+    @property
+    def _form(self) -> tuple[str, str]:
+        return ("+.2f", " dB") if self.shown_as == "dB" else ("+.4g", "")
 
     def _ratio(self, value: float) -> str:
         return f"{exp(value):.1%}" if self.shown_as == "share" else f"x {exp(value):.2f}"
@@ -312,7 +330,8 @@ class Evidence:
         why: what keeps it from being decided; empty where it is.
         under: what the runs were trained with, as far as it bears on the claim.
         runs: ids of the runs.
-        nearest: of what is asked, the number that is nearest to failing or fails by most, with its interval.
+        nearest: of what is asked, the number that is nearest to failing or fails by most, with its interval, and its
+            bound where that is not 0 or one to one.
         is_whole: whether it has every run, or is decided without; a scene that is not counts as one that was not run.
     """
 
@@ -413,7 +432,14 @@ def command(scale: str, rows: Iterable[str], scenes: Iterable[str], seeds: int, 
     `where` is the machine, engine and threads on which alone that decides something; empty where any would do.
     """
     words = f"pop-repro queue --scale {scale} --data DATA --rows {' '.join(rows)} --scenes {' '.join(scenes)}"
-    return words + (f" --seeds {seeds}" if seeds > 1 else "") + (f"  # on {where}" if where else "")
+    # as `Result.trained_on` ends; without it a queue trains with one
+    threads = re.search(r", (\d+) threads$", where)
+    return (
+        words
+        + (f" --seeds {seeds}" if seeds > 1 else "")
+        + (f" --threads {threads[1]}" if threads else "")
+        + (f"  # on {where}" if where else "")
+    )
 
 
 def groups(results: Iterable[Result]) -> Groups:

@@ -222,7 +222,8 @@ def _seeds_to_decide(at: _At, together: int) -> int | None:
 def _nearest(at: _At, together: int) -> str:
     asked = [c for c in at.made if c.asked != "nothing"]
     # in units of its own noise, since dB and logarithms do not compare
-    return min(asked, key=lambda c: c.margin / (c.error or 1.0)).text(together) if asked else ""
+    nearest = min(asked, key=lambda c: c.margin / (c.error or 1.0), default=None)
+    return "" if nearest is None else nearest.text(together) + nearest.condition
 
 
 def _decide(

@@ -176,8 +176,9 @@ def _spread(is_psnr: bool, is_log: bool, spread: Spread) -> str:
     def shown(s: float) -> str:
         return f"{expm1(s):.2%}" if is_log else f"{s:.3f} dB" if is_psnr else f"{s:.4f}"
 
+    where = ", ".join(spread.scenes) + (" alone" if len(spread.scenes) == 1 else "")
     return (
-        f"{shown(spread.s)} ({spread.df} degrees of freedom, {spread.groups} pairs of row and scene, each "
+        f"{shown(spread.s)} ({spread.df} degrees of freedom, {spread.groups} pairs of row and scene, on {where}, each "
         f"between {shown(spread.least)} and {shown(spread.largest)})"
     )
 

@@ -146,7 +146,7 @@ def table(number: int, scale: str, results: Iterable[Result], absent: Iterable[s
         # places among values of different LPIPS networks would mean nothing
         mixed = scale == "paper" and len({published.lpips[title, row] for row in rows}) > 1
         ranked = [m for m in metrics if m.id != "lpips" or not mixed]
-        blocks.append(Block(_titled(title, scale, found), _placed(lines, ranked, printed.marked)))
+        blocks.append(Block(_titled(title, scale, found, where), _placed(lines, ranked, printed.marked)))
     remarks = {n.id: n.why for n in published.not_comparable if _touches(n, printed)} if scale == "paper" else {}
     ratios = None if scale == "paper" else _ratios(printed, groups, found)
     return Table(
@@ -175,8 +175,8 @@ def beyond(scale: str, results: Iterable[Result], absent: Iterable[str] = ()) ->
         where = most_timed_on((r.row, r) for r in found if r.scene in scenes)
         make = _Maker(published, None, scale, title, scenes, frozenset(absent), where)
         lines = [make.line(row, name, found) for row, name in rows.items()]
-        blocks.append(Block(_titled(title, scale, found), _placed(lines, metrics, 1)))
-    return Table("beyond", scale, "Beyond the paper", _header(scale, found), metrics, tuple(blocks), None, {})
+        blocks.append(Block(_titled(title, scale, found, where), _placed(lines, metrics, 1)))
+    return Table("beyond", scale, "Beyond the paper", _header(scale, found, False), metrics, tuple(blocks), None, {})
 
 
 def setting(result: Result, name: str) -> float | None:
@@ -340,8 +340,8 @@ def _placed(lines: Sequence[Line], metrics: Sequence[Metric], upto: int) -> tupl
     return tuple(replace(line, cells=placed[line.row]) for line in lines)
 
 
-def _titled(title: str, scale: str, found: Sequence[Result]) -> str:
-    """Say of a capture that is not the paper's what it is."""
+def _titled(title: str, scale: str, found: Sequence[Result], where: str | None) -> str:
+    """Say of a capture that is not the paper's what it is, and on which machine its times compare."""
     mine = [r for r in found if r.scene == title]
     if scale == "paper" or not mine:
         return title
@@ -350,11 +350,12 @@ def _titled(title: str, scale: str, found: Sequence[Result]) -> str:
         " or ".join(sorted({f"{r.protocol['width']} x {r.protocol['height']}" for r in mine})),
         *([" or ".join(f"{s:,}" for s in steps) + " steps"] if steps else []),
         " or ".join(sorted({str(r.protocol["test_views"]) for r in mine})) + " held-out views",
+        *([f"times on {where}"] if where is not None else []),
     ]
     return f"{title} ({', '.join(facts)})"
 
 
-def _header(scale: str, found: Sequence[Result]) -> tuple[str, ...]:
+def _header(scale: str, found: Sequence[Result], has_ratios: bool = True) -> tuple[str, ...]:
     about = "Ours ± the sample standard deviation over seeds; one seed has none. n is the number of seeds."
     if scale == "paper":
         first = "Scale paper: the published protocol (protocol.md)."
@@ -367,7 +368,7 @@ def _header(scale: str, found: Sequence[Result]) -> tuple[str, ...]:
                 "full": "other photographs, on the whole schedule"}[scale]  # fmt: skip
         first = (
             f"NOT the paper's protocol: scale {scale}, {what} ({names}). No number here may be compared with a number "
-            "of the paper; ratios within the table stand beside the paper's own."
+            f"of the paper{'; ratios within the table stand beside its own' if has_ratios else ''}."
         )
     if not found:
         return first, "No run of this table is finished."
@@ -378,8 +379,10 @@ def _header(scale: str, found: Sequence[Result]) -> tuple[str, ...]:
     timing = "" if all(r.is_timed for r in found) else clock
     if len(machines) > 1:
         timing += (
-            "Those of a block are of the runs on the machine that timed most of its methods; (elsewhere) is of others, "
-            "so that it has no place. "
+            "Those of a block are of the runs on one machine"
+            + ("" if scale == "paper" else ", which its title names")
+            + ": of those that timed POP, or else of all, the one that timed most of its methods. (elsewhere) is of "
+            "others, so that it has no place. "
         )
     cpu = ", those of a CPU its processor time a thread" if any("cpu" in r.seconds for r in found) else ""
     return first, about, f"Seconds are of training alone{cpu}. {timing}Machines: {'; '.join(machines)}."

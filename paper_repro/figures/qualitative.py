@@ -59,7 +59,8 @@ def renders_and_photographs(asked: Asked) -> Drawn:
         raise NoDataError(
             f"figure 5 at scale {asked.scale} is not drawn: there is no scene of {', '.join(scenes)} with results of "
             f"{' and '.join(_ROWS)} whose renders are in {asked.work}; give the folder that they were trained in with "
-            f"--work, or train them with pop-repro run {_ROWS[0]} {scenes[0]} --scale {asked.scale}"
+            f"--work, or train them with pop-repro queue --scale {asked.scale} --data DATA --rows {' '.join(_ROWS)} "
+            f"--scenes {scenes[0]} --results NEW, and draw the figure with --results NEW"
         )
     shown = tuple(view.scene for view in views)
     not_run = tuple(scene for scene in scenes if any((row, scene) not in runs for row in _ROWS))

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
 
 from paper_repro.claims import METHODS, SWEEP, claims
 from paper_repro.evidence import Evidence, Group, Groups, groups
@@ -46,6 +48,8 @@ Box = tuple[float, float, float, float]
 _SIDES: Final = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1))
 # between marker and name; one that stands farther off is joined to its marker by a line
 _GAPS: Final = (2.0, 9.0, 20.0)
+# least distance of two names, points
+_APART: Final = 2.0
 # what it costs in square points covered: a point of the line that joins a name, and to seem to be another marker's name
 _JOINED, _MISTAKEN = 4.0, 120.0
 
@@ -64,17 +68,19 @@ class _Point:
 
 def psnr_against_time(asked: Asked) -> Drawn:
     """Figure 1: PSNR against training time; the area of a marker is the number of Gaussians."""
-    chosen, without = _timed(asked, asked.scenes(paper().datasets["Tanks & Temples"]))
-    means = {row: _means(chosen, row) for row in chosen.runs}
+    timed, without = _timed(asked, asked.scenes(paper().datasets["Tanks & Temples"]))
+    chosen = _whole(asked, timed)
+    means = {row: _means(timed, chosen, row) for row in chosen.runs}
     largest = max(n for _, _, n in means.values())
     points = [
         _Point(row, seconds, psnr, n, _LARGEST * n / largest, f"{name_of(row)}\n{count(n)}")
         for row, (seconds, psnr, n) in means.items()
     ]
-    where = " and ".join(sorted({r.trained_on for r in chosen.all}))
-    clock = "" if all(r.is_timed for r in chosen.all) else ", by the clock though there may have been other work"
+    where = " and ".join(sorted({r.trained_on for r in timed.all}))
+    clock = "" if all(r.is_timed for r in timed.all) else ", by the clock though there may have been other work"
+    alone = "" if len(timed.all) == len(chosen.all) else ", of the runs there alone"
     note = foot(
-        asked, chosen, f"Area of a marker: number of Gaussians, written at it. Time on {where}{clock}.", *without
+        asked, chosen, f"Area of a marker: number of Gaussians, written at it. Time on {where}{clock}{alone}.", *without
     )
     sheet = Sheet(note, 2.3)
     axes = sheet.panel(left=0.52, right=0.1)
@@ -88,7 +94,7 @@ def psnr_against_time(asked: Asked) -> Drawn:
         if point.area > _WITH_MIDDLE:
             axes.scatter(point.x, point.y, s=2.0, color=color if hollow else "white", linewidth=0)
     _name(axes, points)
-    return Drawn(sheet.figure, *_table(chosen))
+    return Drawn(sheet.figure, *_table(timed, chosen))
 
 
 def psnr_against_count(asked: Asked) -> Drawn:
@@ -120,8 +126,8 @@ def psnr_against_count(asked: Asked) -> Drawn:
     sheet = Sheet(note, lines * _PANEL, COLUMN if columns == 1 else TEXT)
     for i, scene in enumerate(shown):
         width = sheet.width / columns
-        left, bottom = 0.44 + width * (i % columns), 0.33 + (lines - 1 - i // columns) * _PANEL
-        axes = sheet.axes(left, bottom, width - 0.54, _PANEL - 0.33 - 0.2)
+        left, bottom = 0.52 + width * (i % columns), 0.33 + (lines - 1 - i // columns) * _PANEL
+        axes = sheet.axes(left, bottom, width - 0.62, _PANEL - 0.33 - 0.2)
         _sweep_panel(axes, found[scene])
         axes.set_title(f"{scene}: {_told(judged.get(scene))}")
     return Drawn(sheet.figure, *_sweep_table(found, shown, judged))
@@ -170,15 +176,20 @@ def _sweep_table(
 def _timed(asked: Asked, scenes: Sequence[str]) -> tuple[Chosen, list[str]]:
     """Choose what was timed on one machine, without scenes whose times do not compare where others have every row.
 
+    A run by the clock stands in only for a row that has no other there.
+
     Returns:
         The results, and what the note says of those that are left out.
     """
     rows = (*METHODS, "pop")
     every = [r for r in asked.results if r.row in rows and r.scene in scenes]
     best = most_timed_on((r.row, r) for r in every)
+    has_time = {(r.row, r.scene) for r in every if r.is_timed and r.trained_on == best}
 
     def there(result: Result) -> bool:
-        return best is None or result.trained_on == best
+        if best is None:
+            return True
+        return result.trained_on == best and (result.is_timed or (result.row, result.scene) not in has_time)
 
     chosen = choose(asked, rows, scenes, there)
     untimed = {r.scene for r in chosen.all if not r.is_timed}
@@ -192,10 +203,19 @@ def _timed(asked: Asked, scenes: Sequence[str]) -> tuple[Chosen, list[str]]:
     return replace(chosen, missing=tuple(row for row in chosen.missing if row not in elsewhere)), said
 
 
-def _means(chosen: Chosen, row: str) -> tuple[float, float, float]:
-    """Average seconds of training, PSNR and Gaussians."""
-    names = ("training_seconds", "psnr", "num_gaussians")
-    seconds, psnr, n = (mean_of(chosen.runs[row], chosen.scenes, attrgetter(name)) for name in names)
+def _whole(asked: Asked, timed: Chosen) -> Chosen:
+    """Add the runs of the same rows and scenes that were timed elsewhere: what they came to does not depend on that."""
+    runs = {
+        row: {scene: tuple(r for r in asked.results if (r.row, r.scene) == (row, scene)) for scene in timed.scenes}
+        for row in timed.runs
+    }
+    return replace(timed, runs=runs)
+
+
+def _means(timed: Chosen, chosen: Chosen, row: str) -> tuple[float, float, float]:
+    """Average seconds of training over what was timed, PSNR and Gaussians over all runs."""
+    seconds = mean_of(timed.runs[row], timed.scenes, attrgetter("training_seconds"))
+    psnr, n = (mean_of(chosen.runs[row], chosen.scenes, attrgetter(name)) for name in ("psnr", "num_gaussians"))
     return seconds, psnr, n
 
 
@@ -260,12 +280,14 @@ def _name(axes: Axes, points: Sequence[_Point], joined: Sequence[str] = ()) -> N
         )
 
 
-def _table(chosen: Chosen) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
+def _table(timed: Chosen, chosen: Chosen) -> tuple[Sequence[str], Sequence[Sequence[Any]]]:
     rows: list[Sequence[Any]] = []
     for row in chosen.runs:
+        compared = {r.run for r in timed.of(row)}
         for r in chosen.of(row):
-            rows.append((row, r.scene, r.seed, r.run, r.training_seconds, r.psnr, r.num_gaussians, r.machine))
-        seconds, psnr, n = _means(chosen, row)
+            seconds = r.training_seconds if r.run in compared else ""
+            rows.append((row, r.scene, r.seed, r.run, seconds, r.psnr, r.num_gaussians, r.trained_on))
+        seconds, psnr, n = _means(timed, chosen, row)
         rows.append((row, "mean", "", "", seconds, psnr, n, ""))
     return ("row", "scene", "seed", "run", "seconds", "psnr", "num_gaussians", "machine"), rows
 
@@ -292,7 +314,7 @@ class Place:
 def places(markers: Sequence[Marker], frame: Box, taken: Sequence[Box] = ()) -> list[Place]:
     """Find a place for every name, such that all together cover little and none seems to be another marker's.
 
-    One after the other moves to where it costs least while the others stay, until none moves.
+    Two after two move to where they cost least together while the others stay, until none moves.
 
     Args:
         markers: with their names' sizes.
@@ -300,22 +322,27 @@ def places(markers: Sequence[Marker], frame: Box, taken: Sequence[Box] = ()) -> 
         taken: boxes that names should not cover.
     """
     choices = [_choices(marker) for marker in markers]
-    fixed = [
-        [_fixed_cost(place, i, markers, frame, taken) + rank for rank, place in enumerate(each)]
-        for i, each in enumerate(choices)
-    ]
-    chosen = [min(range(len(costs)), key=costs.__getitem__) for costs in fixed]
+    fixed = np.array(
+        [
+            [_fixed_cost(place, i, markers, frame, taken) + rank for rank, place in enumerate(each)]
+            for i, each in enumerate(choices)
+        ]
+    )
+    boxes = np.array([[place.box for place in each] for each in choices])
+    low = np.maximum(boxes[:, :, None, None, :2], boxes[..., :2])
+    high = np.minimum(boxes[:, :, None, None, 2:], boxes[..., 2:])
+    # of a name at a place and another at a place of its own
+    between = (high - low + _APART).clip(0.0).prod(axis=-1)
+    chosen = fixed.argmin(axis=1)
     # each move makes the whole cheaper, so that this ends; the bound is for ties that rounding makes
     for _ in range(20):
-        before = list(chosen)
-        for i, each in enumerate(choices):
-            others = [choices[j][k].box for j, k in enumerate(chosen) if j != i]
-            costs = [
-                cost + sum(_overlap(place.box, other) for other in others)
-                for cost, place in zip(fixed[i], each, strict=True)
-            ]
-            chosen[i] = min(range(len(costs)), key=costs.__getitem__)
-        if chosen == before:
+        before = chosen.copy()
+        for pair in combinations(range(len(markers)), 2):
+            rest = [k for k in range(len(markers)) if k not in pair]
+            one, other = (fixed[i] + between[i][:, rest, chosen[rest]].sum(axis=1) for i in pair)
+            costs = one[:, None] + other + between[pair[0], :, pair[1]]
+            chosen[list(pair)] = np.unravel_index(int(costs.argmin()), costs.shape)
+        if (chosen == before).all():
             break
     return [each[k] for each, k in zip(choices, chosen, strict=True)]
 

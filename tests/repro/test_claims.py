@@ -315,6 +315,9 @@ def test_times_compare_on_one_machine_and_not_by_the_clock_of_a_cpu() -> None:
     # two seeds of gsplat are there, and a queue would not train them again
     assert told.told.deciders[0].startswith("pop-repro queue --scale small --data DATA --rows 3dgs gsplat pup ")
     assert told.told.deciders[0].endswith(f"--scenes fox --seeds 3  # on {pop[0].trained_on}")
+    # with as many threads as what is there was timed with
+    on_two = judged("fast", [replace(r, threads=2) for r in pop] + elsewhere).told.deciders[0]
+    assert on_two.endswith("--scenes fox --seeds 3 --threads 2  # on a machine (a kind), native, 2 threads")
     by_clock = [replace(r, seconds={k: v for k, v in r.seconds.items() if k != "cpu"}) for r in other]
     assert judged("fast", [*pop, *by_clock]).verdict == "not decided"
 
@@ -416,7 +419,8 @@ def test_a_toy_is_said_to_tell_nothing_and_other_data_to_be_a_yardstick() -> Non
     assert telling() == ["paper", "full", "no_floor", "small"]
     text = markdown("small", runs)
     assert "NOT the paper's protocol" in text
-    assert "PSNR 0.014 dB (2 degrees of freedom, 2 pairs of row and scene" in text
+    assert "PSNR 0.014 dB (2 degrees of freedom, 2 pairs of row and scene, on fox alone, each between" in text
+    assert "scene, on bear_512, fox, each between" in markdown("small", [*runs, *two("pop", "bear_512")])
     assert "| default | fox | N pop / l2_blur 40.0% (39.8% to 40.2%)" in text
     assert text.count("```sh") >= 12
     empty = markdown("paper", [])
@@ -443,7 +447,12 @@ def test_the_outcome_is_five_lines_each_with_an_interval_or_the_run_that_decides
     assert reset[0] == "POP is no worse than opacity reset in PSNR"
     assert reset[2].startswith("**holds**<br>fox: PSNR pop - reset +0.50 ± ")
     assert reset[3].startswith("**does not hold**<br>fox: PSNR pop - reset -0.50 ± ")
-    assert comparable[2].startswith("**holds**<br>fox: PSNR pop - 3dgs -0.50 ± ")
+    # a difference below 0 holds by the bound that it is held to
+    assert re.fullmatch(
+        r"\*\*holds\*\*<br>fox: PSNR pop - 3dgs -0\.50 ± \S+ dB, where at least -1\.22 dB is asked", comparable[2]
+    )
+    halved = judged("half", [*two("pop", n=40_000), *two("l2_blur", n=100_000)]).told.evidence
+    assert halved[0].nearest.endswith("%), where at most 50.0% is asked")
     # the paper's own scale is told before others that decide too
     both = [*runs, *(replace(r, scale="paper", scene="bonsai") for r in [*two("pop"), *two("reset", psnr=29.0)])]
     assert outcome_cells(both)[4][1] == "paper"

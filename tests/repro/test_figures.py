@@ -27,10 +27,10 @@ from paper_repro.figures.style import foot, save
 from paper_repro.figures.tradeoffs import Marker, along, places
 from paper_repro.jobs import job_named, load_rows
 from paper_repro.paper import paper
-from paper_repro.results import BINS, RESULTS, Result, write
+from paper_repro.results import BINS, RESULTS, UNTIMED, Result, write
 from paper_repro.train_row import Options, capture_folder, load_capture_of
 from pop_fast.errors import PopError
-from tests.repro.made import asked, curve, drawn, lines, result, texts
+from tests.repro.made import PLAIN, asked, curve, drawn, lines, result, texts
 
 ROOT = Path(__file__).parents[2]
 METHODS = ("3dgs", "gsplat", "pup", "mini_splatting", "taming", "speedy_splat", "pop")
@@ -172,6 +172,36 @@ def test_figure_1_has_every_run_and_the_means_in_markers_as_large_as_their_numbe
     sizes = sorted(s for s in (float(c.get_sizes()[0]) for c in made.figure.axes[0].collections) if s > 2.0)
     counts = sorted(line["num_gaussians"] for line in means.values())
     assert sizes == pytest.approx([max(sizes) * n / counts[-1] for n in counts], rel=1e-12)
+
+
+def test_seeds_that_were_not_timed_beside_the_others_count_for_psnr_and_gaussians_of_figure_1():
+    beside = {"protocol": {**PLAIN.protocol, "timing": f"training loop{UNTIMED}"}}
+    slow = {"seconds": {"load": 1.0, "train": 900.0, "evaluate": 2.0, "cpu": 900.0}}
+    runs = [
+        result("pop", n=1000, psnr=30.0),
+        result("pop", seed=43, n=3000, psnr=33.0, cpu="another kind", **slow),
+        result("pop", seed=44, n=2000, psnr=30.0, **beside, **slow),
+    ]
+    made = drawn("1", runs)
+    *each, mean = lines(made)
+    assert (mean["seconds"], mean["psnr"], mean["num_gaussians"]) == (100.0, 31.0, 2000.0)
+    assert [line["seconds"] for line in each] == [100.0, "", ""]
+    assert "Time on a machine (a kind), native, 1 thread, of the runs there alone." in texts(made)
+
+
+@pytest.mark.parametrize("figure", OF_RESULTS)
+def test_all_that_a_figure_writes_lies_inside_of_it(figure):
+    # with two digits behind the point on every axis of figure 6b
+    few = [result("l2", scene, n=1000, psnr=29.28) for scene in ("fox", "bear_512", "garden_512", "bonsai_800")]
+    for results in (full(), *([few] if figure == "6b" else [])):
+        with style.look():
+            made = drawn(figure, results).figure
+            made.set_dpi(style.SAVED_DPI)
+            box = made.get_tightbbox()
+        assert box.x0 >= 0.0, box
+        assert box.y0 >= 0.0, box
+        assert box.x1 <= made.get_figwidth(), box
+        assert box.y1 <= made.get_figheight(), box
 
 
 def test_figure_6b_has_every_run_in_the_panel_of_its_capture_and_no_mean_over_captures():
@@ -546,7 +576,7 @@ def test_the_figure_of_the_readme_is_of_the_results_that_are_kept(tmp_path):
 
 def test_without_renders_or_a_scene_figures_say_where_they_looked(tmp_path):
     runs = [result("pop"), result("3dgs")]
-    with pytest.raises(NoDataError, match=f"whose renders are in {tmp_path}; give the folder"):
+    with pytest.raises(NoDataError, match=rf"whose renders are in {tmp_path}; give the folder .* --results NEW, and"):
         qualitative.renders_and_photographs(asked("5", runs, tmp_path))
     with pytest.raises(PopError, match=f"{tmp_path} has none of kitchen; name another --data"):
         artifact.pushed(asked("3", [], tmp_path, scale="paper"))

@@ -481,6 +481,10 @@ def test_seconds_are_of_the_processor_on_one_machine_and_others_have_no_place() 
     assert [cell.place for cell in cells.values()] == [2, 1, 0, 0]
     assert "(clock) is by the clock of a processor that may have had other work" in markdown(made)
     assert "(elsewhere) is of others, so that it has no place." in markdown(made)
+    # one with POP comes before one with more methods, and the title says which
+    told = table(1, "small", [result("pop", cpu="a third kind"), result("3dgs"), result("gsplat")])
+    assert told.blocks[0].title.endswith("7 held-out views, times on a machine (a third kind), native, 1 thread)")
+    assert line_of(told, 0, "3dgs").cells["time_s"].ours == "100 (elsewhere)"
     assert "(elsewhere) is" not in markdown(table(1, "small", found[:3]))
 
 
@@ -551,6 +555,9 @@ def test_what_goes_beyond_the_paper_has_a_table_of_its_own() -> None:
     assert line_of(made, 0, "final_prune").cells["ckpt_mb"].ours == "6.8"
     paper_rows = {line.row for t in paper().tables for line in t.rows}
     assert set(BEYOND) & paper_rows == {"pop"}
+    # it has no ratios, and does not say that it has
+    assert made.header[0].endswith("compared with a number of the paper.")
+    assert table(1, "small", DEV).header[0].endswith("ratios within the table stand beside its own.")
 
 
 def test_a_setting_is_found_by_the_end_of_its_name() -> None:

@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 
+from paper_repro import verify as repro_verify
 from paper_repro.cli import main
 from paper_repro.jobs import job_named
 from paper_repro.results import RESULTS, SCALES, Result, find, kept, read, read_all, to_line, write
@@ -289,9 +290,28 @@ def test_a_result_whose_commit_is_not_there_is_refused(named, says, tmp_path, ca
     assert says in capsys.readouterr().err
 
 
+def test_a_scene_that_is_absent_is_said_before_anything_is_cloned(tmp_path, capsys, monkeypatch):
+    if history() is None:
+        pytest.skip("this folder is not a clone with its history")
+    monkeypatch.setattr(repro_verify, "_check_out", lambda *_: pytest.fail("cloned"))
+    write(replace(PLAIN, commit=FOUND[0].commit), tmp_path)
+    words = ["verify", "pop", "fox", "--scale", PLAIN.scale, "--results", str(tmp_path), "--work", str(tmp_path)]
+    assert main([*words, "--data", str(tmp_path / "nowhere")]) == 2
+    assert "nowhere: no such folder; name the one that holds the scenes with --data" in capsys.readouterr().err
+
+
 def test_what_has_no_result_is_refused(tmp_path, capsys):
     assert main(["verify", "pop", "demo", "--scale", "toy", "--results", str(tmp_path)]) == 2
     assert "pop.jsonl: has no result of demo, seed 42, to verify" in capsys.readouterr().err
+
+
+def test_another_kind_of_machine_is_not_confirmed_by_the_gaussians_that_a_training_begins_with(tmp_path, monkeypatch):
+    then = result(curve=curve({0: 500, 100: 500, 600: 700, 9_999: 1000}))
+    monkeypatch.setattr(repro_verify, "curve_of", lambda folder, last: then.curve)
+    with pytest.raises(PopError, match=r"after 200 steps there is no point .* held to; take at least 601 with --steps"):
+        repro_verify._compare(then, tmp_path, 200, ("processor",))
+    assert repro_verify._compare(then, tmp_path, 200, ()).points == 2
+    assert repro_verify._compare(then, tmp_path, 700, ("processor",)).points == 1
 
 
 def test_a_machine_of_the_same_kind_differs_in_nothing():

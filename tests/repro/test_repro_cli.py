@@ -56,6 +56,7 @@ def test_help_is_quick_and_loads_nothing_heavy(command):
     [
         (["rum"], "'rum' is not a subcommand; did you mean 'pop-repro run'?"),
         (["xyz"], "'xyz' is not a subcommand; see 'pop-repro --help'"),
+        (["data"], "'data' is not a subcommand; did you mean 'pop-repro data check'?"),
         (["run", "pops", "fox"], "row is 'pops'; it must be one of 3dgs, 3dgs_2023"),
         (["run", "pop", "garden", "--scale", "small"], "scale 'small' has no garden; its scenes are fox, "),
         (["run", "pop", "fox", "--scale", "tiny"], "argument --scale: invalid choice: 'tiny'"),
