@@ -459,7 +459,7 @@ _LINES: Final[Lines] = {
          "test_losses:the_dissimilarity_of_large_pictures_beyond_black_and_white_is_the_oracles"),
         ("dissimilarity_of_the_last_band",
          "of an image that is compared in several bands of rows the last band's SSIM is the image's",
-         "total += dissimilarity.sum(dtype=torch.float64)", "total = dissimilarity.sum(dtype=torch.float64)",
+         "total += _total(dissimilarity, torch.float64)", "total = _total(dissimilarity, torch.float64)",
          "test_losses:a_large_picture_is_as_similar_as_its_halves_are"),
         ("masked_mean_forgets_channels", "a masked mean is over pixels, not over their channels, too",
          "max(int(mask.sum()), 1) * image.shape[2]", "max(int(mask.sum()), 1)",
