@@ -17,7 +17,7 @@ import subprocess
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -87,11 +87,15 @@ def verify(job: Job, options: Options, steps: int | None = None) -> Verification
     if result is None:
         raise PopError(f"{job.file(options.results)}: has no result of {job.scene.name}, seed {job.seed}, to verify")
     _require_commit(result, _ROOT)
-    # said before minutes of cloning and compiling
+    # what is lacking is said before minutes of cloning and compiling
     _ = job.scene.name in MADE or find_folder(job.scene, options.data)
+    options = replace(options, backend=options.backend if options.backend != "auto" else _backend_of(result))
+    why_not = None if options.backend == "auto" else get_backend(options.backend).why_not()
+    if why_not is not None:
+        raise PopError(f"{job}: backend {options.backend} cannot run here: {why_not}, or name another with --backend")
     # git is run from elsewhere
     place = job.work(options.work.absolute() / "verify").with_name(f"{job.scene.name}_{job.seed}_{result.commit}")
-    _check_out(str(result.commit), place / "clone")
+    _check_out(str(result.commit), place / "clone", options.backend)
     taken = _train(job, result, options, place, steps)
     verdict = _compare(result, job.work(place / "work"), taken, other_kind(result, options.backend))
     shutil.rmtree(place)
@@ -136,8 +140,8 @@ def _require_commit(result: Result, root: Path) -> None:
         raise PopError(f"{what}: commit {result.commit} is not in {root}; fetch the whole history, or train it again")
 
 
-def _check_out(commit: str, clone: Path) -> None:
-    """Clone the repository at a commit, with this processor's kernels compiled; what is there already is taken."""
+def _check_out(commit: str, clone: Path, backend: str) -> None:
+    """Clone the repository at a commit, with what the backend runs compiled there; what is there already is taken."""
     if not clone.is_dir():
         partial = clone.with_suffix(".partial")
         shutil.rmtree(partial, ignore_errors=True)
@@ -153,8 +157,14 @@ def _check_out(commit: str, clone: Path) -> None:
         for library in (_ROOT / "pop_fast" / "compiled").glob("_blend_*.so"):
             shutil.copy2(library, partial / "pop_fast" / "compiled")
         partial.rename(clone)
-    build = python_command("-m", "pop_fast.compiled.build", "--if-possible")
-    subprocess.run(build, env=_environment(clone, 1), cwd=clone, check=True, stdout=subprocess.DEVNULL)
+    # the kernels of a GPU lie in the clone's own folder, too
+    builds = [("pop_fast.compiled.build", "--if-possible"), *([("cuda_ext.build",)] if backend == "cuda" else [])]
+    for words in builds:
+        command = python_command("-m", *words)
+        done = subprocess.run(command, env=_environment(clone, 1), cwd=clone, capture_output=True, text=True)
+        if done.returncode != 0:
+            tail = " ".join(done.stderr.strip().splitlines()[-1:])
+            raise PopError(f"{clone}: python -m {words[0]} of commit {commit} failed: {tail}")
 
 
 def _train(job: Job, result: Result, options: Options, place: Path, steps: int | None) -> int:
@@ -167,7 +177,7 @@ def _train(job: Job, result: Result, options: Options, place: Path, steps: int |
         "results": str(place / "results"),
         "work": str(place / "work"),
         "threads": result.threads,
-        "backend": options.backend if options.backend != "auto" else _backend_of(result),
+        "backend": options.backend,
     }
     command = python_command("-c", _TRAIN, json.dumps(asked))
     clone, work = place / "clone", job.work(place / "work")

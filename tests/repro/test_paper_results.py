@@ -21,8 +21,10 @@ from paper_repro import verify as repro_verify
 from paper_repro.cli import main
 from paper_repro.jobs import job_named
 from paper_repro.results import RESULTS, SCALES, Result, find, kept, read, read_all, to_line, write
+from paper_repro.scenes import SCENES
 from paper_repro.train_row import commit
 from paper_repro.verify import history, other_kind
+from pop_fast.api.backend import get_backend
 from pop_fast.errors import PopError
 from tests.repro.made import PLAIN, curve, demo, result
 
@@ -298,6 +300,37 @@ def test_a_scene_that_is_absent_is_said_before_anything_is_cloned(tmp_path, caps
     words = ["verify", "pop", "fox", "--scale", PLAIN.scale, "--results", str(tmp_path), "--work", str(tmp_path)]
     assert main([*words, "--data", str(tmp_path / "nowhere")]) == 2
     assert "nowhere: no such folder; name the one that holds the scenes with --data" in capsys.readouterr().err
+
+
+def test_a_result_of_a_gpu_is_verified_by_kernels_that_its_commit_builds(tmp_path, monkeypatch):
+    built: list[str] = []
+
+    def run(command, **_):
+        built.append(command[command.index("-m") + 1])
+        return subprocess.CompletedProcess(command, len(built) - 1, "", "a line\nnvcc was not found")
+
+    monkeypatch.setattr(repro_verify.subprocess, "run", run)
+    (tmp_path / "clone").mkdir()
+    with pytest.raises(PopError, match=r"python -m cuda_ext\.build of commit c0ffee1 failed: nvcc was not found"):
+        repro_verify._check_out("c0ffee1", tmp_path / "clone", "cuda")
+    built.clear()
+    repro_verify._check_out("c0ffee1", tmp_path / "clone", "compiled")
+    assert built == ["pop_fast.compiled.build"]
+
+
+def test_a_backend_that_cannot_run_here_is_said_before_anything_is_cloned(tmp_path, capsys, monkeypatch):
+    if history() is None:
+        pytest.skip("this folder is not a clone with its history")
+    if get_backend("cuda").available():
+        pytest.skip("there is a GPU here")
+    monkeypatch.setattr(repro_verify, "_check_out", lambda *_: pytest.fail("cloned"))
+    (tmp_path / SCENES["fox"].folder).mkdir()
+    write(replace(PLAIN, commit=FOUND[0].commit, engine="cuda"), tmp_path)
+    words = ["verify", "pop", "fox", "--scale", PLAIN.scale, "--results", str(tmp_path), "--data", str(tmp_path)]
+    assert main([*words, "--work", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert "backend cuda cannot run here: " in said
+    assert said.endswith(", or name another with --backend\n")
 
 
 def test_what_has_no_result_is_refused(tmp_path, capsys):
