@@ -88,7 +88,7 @@ def _explain(args: Args, at: tuple[int, int] | None) -> int:
     config = with_objective(config, args.objective)
     with reproducible(config.threads):
         scene = explain_view(splat.params, view, config, splat.sh_degree, splat.step)
-        parting = None if args.diff is None or at is None else difference(scene, *args.diff, *at)
+        parting = None if args.diff is None or at is None else difference(scene, *args.diff, *at, capture.world_scale)
         maps = view_maps(scene) if args.maps or args.html else []
     maps += parting.maps if parting else ()
     if at is not None:

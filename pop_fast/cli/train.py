@@ -42,7 +42,7 @@ from pop_fast.cli.view import LiveView, check_viewer
 from pop_fast.data.capture import SfmOptions
 from pop_fast.errors import PopError
 from pop_fast.io.heartbeat import bars, duration
-from pop_fast.train.automatic import begun, check_minutes
+from pop_fast.train.automatic import TERMS, begun, check_minutes
 from pop_fast.train.choose import check_gpus, choose_backend
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import RECORD, read_record, record_text
@@ -81,6 +81,8 @@ _SHOWN: Final = frozenset(
         *("exposure", "random_background", "refine_cameras"),
     }
 )
+# settings that a run chooses for itself
+_CHOSEN: Final = frozenset({"max_steps", "factor", *TERMS})
 # settings that are names in a registry
 _NAMED: Final[dict[str, Callable[[], Iterable[str]]]] = {
     "backend": lambda: ("auto", *BACKENDS),
@@ -103,7 +105,8 @@ class _Run(BlocksOptions, FinishOptions):
 
     Without --preset, --steps-scaler or --max-steps the run chooses for itself: photographs are shrunk by the whole
     number that brings their longest side nearest to 2,000 px on a GPU, to 1,100 px on a CPU (to 550 px with --minutes
-    under 15), and the schedule is what --minutes allow on this machine.
+    under 15), and the schedule is what --minutes allow on this machine. Other numbers of steps, as --help-all tells
+    them, are then those of the whole schedule, and are scaled with it.
 
     Attributes:
         minutes: train as much of the schedule as fits in so many, measuring and the report among them, the search for
@@ -327,6 +330,8 @@ def _arguments_type(base: TrainConfig, plan: dict[str, Any], short: bool) -> typ
         default: Any = dataclasses.field(default_factory=lambda name=field.name: getattr(base, name))
         if field.name in _NAMED:
             kind = Literal[tuple(_NAMED[field.name]())]
+        if field.name in _CHOSEN and plan.get("preset") == AUTOMATIC:
+            kind = Annotated[kind, tyro.conf.arg(help_behavior_hint="(default: chosen)")]
         if field.name == "strategy":
             kind = Annotated[type(base.strategy), tyro.conf.arg(name=base.method)]
         if field.name == "data":

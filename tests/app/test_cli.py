@@ -73,6 +73,13 @@ def test_help_shows_what_matters_first_and_help_all_all(pop: Pop) -> None:
     assert pop("--version").out.startswith("pop 0.")
     shown = pop("train", "--help").out
     assert "--pop.theta-blur" not in shown
+    # what a run chooses for itself has no other default
+    whole = [
+        " ".join(line.strip("│ \n") for line in text.splitlines())
+        for text in (shown, pop("train", "--help", "--preset", "quick").out)
+    ]
+    assert [text.count("(default: chosen)") for text in whole] == [3, 0]
+    assert ["training steps, of `batch_size` views each. (default: chosen)" in text for text in whole] == [True, False]
     assert "--pop.theta-blur" in pop("train", "--help-all").out
     # it begins with what is trained and ends with blocks
     names = ("method {", "factor INT", "resume,", "export [", "crop {", "blocks {")

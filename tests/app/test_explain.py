@@ -207,6 +207,10 @@ def test_profiles_are_compared_over_the_view_and_the_oracle_over_the_tile(scene:
     assert parting.n_dominant == int((info["dominant_ids"] != scene.info["dominant_ids"]).sum())
     assert parting.largest == pytest.approx(float((inria - scene.image).abs().max()))
     assert parting.n_blended > 0
+    # in a world that was made forty times larger Inria's near plane lies behind what this camera sees
+    nothing = difference(scene, "inria", "paper", 16, 12, 40.0)
+    assert nothing.flip is not None
+    assert "is not between the planes 8 and" in " ".join(nothing.lines)
     assert parting.maps[0].picture.shape == (VIEW.height, VIEW.width, 3)
     exact = difference(scene, "fast", "ref", 16, 12)
     assert exact.region == (16, 0, 16, 16)

@@ -513,6 +513,7 @@ def test_a_resumed_run_has_all_its_commands(pop: Pop, result: Path, shared_captu
     words = ("train", shared_capture, "--out", result, *TRAIN, "--resume", "--skip-sizes", "--skip-checks")
     pop.done(*words)
     first, second = json.loads((result / "commands.json").read_text())
+    assert "These commands made the result." in (result / "report.html").read_text()
     assert first["words"][:2] == ["pop", "train"]
     assert first["words"][-2:] == list(TRAIN_AND_CHECK[-2:])
     assert second["words"] == ["pop", *map(str, words)]

@@ -173,16 +173,25 @@ class Difference:
         return {**{name: getattr(self, name) for name in kept}, "flip": None if self.flip is None else vars(self.flip)}
 
 
-def difference(scene: ExplainedView, a: str, b: str, x: int, y: int) -> Difference:
+def difference(scene: ExplainedView, a: str, b: str, x: int, y: int, world_scale: float = 1.0) -> Difference:
     """Compare two renderers, profiles or backends, on a view, and at a pixel.
 
     The oracle is slow, so where it is one of the two only the pixel's tile is compared.
+
+    Args:
+        scene: the view.
+        a: name of a profile or a backend.
+        b: another.
+        x: column of the pixel.
+        y: row of the pixel.
+        world_scale: length of one unit of the capture's own frame in the world of the splat, by which the near planes
+            of Inria's profiles lie as many times farther.
     """
     width, height = scene.view.width, scene.view.height
     left, top = x // TILE_SIZE * TILE_SIZE, y // TILE_SIZE * TILE_SIZE
     tile = (left, top, min(TILE_SIZE, width - left), min(TILE_SIZE, height - top))
     region = tile if "ref" in (a, b) else (0, 0, width, height)
-    sides = (_side(scene, a, region), _side(scene, b, region))
+    sides = (_side(scene, a, region, world_scale), _side(scene, b, region, world_scale))
     colors = np.abs(sides[0].image - sides[1].image).max(axis=2)
     dominant, blended = sides[0].dominant != sides[1].dominant, sides[0].blended != sides[1].blended
     at = (x, y)
@@ -209,14 +218,15 @@ def difference(scene: ExplainedView, a: str, b: str, x: int, y: int) -> Differen
     )
 
 
-def _side(scene: ExplainedView, name: str, region: tuple[int, int, int, int]) -> Side:
+def _side(scene: ExplainedView, name: str, region: tuple[int, int, int, int], world_scale: float) -> Side:
     left, top, width, height = region
     part = (slice(top, top + height), slice(left, left + width))
     if name == "ref":
         return _oracle_side(scene, region)
     if name in PROFILES:
         own = scene.config.renderer
-        profile = own if own.name == name else PROFILES[name]
+        other = scene.config.with_overrides(profile=name, near_plane=None, eps2d=None).in_world(world_scale)
+        profile = own if own.name == name else other.renderer
         image, info = scene.rasterized(profile=profile)
     elif name in backend_names():
         backend, profile = get_backend(name), scene.config.renderer

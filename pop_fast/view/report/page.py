@@ -218,8 +218,10 @@ def command_section(commands: Sequence[tuple[str, str]]) -> str:
         f'<pre class="command">{escape(line)}</pre><p class="caption">in {escape(folder)}</p>'
         for line, folder in commands
     )
-    later = " The first began the run, the others resumed it." if len(commands) > 1 else ""
-    return f"<h2>The command</h2><p>This command made the result.{later}</p>{lines}"
+    if len(commands) == 1:
+        return f"<h2>The command</h2><p>This command made the result.</p>{lines}"
+    about = "These commands made the result. The first began the run, the others resumed it."
+    return f"<h2>The commands</h2><p>{about}</p>{lines}"
 
 
 def _link(path: str, words: str) -> str:
