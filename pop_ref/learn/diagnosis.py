@@ -276,7 +276,7 @@ def _as_a_whole(
     if factor:
         return factor
     if np.ptp(found - expected) < 1e-9 * max(1.0, np.max(np.abs(expected))) and len(found) > 1:
-        return _offset(float(np.mean(found - expected)))
+        return _offset(float(np.mean(found - expected)), "on some inputs" if some_right else "everywhere")
     if all(b.ndim >= 2 and b.shape[-1] == b.shape[-2] for _, b in pairs):
         if always(lambda b: np.swapaxes(b, -1, -2)):
             return "is transposed: rows stand for columns"
@@ -311,12 +311,12 @@ def _of_a_mask(found: np.ndarray, expected: np.ndarray, some_right: bool) -> str
     return ""
 
 
-def _offset(by: float) -> str:
+def _offset(by: float, where_: str) -> str:
     if abs(abs(by) - 0.5) < 1e-9:
-        return f"is {by:+.4g} off everywhere, by half: pixel centres lie at index + 0.5"
+        return f"is {by:+.4g} off {where_}, by half: pixel centres lie at index + 0.5"
     if abs(abs(by) - 1.0) < 1e-9:
-        return f"is off by one everywhere ({by:+.4g})"
-    return f"is {by:+.6g} off everywhere: a constant is added, or one is missing"
+        return f"is off by one {where_} ({by:+.4g})"
+    return f"is {by:+.6g} off {where_}: a constant is added, or one is missing"
 
 
 def _of_rounding(found: np.ndarray, expected: np.ndarray) -> str:
