@@ -105,7 +105,9 @@ def _misused(name: str, wrong: Sequence[Call]) -> str:
         (found, changed), (expected, meant) = call.found, call.expected
         if found is None and expected is not None:
             return f"{name} returns nothing: is a return missing?"
-        if call.wanted and same(call.found, call.expected):
+        if call.wanted.startswith("the keys") and not call.words:
+            return f"{name} gives a dictionary with other keys: {call.wanted} are asked for."
+        if call.wanted == "truth values" or (call.wanted == "whole numbers" and same(call.found, call.expected)):
             how = {"truth values": "compare, as in x > 0", "whole numbers": "write int(x), or x.astype(int)"}
             return f"{name} gives other numbers where {call.wanted} are asked for: {how[call.wanted]}."
         if _of_lists(expected) and not _of_lists(found) and found != []:
@@ -247,7 +249,7 @@ def leaves(value: Any, label: str = "", depth: int = 0) -> list[tuple[str, np.nd
     if depth > 1 and isinstance(value, tuple) and value and all(np.ndim(each) == 0 for each in value):
         return [(label, numbers(value))]
     if isinstance(value, dict):
-        return [leaf for key, each in value.items() for leaf in leaves(each, f"{label}.{key}".strip("."))]
+        return [leaf for key in sorted(value) for leaf in leaves(value[key], f"{label}.{key}".strip("."))]
     fields = getattr(value, "_fields", None) or list(getattr(value, "__dataclass_fields__", ()))
     if fields:
         return [leaf for key in fields for leaf in leaves(getattr(value, key), f"{label}.{key}".strip("."))]
