@@ -105,7 +105,9 @@ def _misused(name: str, wrong: Sequence[Call]) -> str:
         (found, changed), (expected, meant) = call.found, call.expected
         if found is None and expected is not None:
             return f"{name} returns nothing: is a return missing?"
-        if call.wanted and same(call.found, call.expected):
+        if call.wanted.startswith("the keys") and not call.words:
+            return f"{name} gives a dictionary with other keys: {call.wanted} are asked for."
+        if call.wanted == "truth values" or (call.wanted == "whole numbers" and same(call.found, call.expected)):
             how = {"truth values": "compare, as in x > 0", "whole numbers": "write int(x), or x.astype(int)"}
             return f"{name} gives other numbers where {call.wanted} are asked for: {how[call.wanted]}."
         if _of_lists(expected) and not _of_lists(found) and found != []:
@@ -247,7 +249,7 @@ def leaves(value: Any, label: str = "", depth: int = 0) -> list[tuple[str, np.nd
     if depth > 1 and isinstance(value, tuple) and value and all(np.ndim(each) == 0 for each in value):
         return [(label, numbers(value))]
     if isinstance(value, dict):
-        return [leaf for key, each in value.items() for leaf in leaves(each, f"{label}.{key}".strip("."))]
+        return [leaf for key in sorted(value) for leaf in leaves(value[key], f"{label}.{key}".strip("."))]
     fields = getattr(value, "_fields", None) or list(getattr(value, "__dataclass_fields__", ()))
     if fields:
         return [leaf for key in fields for leaf in leaves(getattr(value, key), f"{label}.{key}".strip("."))]
@@ -276,7 +278,7 @@ def _as_a_whole(
     if factor:
         return factor
     if np.ptp(found - expected) < 1e-9 * max(1.0, np.max(np.abs(expected))) and len(found) > 1:
-        return _offset(float(np.mean(found - expected)))
+        return _offset(float(np.mean(found - expected)), "on some inputs" if some_right else "everywhere")
     if all(b.ndim >= 2 and b.shape[-1] == b.shape[-2] for _, b in pairs):
         if always(lambda b: np.swapaxes(b, -1, -2)):
             return "is transposed: rows stand for columns"
@@ -311,12 +313,12 @@ def _of_a_mask(found: np.ndarray, expected: np.ndarray, some_right: bool) -> str
     return ""
 
 
-def _offset(by: float) -> str:
+def _offset(by: float, where_: str) -> str:
     if abs(abs(by) - 0.5) < 1e-9:
-        return f"is {by:+.4g} off everywhere, by half: pixel centres lie at index + 0.5"
+        return f"is {by:+.4g} off {where_}, by half: pixel centres lie at index + 0.5"
     if abs(abs(by) - 1.0) < 1e-9:
-        return f"is off by one everywhere ({by:+.4g})"
-    return f"is {by:+.6g} off everywhere: a constant is added, or one is missing"
+        return f"is off by one {where_} ({by:+.4g})"
+    return f"is {by:+.6g} off {where_}: a constant is added, or one is missing"
 
 
 def _of_rounding(found: np.ndarray, expected: np.ndarray) -> str:

@@ -91,7 +91,7 @@ class Call:
 
     @property
     def wanted(self) -> str:
-        """Return the kind of number that is asked for, where another came out; empty where it fits."""
+        """Return the kind of number, or the keys, that are asked for, where others came out; empty where they fit."""
         return _wanted(self.found[0], self.expected[0])
 
 
@@ -99,6 +99,9 @@ def _wanted(found: Any, expected: Any) -> str:
     """Compare the kinds of numbers: a mask of 0 and 1 takes rows by their places, and no list has a place 1.0."""
     if type(expected) is tuple and isinstance(found, tuple | list):
         return next(filter(None, map(_wanted, found, expected)), "")
+    if isinstance(expected, dict):
+        keys = f"the keys {', '.join(sorted(expected))}"
+        return "" if isinstance(found, dict) and found.keys() == expected.keys() else keys
     # one truth value is as good as 0 or 1
     if not isinstance(expected, np.ndarray | int) or isinstance(expected, bool):
         return ""
@@ -377,7 +380,8 @@ def numbers(value: Any) -> np.ndarray:
     if value is None:
         return np.zeros(0)
     if isinstance(value, dict):
-        value = tuple(value.values())
+        # in whatever order it was filled
+        value = tuple(value[key] for key in sorted(value))
     elif hasattr(value, "__dataclass_fields__"):
         value = tuple(getattr(value, name) for name in value.__dataclass_fields__)
     if isinstance(value, list) and any(isinstance(each, list) for each in value):

@@ -724,6 +724,29 @@ def test_what_is_called_right_is_right_where_many_parts_are_wrong(tmp_path: Path
     assert "`color` and `T_final` and 2 more parts in composite_pixel are not right yet" in sentence
 
 
+def test_a_dictionary_is_compared_by_its_keys_and_not_by_their_order(tmp_path: Path) -> None:
+    def backwards(*given):
+        return dict(reversed(oracle()["params_vjp"](*given).items()))
+
+    assert all(tried_on(backwards, oracle()["params_vjp"], given, "").is_right for _, given in probes("params_vjp"))
+
+    def renamed(*given):
+        return {name.replace("opacities", "opacity"): x for name, x in oracle()["params_vjp"](*given).items()}
+
+    sentence, _ = _told_of("params_vjp", renamed, tmp_path)
+    assert "other keys: the keys means, opacities, quats, scales, sh0 are asked for" in sentence
+
+
+def test_what_is_off_on_some_inputs_is_not_said_to_be_off_everywhere(tmp_path: Path) -> None:
+    def one_more(width, height, size):
+        if size < 1:
+            raise ValueError
+        # right where a part of a tile is left over
+        return width // size + 1, height // size + 1
+
+    assert _told_of("grid_size", one_more, tmp_path)[0] == "grid_size is off by one on some inputs (+1)."
+
+
 def test_an_argument_that_all_parts_lack_is_named(tmp_path: Path) -> None:
     def without_v(mean2d, conic, px, py, v_sigma):
         return oracle()["sigma_at_pixel_vjp"](mean2d, conic, px, py, 1.0)
