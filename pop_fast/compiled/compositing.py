@@ -229,8 +229,8 @@ class _Projection(torch.autograd.Function):
         }
         given = {"means": means, "covars": covars, "opacities": opacities, "viewmat": viewmat, "K": view.K}
         call_library("projection", means.dtype, _projection_numbers(n, view), {**given, **results})
-        ctx.view, ctx.radii = view, results["radii"]
-        ctx.save_for_backward(means, covars, opacities, viewmat)
+        ctx.view = view
+        ctx.save_for_backward(means, covars, opacities, viewmat, results["radii"])
         ctx.mark_non_differentiable(results["radii"])
         return tuple(results.values())
 
@@ -245,14 +245,14 @@ class _Projection(torch.autograd.Function):
         _v_radii: None,
         v_factors: Tensor | None,
     ) -> tuple[Tensor | None, ...]:
-        means, covars, opacities, viewmat = ctx.saved_tensors
+        means, covars, opacities, viewmat, radii = ctx.saved_tensors
         n_parts = -(-len(means) // this_library().rows_at_a_time)
         found = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in (means, covars, opacities)]
         v_viewmats = means.new_empty((n_parts, 3, 4)) if ctx.needs_input_grad[3] else None
         given = {"means": means, "covars": covars, "opacities": opacities, "viewmat": viewmat, "K": ctx.view.K}
         given |= {"v_means2d": v_means2d.T, "v_depths": v_depths, "v_conics": v_conics.T}
         given |= {"v_effective_opacities": v_effective_opacities, "v_factors": v_factors}
-        given |= {"radii": ctx.radii, "v_viewmats": v_viewmats}
+        given |= {"radii": radii, "v_viewmats": v_viewmats}
         given |= dict(zip(("v_means", "v_covars", "v_opacities"), found, strict=True))
         call_library("projection_backward", means.dtype, _projection_numbers(len(means), ctx.view), given)
         if v_viewmats is None:

@@ -172,7 +172,8 @@ class _Canvas:
         image = self._flat(self.image)
         whole = (self.ids, self.weights, self.blended, self.traversed)
         rest = tuple(None if x is None else self._flat(x[:, None])[..., 0] for x in whole)
-        return image[..., :-1], image[..., -1], *rest
+        # copies, as views of one tensor may not be written to: a caller leaves pixels out so
+        return image[..., :-1].clone(), image[..., -1].clone(), *rest
 
     def _flat(self, tiles: Tensor) -> Tensor:
         lists, size = self.options.lists, self.options.lists.tile_size

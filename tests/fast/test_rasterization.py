@@ -121,6 +121,22 @@ def test_what_is_written_to_inputs_before_the_way_back_changes_no_gradient_in_si
         assert all(map(torch.equal, once, found)), name
 
 
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("backend", ON_THE_CPU)
+def test_an_image_and_alphas_may_be_written_to(backend: str, packed: bool) -> None:
+    skip_without(backend)
+
+    def gradients(written: bool) -> list[Tensor]:
+        given = {name: value.requires_grad_() for name, value in scene(n=8).items()}
+        image, alphas, _ = program(**given, **cameras(), packed=packed, backend=backend)
+        # as gsplat's trainer leaves pixels out, and as it does not
+        image = image.clamp_(0.1, 0.4) if written else image.clamp(0.1, 0.4)
+        alphas = alphas.mul_(0.5) if written else 0.5 * alphas
+        return list(torch.autograd.grad(image.square().sum() + alphas.square().sum(), list(given.values())))
+
+    assert all(map(torch.equal, gradients(True), gradients(False)))
+
+
 @pytest.mark.parametrize("backend", ON_THE_CPU)
 def test_second_derivatives_are_refused_where_first_ones_of_a_checkpoint_are_right(backend: str) -> None:
     skip_without(backend)
