@@ -277,9 +277,9 @@ def test_a_new_result_changes_what_is_made_from_it() -> None:
     assert "holds at scale small" in made["paper_repro/README.md"]
     reset = [*seeds("pop", 40_000, psnr=31.0), *seeds("reset", 40_000)]
     for name in ("README.md", "docs/paper.md"):
-        assert "- POP is no worse than opacity reset in PSNR: **not decided**" in made[name]
+        assert "| POP is no worse than opacity reset in PSNR | small | **not decided**" in made[name]
         text = next(text for path, text in files(reset).items() if path == HERE.parent / name)
-        assert "- POP is no worse than opacity reset in PSNR: **holds** at scale small (fox PSNR pop - reset +1" in text
+        assert "| POP is no worse than opacity reset in PSNR | small | **holds**<br>fox: PSNR pop - reset +1" in text
 
 
 def test_every_scale_that_decides_a_claim_is_told() -> None:
