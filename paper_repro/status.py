@@ -487,7 +487,8 @@ def _claim_row(by_scale: Sequence[Claim], found: Sequence[Result]) -> list[str]:
     judged = [(scale, c) for scale, c in named if c.verdict != "not decided"]
     ours = "; ".join(f"{c.verdict} at scale {scale}: {c.line}" for scale, c in judged)
     scale, told = deciding(named)
-    command = f"pop-repro claims --scale {scale}" if judged else next(iter(told.told.enough), "none")
+    # where nothing that is known would decide it, the claims say why
+    command = next(iter([] if judged else told.told.enough), f"pop-repro claims --scale {scale}")
     readings = [reading for _, c in judged or [(scale, told)] for reading in (c.told, *c.others)]
     runs = {run for reading in readings for e in reading.evidence for run in e.runs}
     used = [r for r in found if r.run in runs]
