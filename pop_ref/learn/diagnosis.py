@@ -249,7 +249,7 @@ def leaves(value: Any, label: str = "", depth: int = 0) -> list[tuple[str, np.nd
     if depth > 1 and isinstance(value, tuple) and value and all(np.ndim(each) == 0 for each in value):
         return [(label, numbers(value))]
     if isinstance(value, dict):
-        return [leaf for key in sorted(value) for leaf in leaves(value[key], f"{label}.{key}".strip("."))]
+        return [leaf for key in sorted(value, key=str) for leaf in leaves(value[key], f"{label}.{key}".strip("."))]
     fields = getattr(value, "_fields", None) or list(getattr(value, "__dataclass_fields__", ()))
     if fields:
         return [leaf for key in fields for leaf in leaves(getattr(value, key), f"{label}.{key}".strip("."))]

@@ -381,7 +381,7 @@ def numbers(value: Any) -> np.ndarray:
         return np.zeros(0)
     if isinstance(value, dict):
         # in whatever order it was filled
-        value = tuple(value[key] for key in sorted(value))
+        value = tuple(value[key] for key in sorted(value, key=str))
     elif hasattr(value, "__dataclass_fields__"):
         value = tuple(getattr(value, name) for name in value.__dataclass_fields__)
     if isinstance(value, list) and any(isinstance(each, list) for each in value):

@@ -18,7 +18,7 @@ import pytest
 from paper_repro import status
 from paper_repro.paper import PAPER, Statement, checks, load, paper, places
 from paper_repro.results import RESULTS, SCALES, Result, read_all, write
-from paper_repro.status import HERE, files, status_table, with_part
+from paper_repro.status import HERE, everything, files, status_table, with_part
 from paper_repro.table_formats import COLUMNS, PREAMBLE, csv_text, latex, markdown
 from paper_repro.tables import BEYOND, REFERENCES, SCENES_OF, Line, Table, beyond, setting, table
 from pop_fast.errors import PopError
@@ -280,6 +280,13 @@ def test_a_new_result_changes_what_is_made_from_it() -> None:
         assert "| POP is no worse than opacity reset in PSNR | small | **not decided**" in made[name]
         text = next(text for path, text in files(reset).items() if path == HERE.parent / name)
         assert "| POP is no worse than opacity reset in PSNR | small | **holds**<br>fox: PSNR pop - reset +1" in text
+
+
+def test_every_claim_of_the_package_names_a_command() -> None:
+    # also one that no number of seeds would decide
+    rows = [line.split(" | ") for line in status_table(everything()).splitlines()[2:]]
+    assert len(rows) == 12 + 5 + 1
+    assert all(row[3].startswith("`pop-repro ") for row in rows)
 
 
 def test_every_scale_that_decides_a_claim_is_told() -> None:

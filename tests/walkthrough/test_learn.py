@@ -733,8 +733,12 @@ def test_a_dictionary_is_compared_by_its_keys_and_not_by_their_order(tmp_path: P
     def renamed(*given):
         return {name.replace("opacities", "opacity"): x for name, x in oracle()["params_vjp"](*given).items()}
 
-    sentence, _ = _told_of("params_vjp", renamed, tmp_path)
-    assert "other keys: the keys means, opacities, quats, scales, sh0 are asked for" in sentence
+    def numbered(*given):
+        return {**oracle()["params_vjp"](*given), 0: np.zeros(3)}
+
+    for other in (renamed, numbered):
+        sentence, _ = _told_of("params_vjp", other, tmp_path)
+        assert "other keys: the keys means, opacities, quats, scales, sh0 are asked for" in sentence
 
 
 def test_what_is_off_on_some_inputs_is_not_said_to_be_off_everywhere(tmp_path: Path) -> None:
