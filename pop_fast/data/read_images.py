@@ -106,8 +106,9 @@ def _locate(
     folder = root / "masks" if options.masks and (root / "masks").is_dir() else None
     masks = find_masks(folder, shots) if options.masks else [None] * len(shots)
     elsewhere = names_elsewhere(shots)
+    folders = _image_folders(root, shots, options)
     for shot, mask in zip(shots, masks, strict=True):
-        chosen, shrink = _image_folder(root, shot.folder, options)
+        chosen, shrink = folders[shot.folder]
         names = [shot.file] if options.images is None else elsewhere(shot)
         path = _find_first(root / chosen, names)
         if path is None:
@@ -193,7 +194,7 @@ def _about_folders(root: Path, shots: Sequence[PosedImage], options: PhotoOption
     """Tell which photographs a factor is met by: those that were made smaller before, or the large ones."""
     if options.factor == 1:
         return []
-    read = {_image_folder(root, folder, options) for folder in {shot.folder for shot in shots}}
+    read = set(_image_folders(root, shots, options).values())
     names = ", ".join(sorted(f"{chosen}/" for chosen, _ in read if chosen))
     whose = f"the photographs of {names}" if names else "the photographs"
     if all(shrink == 1 for _, shrink in read):
@@ -201,16 +202,24 @@ def _about_folders(root: Path, shots: Sequence[PosedImage], options: PhotoOption
     return [f"{whose} are shrunk by {options.factor} here"]
 
 
-def _image_folder(root: Path, folder: str, options: PhotoOptions) -> tuple[str, int]:
-    """Choose the folder to read from, and by how much its photographs are still to be shrunk.
+def _image_folders(root: Path, shots: Sequence[PosedImage], options: PhotoOptions) -> dict[str, tuple[str, int]]:
+    """Choose the folder to read in place of each listed one, and by how much its photographs are still to be shrunk.
 
-    The folder that was asked for; else `<folder>_<factor>` where it exists; else the listed folder, shrunk here.
+    The folder that was asked for; else `<folder>_<factor>` where it exists, unless the list has photographs of its own
+    in there; else the listed folder, shrunk here.
     """
-    chosen = options.images or folder
-    if options.images is None and folder and options.factor > 1 and (root / f"{folder}_{options.factor}").is_dir():
-        chosen = f"{folder}_{options.factor}"
-    done = options.factor > 1 and chosen.endswith(f"_{options.factor}")
-    return chosen, 1 if done else options.factor
+    factor, listed = options.factor, {shot.folder for shot in shots}
+    # a shell that completes names ends them with a slash
+    asked = Path(options.images).as_posix() if options.images else None
+    found: dict[str, tuple[str, int]] = {}
+    for folder in listed:
+        small = f"{folder}_{factor}"
+        shrunk_before = bool(folder) and factor > 1 and small not in listed and (root / small).is_dir()
+        chosen = asked or (small if shrunk_before else folder)
+        # the last letters of a listed folder's own name say nothing: `cam_2` is that of the second camera
+        done = factor > 1 and (asked.endswith(f"_{factor}") if asked else shrunk_before)
+        found[folder] = chosen, 1 if done else factor
+    return found
 
 
 def _rectifier() -> Any:

@@ -224,6 +224,7 @@ def test_shrinking_averages_areas_or_takes_a_folder_of_shrunk_photographs_and_te
     assert np.allclose(exact.views[0].K[:2], K[:2] / 2.0)
     named = raw(root, factor=1, images="images_2")
     assert np.array_equal(named.views[0].image, exact.views[0].image)
+    assert raw(root, factor=2, images="images_2/").views[0].image.shape == (15, 20, 3)
     (root / "images_2" / "03.jpg").unlink()
     assert_one_line(lambda: raw(root, factor=2), "images_2", "03.png")
     assert np.array_equal(raw(root, factor=2, missing="skip").views[2].image, exact.views[2].image)

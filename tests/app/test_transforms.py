@@ -264,6 +264,14 @@ def test_cameras_with_a_folder_each_may_name_their_photographs_alike(root: Path)
     assert_one_line(lambda: raw(root), "masks", "no mask named like a photograph")
 
 
+def test_a_listed_folder_whose_name_ends_like_one_of_shrunk_photographs_is_shrunk_too(root: Path) -> None:
+    names = [f"{'cam' if i % 2 else 'cam_2'}/{i}.png" for i in range(len(list((root / "images").iterdir())))]
+    in_folders(root, names)
+    for view in raw(root, factor=2).views:
+        want = photograph(int(Path(view.name).stem)).astype(float).reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3)
+        assert np.abs(view.image - want.mean(axis=(1, 3))).max() <= 0.5 + 1e-6
+
+
 @pytest.mark.parametrize("place", ["", "../", "absolute"])
 def test_a_photograph_is_not_its_own_mask_wherever_it_lies(tmp_path: Path, place: str) -> None:
     root = transforms_capture(tmp_path / "scene")
