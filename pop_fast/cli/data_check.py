@@ -97,7 +97,7 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
     findings += about_quality([photo.shown for photo in photos if photo.shown is not None])
     findings += check_dataset.about_drift(photos)
     findings += check_dataset.about_masks(photos, root)
-    findings += check_dataset.about_points(shots, cloud)
+    findings += check_dataset.about_points(photos, cloud)
     findings += check_dataset.about_reprojection(root)
     findings += check_dataset.about_memory(photos, cloud, memory_bytes()[1])
     return findings

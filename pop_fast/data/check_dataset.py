@@ -33,7 +33,7 @@ from pop_fast.data.photo_quality import (
     ok,
     warn,
 )
-from pop_fast.data.read_images import find_masks, fix_of_absent, read_fitting_mask, undistortion
+from pop_fast.data.read_images import camera_of, find_masks, fix_of_absent, read_fitting_mask, undistortion
 from pop_fast.data.sfm import photo_folder
 from pop_fast.errors import CaptureError
 from pop_fast.io.images import list_images, read_image, read_mask, unreadable_photographs
@@ -227,26 +227,24 @@ def about_masks(photos: Sequence[Photo], root: Path) -> Iterator[CaptureFinding]
         yield warn("masks", f"{len(lone)} photographs have none, first {lone[0]}: all of their pixels count")
 
 
-def about_points(
-    shots: Iterable[PosedImage], cloud: SparsePoints | None, sample: int = 2000
-) -> Iterator[CaptureFinding]:
+def about_points(photos: Iterable[Photo], cloud: SparsePoints | None, sample: int = 2000) -> Iterator[CaptureFinding]:
     """Project a sample of the points into every view: poses and points that do not belong together show here."""
     if cloud is None or len(cloud) == 0:
         yield warn("points", "none: training starts from random points in the cameras' view")
         return
     chosen = cloud.xyz[np.random.default_rng(0).permutation(len(cloud))[:sample]]
     shares: dict[str, float] = {}
-    for shot in shots:
-        if shot.camera is None or shot.camera.width < 1:
+    for shot, camera in ((photo.shot, camera_of(photo.shot, photo.size)) for photo in photos):
+        if camera.width < 1:
             continue
         seen = chosen @ shot.viewmat[:3, :3].T + shot.viewmat[:3, 3]
         front = seen[seen[:, 2] > 1e-6]
-        pixels = shot.camera.img_from_cam(front) if len(front) else np.zeros((0, 2))
-        inside = np.all((pixels >= 0.0) & (pixels <= [shot.camera.width, shot.camera.height]), axis=1)
+        pixels = camera.img_from_cam(front) if len(front) else np.zeros((0, 2))
+        inside = np.all((pixels >= 0.0) & (pixels <= [camera.width, camera.height]), axis=1)
         shares[shot.name] = float(inside.sum()) / len(chosen)
     blind = [name for name, share in shares.items() if share == 0.0]
-    mean = 100.0 * float(np.mean(list(shares.values()) or [0.0]))
-    yield ok("points", f"{len(cloud):,}; a view sees {mean:.0f} % of them on average")
+    mean = f"; a view sees {100.0 * float(np.mean(list(shares.values()))):.0f} % of them on average" if shares else ""
+    yield ok("points", f"{len(cloud):,}{mean}")
     if blind:
         yield warn("points", f"{len(blind)} views see none, first {blind[0]}: are these poses right?")
 
@@ -273,7 +271,7 @@ def about_reprojection(root: Path) -> Iterator[CaptureFinding]:
     # COLMAP holds tracks against each other, and says what does not agree by errors of many kinds, without a file
     except Exception as problem:
         words = " ".join(str(problem).split())
-        fix = "training ignores its tracks; write the model again to use them"
+        fix = "their error is unknown, and training takes them as they stand; write the model again to have it measured"
         yield warn("reprojection", f"{model}: COLMAP cannot read its tracks ({words}); {fix}")
         return
     if observations == 0:

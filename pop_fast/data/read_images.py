@@ -262,13 +262,19 @@ def _read(photo: _Photo, options: PhotoOptions, rectify: Any) -> View:
     return _upright(view, photo.shot.turns)
 
 
+def camera_of(shot: PosedImage, stored: tuple[int, int]) -> Any:
+    """Give the camera of a shot; by its field of view, where that alone is known, and its photograph's stored size."""
+    if shot.camera is not None:
+        return shot.camera
+    width, height = stored
+    focal = 0.5 * width / math.tan(0.5 * (shot.angle_x or 1.0))
+    return make_camera(0, "PINHOLE", width, height, [focal, focal, width / 2, height / 2])
+
+
 def _placed(photo: _Photo, stored: tuple[int, int], rectify: Any) -> tuple[Undistortion, tuple[int, int], np.ndarray]:
     """Find how a photograph of a stored size is undistorted, the size that it is used in, and K of that."""
     width, height = stored
-    camera = photo.shot.camera
-    if camera is None:
-        focal = 0.5 * width / math.tan(0.5 * (photo.shot.angle_x or 1.0))
-        camera = make_camera(0, "PINHOLE", width, height, [focal, focal, width / 2, height / 2])
+    camera = camera_of(photo.shot, stored)
     _check_shape(photo.path, "the photograph", stored, "its camera", (camera.width, camera.height))
     try:
         rectification = rectify(camera, width, height)

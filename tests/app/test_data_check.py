@@ -37,6 +37,7 @@ from tests.app.captures import (
     look_at,
     photograph,
     ring,
+    transforms_capture,
     write_model,
     write_photograph,
 )
@@ -211,6 +212,13 @@ def test_what_training_refuses_stands_against_it_in_the_same_words(check: Check,
         assert message.endswith(problem.removeprefix("00.png: ")), (message, problem)
 
 
+def test_points_are_held_against_cameras_of_which_only_the_field_of_view_is_known(check: Check, tmp_path: Path) -> None:
+    root = transforms_capture(tmp_path, camera_angle_x=1.0, **dict.fromkeys(("w", "h", "fl_x", "fl_y", "cx", "cy")))
+    head = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    (root / "points3D.ply").write_text(f"{head}end_header\n0 0 0\n0 0 99\n")
+    assert finding(check(root), "ok", "points").endswith("2; a view sees 50 % of them on average")
+
+
 def test_of_a_block_the_whole_capture_is_looked_over(check: Check, root: Path, tmp_path: Path) -> None:
     listing = list_capture(root)
     shots = [replace(shot, split="train") for shot in listing.shots[:3]]
@@ -239,15 +247,24 @@ def test_photographs_without_a_camera_are_named(check: Check, root: Path) -> Non
     assert load_capture(root).notes[0] in note
 
 
-def test_tracks_that_colmap_refuses_are_told_with_the_models_folder(pop: Pop, tmp_path: Path) -> None:
+def test_tracks_that_colmap_refuses_are_told_with_the_models_folder(
+    pop: Pop, shared_capture: Path, tmp_path: Path
+) -> None:
     shutil.copytree(HERE / "colmap", tmp_path / "scene")
     outcome = pop("data", "check", tmp_path / "scene")
     assert outcome.err == ""
     (line,) = [line for line in outcome.out.splitlines() if " reprojection " in line]
     assert line.startswith("LOOK")
     assert f"{tmp_path / 'scene' / 'sparse' / '0'}: COLMAP cannot read its tracks" in line
-    assert line.endswith("training ignores its tracks; write the model again to use them")
+    assert line.endswith("training takes them as they stand; write the model again to have it measured")
     assert pop("data", "check", HERE / "tracked").out.count("mean error") == 1
+    # a copy without its frames holds the same tracks
+    copy = Path(shutil.copytree(shared_capture, tmp_path / "copy"))
+    (copy / "sparse" / "0" / "frames.bin").unlink()
+    assert "COLMAP cannot read its tracks" in pop("data", "check", copy).out
+    for ours, theirs in zip(load_capture(copy).views, load_capture(shared_capture).views, strict=True):
+        assert len(ours.seen)
+        assert np.array_equal(ours.seen, theirs.seen)
 
 
 def test_photographs_alone_are_looked_over(check: Check, bare: Path, tmp_path: Path) -> None:
