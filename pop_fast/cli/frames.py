@@ -43,6 +43,6 @@ def run(argv: Sequence[str]) -> int:
     with bars() as progress:
         found = take_frames(args.video, out, args.count, args.max_size, progress, overwrite=args.overwrite)
     resting = f"; the camera rested in {found.alike} stretches" if found.alike else ""
-    print(f"{len(found.frames)} of {found.of:,} frames{resting} -> {found.folder}")
+    print(f"{len(found.frames)} of {found.of:,} frames{resting} -> {found.folder}{found.lost}")
     print(f"next: pop train {quote(str(found.folder))}")
     return 0

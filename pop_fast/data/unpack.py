@@ -32,7 +32,9 @@ _FIX = "unpack it yourself, and give the folder"
 # what the system says of a member's name that cannot be a file's
 _NAMES = (errno.ENAMETOOLONG, errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.EINVAL, errno.EILSEQ)
 # next to the photographs of an archive, what other systems have put there
-_LEFT_OUT = ("__MACOSX", ".DS_Store", "Thumbs.db")
+_LEFT_OUT = ("__MACOSX", ".DS_Store", "Thumbs.db", "desktop.ini")
+# words about a capture that lie beside its folder
+_ABOUT = ("readme", "license", "licence")
 
 
 def capture_folder(path: Path, progress: Progress | None = None) -> tuple[Path, str | None]:
@@ -53,7 +55,8 @@ def capture_folder(path: Path, progress: Progress | None = None) -> tuple[Path, 
         if _made_before(path, target):
             return target, f"{path}: its photographs are in {target} already"
         taken = take_frames(path, target, progress=progress)
-        return target, f"{path}: {len(taken.frames)} of {taken.of:,} frames are taken as photographs, in {target}"
+        what = f"{len(taken.frames)} of {taken.of:,} frames are taken as photographs, in {target}"
+        return target, f"{path}: {what}{taken.lost}"
     # one that was cut short is not known by its end, but by its name
     if zipfile.is_zipfile(path) or path.suffix.lower() == ".zip":
         # beside x.zip, what x.usdz holds has a folder of its own
@@ -92,13 +95,15 @@ def unpack(path: Path, target: Path) -> None:
     try:
         with zipfile.ZipFile(path) as archive:
             members = [member for member in archive.infolist() if not _left_out(member)]
-            check_members(path, archive, path.stat().st_size, _FIX)
+            check_members(path, archive, path.stat().st_size, _FIX, disk=path.absolute().parent)
             with folder_atomically(target, keeps=[path]) as folder:
                 for member in members:
                     place = folder / _inside(path, member)
                     place.parent.mkdir(parents=True, exist_ok=True)
                     with archive.open(member) as source, place.open("wb") as file:
                         shutil.copyfileobj(source, file)
+    except PopError as error:
+        raise CaptureError(str(error)) from error
     except OSError as error:
         # a full disk is reported as such by the caller; a name that no folder can hold is the archive's
         if error.errno not in _NAMES:
@@ -133,7 +138,7 @@ def _inside(path: Path, member: zipfile.ZipInfo) -> str:
 def _inmost(folder: Path) -> Path:
     """Go down to the capture, where an archive holds it in one folder of its own."""
     while True:
-        inside = [path for path in folder.iterdir() if not path.name.startswith(".")]
+        inside = [path for path in folder.iterdir() if path.name[0] != "." and path.stem.lower() not in _ABOUT]
         # a folder of photographs is found in the capture; sparse cameras belong to the folder over them
         if len(inside) != 1 or not inside[0].is_dir() or inside[0].name in ("images", "sparse"):
             return folder
@@ -152,6 +157,13 @@ class Taken:
     frames: tuple[int, ...]  # their numbers in the video, from 0
     of: int  # frames that the video has
     alike: int  # stretches without a photograph, because nothing had moved
+    decoded: int  # frames before the first that could not be decoded
+
+    @property
+    def lost(self) -> str:
+        """Say which frames were not looked at; empty where all were."""
+        what = f"; from frame {self.decoded + 1:,} on the video is damaged, and was not read: {_CONVERT}"
+        return what if self.decoded < self.of else ""
 
 
 @dataclass
@@ -196,8 +208,9 @@ def take_frames(
     taken: list[int] = []
     alike = 0
     last: np.ndarray | None = None
+    decoded: list[int] = []
     with folder_atomically(out, overwrite, keeps=[path], recognise=lambda file: _is_ours(file, pattern)) as folder:
-        for best in _sharpest(path, total, stretch, progress):
+        for best in _sharpest(path, total, stretch, progress, decoded):
             thumb = thumbnail(cv2.cvtColor(best.image, cv2.COLOR_BGR2GRAY))
             if last is not None and look_the_same(thumb, last[None])[0]:
                 alike += 1
@@ -207,7 +220,7 @@ def take_frames(
             taken.append(best.number)
         if len(taken) < 2:
             raise CaptureError(f"{path}: nothing moves in it; walk around the subject with the camera")
-    return Taken(out, tuple(taken), total, alike)
+    return Taken(out, tuple(taken), total, alike, len(decoded))
 
 
 def _is_ours(file: Path, pattern: str) -> bool:
@@ -250,8 +263,13 @@ def _count(path: Path, *settings: int) -> int:
         video.release()
 
 
-def _sharpest(path: Path, total: int, stretch: float, progress: Progress | None) -> Iterator[_Candidate]:
-    """Give the sharpest frame of every stretch, in order, half a stretch or more apart."""
+def _sharpest(
+    path: Path, total: int, stretch: float, progress: Progress | None, decoded: list[int]
+) -> Iterator[_Candidate]:
+    """Give the sharpest frame of every stretch, in order, half a stretch or more apart.
+
+    What follows a damaged frame would show it too, up to a frame that does not build on others, and is not read.
+    """
     video = _open(path)
     best: _Candidate | None = None
     earliest, end = 0.0, stretch
@@ -260,6 +278,7 @@ def _sharpest(path: Path, total: int, stretch: float, progress: Progress | None)
             found, image = video.read()
             if not found:
                 break
+            decoded.append(number)
             if progress is not None:
                 progress("looking at frames", number + 1, total)
             if number >= end:

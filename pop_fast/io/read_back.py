@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -161,7 +162,9 @@ PICTURE: Final = 2**29
 _MOST_TIMES: Final = 200
 
 
-def check_memory(path: Path | str, needed: int, packed: int, what: str, fix: str, floor: int = _ANY) -> None:
+def check_memory(
+    path: Path | str, needed: int, packed: int, what: str, fix: str, floor: int = _ANY, disk: Path | None = None
+) -> None:
     """Refuse what needs more memory than its file makes likely, or than there is; a PopError names both sizes in MB.
 
     Args:
@@ -171,26 +174,25 @@ def check_memory(path: Path | str, needed: int, packed: int, what: str, fix: str
         what: states it, for the error.
         fix: what to do, for the error.
         floor: bytes that are always likely.
+        disk: a folder on the disk that it is written to piece by piece, and which has to have room in place of memory.
     """
     if needed <= _ANY:
         return
+    takes = f"{path}: {what} would take {_mb(needed)} of {'memory to read' if disk is None else 'the disk'}"
     if needed > max(floor, _MOST_TIMES * packed):
-        raise PopError(
-            f"{path}: {what} would take {_mb(needed)} of memory to read, and the file has {_mb(packed)}, "
-            f"too little for such content; {fix}"
-        )
-    free = free_bytes()
+        raise PopError(f"{takes}, and the file has {_mb(packed)}, too little for such content; {fix}")
+    free = free_bytes() if disk is None else shutil.disk_usage(disk).free
     if free is not None and needed > free:
-        raise PopError(f"{path}: {what} would take {_mb(needed)} of memory to read, and {_mb(free)} are free; {fix}")
+        raise PopError(f"{takes}, and {_mb(free)} are free; {fix}")
 
 
-def check_members(path: Path | str, archive: zipfile.ZipFile, packed: int, fix: str, times: int = 1) -> None:
-    """Refuse a zip whose members would come to too much, at `times` bytes for one of theirs; see `check_memory`."""
+def check_members(path: Path | str, archive: zipfile.ZipFile, packed: int, fix: str, disk: Path | None = None) -> None:
+    """Refuse a zip whose members would come to too much; see `check_memory`."""
     members = archive.infolist()
     if members:
         largest = max(members, key=lambda member: member.file_size)
-        needed = times * sum(member.file_size for member in members)
-        check_memory(path, needed, packed, f"{largest.filename[:80]!r} and what else is in it", fix)
+        needed = sum(member.file_size for member in members)
+        check_memory(path, needed, packed, f"{largest.filename[:80]!r} and what else is in it", fix, disk=disk)
 
 
 def _mb(size: int) -> str:

@@ -706,6 +706,7 @@ def test_an_archive_trains_without_a_second_command(pop: Pop, shared_capture: Pa
         for part in filter(Path.is_file, shared_capture.rglob("*")):
             file.write(part, f"walk/{part.relative_to(shared_capture).as_posix()}")
         file.writestr("__MACOSX/._a.jpg", b"nothing")
+        file.writestr("README.txt", b"beside the capture")
     said = pop.done("train", packed, "--out", tmp_path / "r", "--max-steps", "2", *QUICKLY).out
     assert "unpacked in" in said
     folder = tmp_path / "toy_unpacked" / "walk"
@@ -739,7 +740,7 @@ def test_an_archive_that_leads_out_of_its_folder_fills_the_disk_or_is_damaged_is
         with zipfile.ZipFile(tmp_path / "a.zip", "w") as file:
             file.writestr("fine.jpg", b"1")
             file.writestr(name, b"2")
-        with pytest.raises(CaptureError, match="outside of its folder"):
+        with pytest.raises(CaptureError, match=r"^\S+a\.zip: '\S+' would be unpacked outside of its folder; [^;:]+$"):
             unpack(tmp_path / "a.zip", tmp_path / "deep" / "a")
         assert not list(tmp_path.rglob("*.jpg"))
     with zipfile.ZipFile(tmp_path / "bomb.zip", "w", zipfile.ZIP_DEFLATED) as file:

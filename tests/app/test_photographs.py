@@ -8,7 +8,9 @@ import os
 import shutil
 import tracemalloc
 import unicodedata
+import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -24,9 +26,9 @@ from pop_fast.cli import main
 from pop_fast.data import load_capture, run_sfm, sfm
 from pop_fast.data.photo_quality import sharpness
 from pop_fast.data.read_images import _upright, shrink_bicubic
-from pop_fast.data.unpack import take_frames
+from pop_fast.data.unpack import take_frames, unpack
 from pop_fast.errors import CaptureError, PopError
-from pop_fast.io import images
+from pop_fast.io import images, read_back
 from pop_fast.io.image_header import Exif, can_read_heif, read_exif, read_size, size_of
 from pop_fast.io.images import list_images, read_image, sound_jpegs
 from pop_fast.view.paths import VideoFile
@@ -505,6 +507,21 @@ def test_every_stretch_gives_a_sharp_frame_and_a_rest_gives_one(clip: Path, tmp_
     assert {read_image(path).shape for path in list_images(tmp_path / "all")} == {(48, 64, 3)}
 
 
+def test_frames_after_a_damaged_one_are_not_taken_which_is_said(clip: Path, tmp_path: Path, pop: Pop) -> None:
+    data = bytearray(clip.read_bytes())
+    at = -1
+    for _ in range(41):
+        at = data.index(b"00dc", at + 1)
+    data[at + 8 : at + 1000] = bytes(992)
+    (tmp_path / "walk.avi").write_bytes(data)
+    assert take_frames(clip, tmp_path / "whole", count=8).lost == ""
+    done = pop.done("frames", tmp_path / "walk.avi", "--count", "8", "--out", tmp_path / "out")
+    assert "of 80 frames" in done.out
+    # a decoder that works ahead may tell a frame early
+    assert "; from frame 4" in done.out
+    assert " on the video is damaged, and was not read: convert it" in done.out
+
+
 def test_sharpness_is_that_of_the_picture_shrunk_and_falls_with_blur() -> None:
     sharp, soft = (cv2.cvtColor(frame(number), cv2.COLOR_RGB2GRAY) for number in (2, 3))
     assert sharpness(sharp) > 4.0 * sharpness(soft)
@@ -550,3 +567,17 @@ def test_what_is_no_video_is_one_line_and_leaves_nothing(clip: Path, tmp_path: P
     assert len(taken.frames) + taken.alike == 8
     # training on one says how to take photographs out of it
     assert_one_line(lambda: load_capture(clip), "walk.avi: is a video; ", " pop frames")
+
+
+def test_an_archive_needs_room_on_the_disk_and_not_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as file:
+        file.writestr("a.jpg", b"some bytes")
+    monkeypatch.setattr(read_back, "_ANY", 0)
+    monkeypatch.setattr(read_back, "free_bytes", lambda: 0)
+    unpack(tmp_path / "a.zip", tmp_path / "whole")
+    assert (tmp_path / "whole" / "a.jpg").read_bytes() == b"some bytes"
+    monkeypatch.setattr(read_back.shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
+    said = r"a\.zip: 'a\.jpg' and what else is in it would take .* of the disk, and 0\.0 MB are free"
+    with pytest.raises(CaptureError, match=said):
+        unpack(tmp_path / "a.zip", tmp_path / "none")
+    assert not (tmp_path / "none").exists()
