@@ -28,6 +28,7 @@ import io
 import itertools
 import json
 import math
+import os
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Callable
@@ -47,7 +48,7 @@ from pop_fast.data.cameras import (
     viewmat_from_pose,
 )
 from pop_fast.data.capture import Listing, PosedImage, SparsePoints, Split
-from pop_fast.errors import CaptureError
+from pop_fast.errors import CaptureError, PopError
 from pop_fast.io.image_header import read_size
 from pop_fast.io.images import find_image, read_image
 from pop_fast.io.ply import read_points
@@ -418,17 +419,23 @@ def read_transforms(paths: list[Path]) -> tuple[list[PosedImage], SparsePoints |
                 f"{path}: ply_file_path is {shortened(points)}; it must be the relative name of a PLY file"
             )
         named = path.parent / _name(points) if points else named
+        if points and named is not None and not os.path.isfile(named):
+            raise CaptureError(f"{path}: ply_file_path names {named}, which is absent; restore it or remove the field")
     names = sorted(shot.name for shot in shots)
     twice = [a for a, b in itertools.pairwise(names) if a == b]
     if twice:
-        raise CaptureError(f"{paths[0]}: frames lists {twice[0]} twice; remove one of them")
+        lists = " and ".join(map(str, paths))
+        raise CaptureError(f"{lists}: frames lists {twice[0]} twice; remove one of them")
     return sorted(shots, key=lambda shot: shot.name), points_beside(paths[0].parent, named)
 
 
 def points_beside(folder: Path, named: Path | None = None) -> SparsePoints | None:
     """Read the points of a capture: those of the file that its list names, else of a file of a usual name, if any."""
     found = [named] if named else [f for f in (folder / name for name in _POINTS) if f.is_file()]
-    return SparsePoints(*read_points(found[0])) if found else None
+    try:
+        return SparsePoints(*read_points(found[0])) if found else None
+    except PopError as error:
+        raise CaptureError(str(error)) from error
 
 
 def _load_transforms(path: Path) -> dict[str, Any]:
@@ -469,7 +476,7 @@ def _placed(name: str) -> tuple[str, str]:
 
     That is the first folder below the list, or below folders above it; of an absolute name all but the file's own.
     """
-    if name.startswith("/"):
+    if name.startswith("/") or name[1:3] == ":/":
         folder, _, file = name.rpartition("/")
         return folder or "/", file
     parts = name.split("/")
@@ -531,7 +538,10 @@ def _camera(where: str, fields: dict[str, Any], camera_id: int) -> Any:
         raise CaptureError(f"{where}: w x h is {width} x {height}; both must be at least 1 and at most {WIDEST}")
     model = "OPENCV_FISHEYE" if fields.get("is_fisheye") else str(fields.get("camera_model", "OPENCV"))
     if model not in _MODELS:
-        raise CaptureError(f"{where}: camera_model is {model!r}; use one of {', '.join(_MODELS)}, or a COLMAP model")
+        fix = f"use one of {', '.join(_MODELS)}, or a COLMAP model"
+        if model == "EQUIRECTANGULAR":
+            fix = "no pinhole image can hold a full sphere: cut it into perspective views"
+        raise CaptureError(f"{where}: camera_model is {model!r}; {fix}")
     focal_x = _focal(number, "fl_x", "camera_angle_x", width)
     if focal_x is None:
         raise CaptureError(f"{where}: has neither fl_x nor camera_angle_x; one of them must give the focal length")

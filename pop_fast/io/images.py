@@ -50,8 +50,9 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
-# what cameras write and nothing here reads: HEIF without pillow-heif, and raw formats
-_UNREADABLE = (".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
+# what cameras and other programs write and no folder is searched for: HEIF without pillow-heif, and raw formats
+_RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".orf", ".raf", ".rw2")
+_UNREADABLE = (*_RAW, ".avif", ".jxl", ".gif", ".jfif", ".jp2", ".exr")
 VIDEO_SUFFIXES = (".mov", ".mp4", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp")
 # what `pop train` writes tells a result
 _OF_A_RESULT: Final = ("cfg.json", "capture.json")
@@ -281,7 +282,7 @@ def _decode(path: Path) -> np.ndarray:
         raise CaptureError(f"{path}: {defect}; {FIX}")
     if size is None:
         # a size that nobody has seen is nobody's to judge, and OpenCV also decodes what no camera writes
-        raise CaptureError(f"{path}: is not a PNG, JPEG, WebP, TIFF, BMP or HEIC image; {FIX}")
+        raise CaptureError(f"{path}: is not a PNG, JPEG, WebP, TIFF, BMP or HEIC image; convert it to one, or {FIX}")
     try:
         # IMREAD_UNCHANGED keeps alpha and 16 bit, and leaves the EXIF orientation alone, but for a TIFF's
         with QUIET:

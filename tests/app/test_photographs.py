@@ -195,7 +195,8 @@ def test_reading_whole_and_bad_photographs_prints_nothing(tmp_path: Path, capfd:
 )
 def test_what_is_no_photograph_is_named_by_the_capture_too(root: Path, content: bytes, word: str) -> None:
     (root / "images" / "02.png").write_bytes(content)
-    assert_one_line(lambda: load_capture(root), str(root / "images" / "02.png"), word, "copy it again")
+    message = assert_one_line(lambda: load_capture(root), str(root / "images" / "02.png"), word, "copy it again")
+    assert ("convert it" in message) == (word[:3] == "is ")
 
 
 # What a file's header says, held against what another library writes; and headers that promise too much.
@@ -287,6 +288,12 @@ def test_what_is_not_read_is_named_with_the_way_to_convert_it(tmp_path: Path, mo
     words = ("3 files are HEIC", "pip install pillow-heif, or convert them to JPEG", "mogrify -format jpg *.HEIC")
     assert_one_line(lambda: load_capture(tmp_path, sfm=True), "has no photographs", *words)
     assert_one_line(lambda: run_sfm(tmp_path), "has 0 photographs;", *words)
+    # what browsers save, and what is an image all the same
+    for kind in ("jfif", "gif"):
+        (tmp_path / kind).mkdir()
+        (tmp_path / kind / f"a.{kind}").write_bytes(b"")
+        one = f"1 file is {kind.upper()} or the like, which is not read: convert them to JPEG"
+        assert_one_line(lambda kind=kind: load_capture(tmp_path / kind), one)
 
 
 def test_a_subfolder_that_cannot_be_looked_into_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -212,7 +212,10 @@ def test_blender_captures_have_their_own_split_field_of_view_and_transparency(tm
     assert K_of(tmp_path) == pytest.approx([focal(0.9, WIDTH)] * 2 + [WIDTH / 2, HEIGHT / 2])
     assert capture.views[0].image.shape == (HEIGHT, WIDTH, 3)
     assert not np.array_equal(capture.views[0].image, raw(tmp_path).views[0].image)
-    (tmp_path / "transforms_test.json").unlink()
+    train, test = (tmp_path / f"transforms_{split}.json" for split in ("train", "test"))
+    test.write_text(test.read_text().replace("test/r_0", "train/r_0"))
+    assert_one_line(lambda: raw(tmp_path), str(train), str(test), "lists train/r_0 twice")
+    test.unlink()
     assert [view.name for view in raw(tmp_path).test_views()] == ["val/r_0", "val/r_1"]
     (tmp_path / "transforms_val.json").unlink()
     assert [view.name for view in raw(tmp_path).test_views(2)] == ["train/r_0", "train/r_2"]
@@ -305,6 +308,15 @@ def test_every_name_of_a_list_from_windows_may_have_backslashes(root: Path) -> N
     ]
     assert all(view.mask is not None for view in capture.views)
 
+    def absolute(listing: dict[str, Any]) -> None:
+        for frame in listing["frames"]:
+            frame["file_path"] = f"C:\\walk\\{frame['file_path']}"
+        listing["train_filenames"] = None
+
+    edit_transforms(root, absolute)
+    assert_one_line(lambda: raw(root), "C:/walk/images", "pass --images .")
+    assert np.array_equal(raw(root, images=".").views[1].image, capture.views[1].image)
+
 
 def test_colmap_is_preferred_unless_the_other_is_asked_for(root: Path) -> None:
     colmap_capture(root)
@@ -396,6 +408,7 @@ BAD_FIELDS: dict[str, tuple[Edit, tuple[str, ...]]] = {
     "no size": (without("w", "h"), ("frames[0]", "w and h are absent")),
     "no height": (without("h"), ("frames[0]", "h is None")),
     "unknown lens": (frame(camera_model="PANINI"), ("frames[1]", "camera_model is 'PANINI'", "OPENCV")),
+    "full sphere": (frame(camera_model="EQUIRECTANGULAR"), ("frames[1]", "full sphere", "perspective views")),
     "fourth radial term": (frame(k4=0.1), ("frames[1]", "k4 is 0.1")),
     "terms of a pinhole": (frame(camera_model="PINHOLE", k1=0.1), ("frames[1]", "k1 is 0.1", "PINHOLE", "OPENCV")),
     "p2 of a fisheye": (frame(camera_model="OPENCV_FISHEYE", p2=0.1), ("frames[1]", "p2 is 0.1")),
@@ -405,6 +418,10 @@ BAD_FIELDS: dict[str, tuple[Edit, tuple[str, ...]]] = {
     "width 1e300": (frame(w=1e300), ("frames[1]", "w x h", "at most")),
     "split a number": (listed(val_filenames=5), ("val_filenames is 5", "list")),
     "points a list": (listed(ply_file_path=[]), ("ply_file_path is []", "PLY")),
+    "no points": (
+        listed(ply_file_path="no.ply"),
+        ("ply_file_path names", "no.ply, which is absent", "remove the field"),
+    ),
     "listed twice": (lambda listing: listing["frames"].append(listing["frames"][0]), ("images/00.png twice",)),
     "split of unknown": (listed(test_filenames=["no.png"]), ("test_filenames", "no.png")),
 }
@@ -440,6 +457,8 @@ XY = b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float
 )
 def test_damaged_points_in_the_folder_are_named(root: Path, content: bytes, words: tuple[str, ...]) -> None:
     (root / "sparse_pc.ply").write_bytes(content)
+    with pytest.raises(CaptureError):
+        load_capture(root)
     assert_one_line(lambda: load_capture(root), "sparse_pc.ply", *words)
 
 
