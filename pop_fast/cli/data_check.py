@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import tyro
 
 from pop_fast.cli import parse, printable
+from pop_fast.errors import CaptureError
 from pop_fast.io.heartbeat import bars
 from pop_fast.machine import memory_bytes
 
 if TYPE_CHECKING:
+    from pop_fast.data.capture import Listing
     from pop_fast.data.photo_quality import CaptureFinding
 
 T = TypeVar("T")
@@ -86,6 +88,7 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
     findings += [warn("poses", note) for note in listing.notes]
     findings += check_dataset.about_cameras(shots)
     findings += check_dataset.about_places(shots, cloud)
+    findings += check_dataset.about_split(shots)
     findings += check_dataset.about_spacing(shots)
     found = find_photographs(root, shots, images)
     paths = {id(shot): path for shot, path in zip(shots, found, strict=True)}
@@ -98,9 +101,24 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
     findings += check_dataset.about_drift(photos)
     findings += check_dataset.about_masks(photos, root)
     findings += check_dataset.about_points(photos, cloud)
+    if not cloud and all(finding.state != "bad" for finding in findings):
+        findings += _about_start(root, listing, images)
     findings += check_dataset.about_reprojection(root)
     findings += check_dataset.about_memory(photos, cloud, memory_bytes()[1])
     return findings
+
+
+def _about_start(root: Path, listing: Listing, images: str | None) -> list[CaptureFinding]:
+    """Tell what stands against the random points that training starts from, where the capture brings none."""
+    from pop_fast.data.load import RANDOM_POINTS, about_random_points, load_capture, random_points
+    from pop_fast.data.photo_quality import bad, warn
+
+    views = load_capture(root, images=images, masks=False, photographs="none", listing=listing).views
+    try:
+        made = random_points(views)
+    except CaptureError as error:
+        return [bad("points", str(error))]
+    return [warn("points", note) for note in about_random_points(views, len(made), RANDOM_POINTS)]
 
 
 def _each(items: Sequence[T], read: Callable[[T], R], file_of: Callable[[T], Path | None]) -> tuple[list[R], list[str]]:

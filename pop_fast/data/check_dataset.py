@@ -13,6 +13,8 @@ from pop_fast.data.capture import (
     FAR_APART,
     PosedImage,
     SparsePoints,
+    Split,
+    held_out,
     nearest_cameras,
     normalizing_transform,
 )
@@ -108,6 +110,15 @@ def about_places(shots: Sequence[PosedImage], cloud: SparsePoints | None) -> Ite
             normalizing_transform(np.stack([shot.viewmat for shot in shots]), cloud.xyz if cloud else None)
     except CaptureError as error:
         yield bad("poses", str(error))
+
+
+def about_split(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:
+    """Tell how many views a capture's own lists leave to train on, where it has any."""
+    splits: list[Split | None] = [shot.split for shot in shots]
+    if any(split is not None for split in splits):
+        out = f"{sum(held_out(splits, 0))} of {len(shots)} held out by its own lists"
+        none = "its own lists hold all out: name photographs to train on there"
+        yield ok("split", f"{splits.count('train')} to train on, {out}") if "train" in splits else bad("split", none)
 
 
 def about_spacing(shots: Sequence[PosedImage]) -> Iterator[CaptureFinding]:

@@ -52,6 +52,9 @@ from pop_fast.io.read_back import read_arrays, read_json
 _SAME_WAY = 0.9
 # photographs that a line names
 _NAMED = 12
+# made where a capture brings none
+RANDOM_POINTS: Final = 30_000
+_ADD_POINTS: Final = "add points: run pop sfm on the photographs, or name a PLY file as ply_file_path"
 
 
 def about_other_models(root: Path, models: Sequence[tuple[Path, int]]) -> list[str]:
@@ -81,14 +84,14 @@ def about_unplaced(folder: Path, shots: Sequence[PosedImage]) -> tuple[int, list
 
 def about_random_points(views: Sequence[View], made: int, wanted: int) -> list[str]:
     """Tell where random points can be expected to be poor: too few, or between cameras that all look away."""
-    fix = "add points: run pop sfm on the photographs, or name a PLY file as ply_file_path"
     length = float(np.linalg.norm(np.mean([view.viewmat[2, :3] for view in views], axis=0)))
     if length > _SAME_WAY:
         return [
-            f"all cameras look about the same way, so the {made:,} random points are near them, not on the scene; {fix}"
+            f"all cameras look about the same way, so the {made:,} random points are near them, not on the scene; "
+            f"{_ADD_POINTS}"
         ]
     if made < wanted:
-        return [f"only {made:,} of {wanted:,} random points are where two cameras look; {fix}"]
+        return [f"only {made:,} of {wanted:,} random points are where two cameras look; {_ADD_POINTS}"]
     return []
 
 
@@ -109,7 +112,7 @@ def load_capture(
     images: str | None = None,
     resize: Literal["area", "bicubic"] = "area",
     sfm: bool | SfmOptions = False,
-    points: int = 30_000,
+    points: int = RANDOM_POINTS,
     seed: int = 0,
     photographs: Photographs = "all",
     test_every: int = 8,
@@ -341,7 +344,7 @@ def _assemble(root: Path, listing: Listing, views: list[View], normalize: bool, 
 _ROUNDS = 20
 
 
-def random_points(views: Sequence[View], count: int = 30_000, seed: int = 0) -> SparsePoints:
+def random_points(views: Sequence[View], count: int = RANDOM_POINTS, seed: int = 0) -> SparsePoints:
     """Draw points uniformly from the cameras' bounding cube, and keep those in the pictures of two views or more.
 
     The cube stands around the bounding box of the camera centres, with that box's longest side. Every point gets the
@@ -363,7 +366,8 @@ def random_points(views: Sequence[View], count: int = 30_000, seed: int = 0) -> 
     xyz = np.concatenate(kept)[:count]
     if len(xyz) == 0:
         raise CaptureError(
-            "there are no points, and no two views look at the same part of the space around the cameras"
+            "there are no points, and no two views look at the same part of the space around the cameras; correct the "
+            f"poses, or {_ADD_POINTS}"
         )
     color = np.mean([view.image.mean(axis=(0, 1)) for view in views], axis=0)
     return SparsePoints(xyz, np.tile(np.rint(color).astype(np.uint8), (len(xyz), 1)))

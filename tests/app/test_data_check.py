@@ -34,6 +34,7 @@ from tests.app.captures import (
     assert_one_line,
     camera,
     colmap_capture,
+    edit_transforms,
     look_at,
     photograph,
     ring,
@@ -217,6 +218,22 @@ def test_points_are_held_against_cameras_of_which_only_the_field_of_view_is_know
     head = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(f"property float {axis}\n" for axis in "xyz")
     (root / "points3D.ply").write_text(f"{head}end_header\n0 0 0\n0 0 99\n")
     assert finding(check(root), "ok", "points").endswith("2; a view sees 50 % of them on average")
+
+
+def test_lists_that_leave_no_view_and_views_that_see_nothing_together_stand_against_training(check, tmp_path) -> None:
+    root = transforms_capture(tmp_path, test_filenames=["images/00.png"])
+    assert finding(check(root), "ok", "split").endswith("3 to train on, 1 of 4 held out by its own lists")
+    edit_transforms(root, lambda listing: listing.update(test_filenames=[f["file_path"] for f in listing["frames"]]))
+    assert "its own lists hold all out" in finding(check(root, 1), "BAD", "split")
+
+    def turn_away(listing: dict[str, Any]) -> None:
+        del listing["test_filenames"]
+        for frame in listing["frames"]:
+            frame["transform_matrix"] = (frame["transform_matrix"] @ np.diag([-1.0, 1.0, -1.0, 1.0])).tolist()
+
+    edit_transforms(root, turn_away)
+    message = assert_one_line(lambda: load_capture(root), "correct the poses, or add points")
+    assert message.endswith(finding(check(root, 1), "BAD", "points").split(maxsplit=2)[2])
 
 
 def test_of_a_block_the_whole_capture_is_looked_over(check: Check, root: Path, tmp_path: Path) -> None:
