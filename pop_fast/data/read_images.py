@@ -368,7 +368,9 @@ def read_fitting_mask(path: Path, stored: tuple[int, int], turns: int) -> np.nda
 
 def _check_mask(path: Path, mask: np.ndarray) -> np.ndarray:
     if not mask.any():
-        raise CaptureError(f"{path}: the mask hides the whole photograph; white means keep: invert it or remove it")
+        raise CaptureError(
+            f"{path}: the mask hides the whole photograph; white means keep (255, not 1): invert it or remove it"
+        )
     return mask
 
 

@@ -115,9 +115,8 @@ def unpack(path: Path, target: Path) -> None:
 
 
 def _left_out(member: zipfile.ZipInfo) -> bool:
-    if not member.filename:
-        return False
-    return member.is_dir() or any(part in _LEFT_OUT for part in PurePosixPath(member.filename).parts)
+    name = member.filename.replace("\\", "/")
+    return name.endswith("/") or any(part in _LEFT_OUT for part in PurePosixPath(name).parts)
 
 
 def _name(member: zipfile.ZipInfo) -> str:

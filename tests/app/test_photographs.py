@@ -576,6 +576,14 @@ def test_what_is_no_video_is_one_line_and_leaves_nothing(clip: Path, tmp_path: P
     assert_one_line(lambda: load_capture(clip), "walk.avi: is a video; ", " pop frames")
 
 
+def test_folders_and_marks_of_a_zip_from_windows_are_told_from_its_files(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as file:
+        for name in ("walk\\", "walk\\images\\", "__MACOSX\\walk\\._a.jpg", "walk\\desktop.ini", "walk\\images\\a.jpg"):
+            file.writestr(name, b"" if name.endswith("\\") else b"some bytes")
+    unpack(tmp_path / "a.zip", tmp_path / "a")
+    assert [path for path in (tmp_path / "a").rglob("*") if path.is_file()] == [tmp_path / "a" / "walk/images/a.jpg"]
+
+
 def test_an_archive_needs_room_on_the_disk_and_not_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as file:
         file.writestr("a.jpg", b"some bytes")
