@@ -50,7 +50,7 @@ from pop_fast.data.cameras import (
 from pop_fast.data.capture import Listing, PosedImage, SparsePoints, Split
 from pop_fast.errors import CaptureError, PopError
 from pop_fast.io.image_header import read_size
-from pop_fast.io.images import find_image, read_image
+from pop_fast.io.images import find_image, image_finder, read_image
 from pop_fast.io.ply import read_points
 
 # cameras and the photographs that belong to them, the better ones first
@@ -79,10 +79,11 @@ def read_polycam(folder: Path, root: Path, images: str) -> tuple[list[PosedImage
     relative = photos.relative_to(root).as_posix()
     # hidden are what a Mac puts beside every file on a disk of another system
     files = enumerate(sorted(folder.glob("[!.]*.json")), start=1)
-    return [_shot(path, photos, relative, number) for number, path in files], []
+    find = image_finder()
+    return [_shot(path, photos, relative, number, find) for number, path in files], []
 
 
-def _shot(path: Path, photos: Path, folder: str, number: int) -> PosedImage:
+def _shot(path: Path, photos: Path, folder: str, number: int, find: Callable[[Path, str], Path | None]) -> PosedImage:
     given = _load(path)
     read = Numbers(str(path), given)
     width, height = check_size(str(path), read("width"), read("height"))
@@ -93,7 +94,7 @@ def _shot(path: Path, photos: Path, folder: str, number: int) -> PosedImage:
     pose = np.eye(4)
     pose[:3] = [[read(f"t_{row}{column}") for column in range(4)] for row in range(3)]
     viewmat = viewmat_from_pose(f"{path}: the matrix t_00 to t_23", pose, opengl=True)
-    found = find_image(photos, path.stem)
+    found = find(photos, path.stem)
     name = path.stem if found is None else found.name
     return PosedImage(name, folder, name, camera, viewmat)
 
@@ -156,6 +157,7 @@ def read_metashape(path: Path, root: Path, images: str) -> tuple[list[PosedImage
         raise CaptureError(f"{path}: is not valid XML ({error}); {_EXPORT_XML}") from error
     shots: list[PosedImage] = []
     unaligned: list[str] = []
+    find = image_finder()
     chunks = document.findall("chunk")
     if not any(chunk.find("cameras") is not None for chunk in chunks):
         raise CaptureError(f"{path}: has no chunk with cameras; {_EXPORT_XML}")
@@ -175,7 +177,7 @@ def read_metashape(path: Path, root: Path, images: str) -> tuple[list[PosedImage
             frame = frames.get(str(camera.get("component_id")), chunk)
             viewmat = _viewmat(f"{path}: camera {label}", camera, _similarity(str(path), frame))
             lens = _metashape_camera(path, label, sensors.get(str(camera.get("sensor_id"))), len(shots) + 1)
-            found = find_image(root / images, label)
+            found = find(root / images, label)
             name = label if found is None else found.name
             shots.append(PosedImage(name, images, name, lens, viewmat))
     names = [shot.name for shot in shots]
@@ -480,10 +482,8 @@ def _placed(name: str) -> tuple[str, str]:
         folder, _, file = name.rpartition("/")
         return folder or "/", file
     parts = name.split("/")
-    first = 1 + next((i for i, part in enumerate(parts) if part != ".."), 0)
-    return (
-        ("/".join(parts[:first]), "/".join(parts[first:])) if len(parts) > first else ("/".join(parts[:-1]), parts[-1])
-    )
+    first = min(1 + next((i for i, part in enumerate(parts) if part != ".."), 0), len(parts) - 1)
+    return "/".join(parts[:first]), "/".join(parts[first:])
 
 
 def _fields(listing: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:

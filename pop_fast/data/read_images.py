@@ -32,7 +32,7 @@ from pop_fast.data.cameras import make_camera
 from pop_fast.data.capture import PosedImage, Progress, View
 from pop_fast.errors import CaptureError
 from pop_fast.io.image_header import read_size
-from pop_fast.io.images import IMAGE_SUFFIXES, find_image, in_threads, read_image, read_mask, sound_jpegs
+from pop_fast.io.images import IMAGE_SUFFIXES, find_image, image_finder, in_threads, read_image, read_mask, sound_jpegs
 
 
 @dataclass(frozen=True)
@@ -106,11 +106,11 @@ def _locate(
     folder = root / "masks" if options.masks and (root / "masks").is_dir() else None
     masks = find_masks(folder, shots) if options.masks else [None] * len(shots)
     elsewhere = names_elsewhere(shots)
-    folders = _image_folders(root, shots, options)
+    folders, find = _image_folders(root, shots, options), image_finder()
     for shot, mask in zip(shots, masks, strict=True):
         chosen, shrink = folders[shot.folder]
         names = [shot.file] if options.images is None else elsewhere(shot)
-        path = _find_first(root / chosen, names)
+        path = _find_first(find, root / chosen, names)
         if path is None:
             absent.append((shot, root / chosen / names[-1]))
             continue
@@ -155,8 +155,8 @@ def names_elsewhere(shots: Sequence[PosedImage]) -> Callable[[PosedImage], list[
     return names
 
 
-def _find_first(folder: Path, names: Sequence[str]) -> Path | None:
-    return next((path for name in names if (path := find_image(folder, name)) is not None), None)
+def _find_first(find: Callable[[Path, str], Path | None], folder: Path, names: Sequence[str]) -> Path | None:
+    return next((path for name in names if (path := find(folder, name)) is not None), None)
 
 
 def find_photographs(root: Path, shots: Sequence[PosedImage], images: str | None = None) -> list[Path | None]:
@@ -164,16 +164,17 @@ def find_photographs(root: Path, shots: Sequence[PosedImage], images: str | None
 
     None where one is absent.
     """
+    find = image_finder()
     if images is None:
-        return [find_image(root / shot.folder, shot.file) for shot in shots]
+        return [find(root / shot.folder, shot.file) for shot in shots]
     elsewhere = names_elsewhere(shots)
-    return [_find_first(root / images, elsewhere(shot)) for shot in shots]
+    return [_find_first(find, root / images, elsewhere(shot)) for shot in shots]
 
 
 def find_masks(folder: Path | None, shots: Sequence[PosedImage]) -> list[Path | None]:
     """Find the mask of each shot of a list: the one that the list names, else one in a folder of masks, if any."""
-    elsewhere = names_elsewhere(shots)
-    return [shot.mask or (_find_first(folder, elsewhere(shot)) if folder else None) for shot in shots]
+    elsewhere, find = names_elsewhere(shots), image_finder()
+    return [shot.mask or (_find_first(find, folder, elsewhere(shot)) if folder else None) for shot in shots]
 
 
 def fix_of_absent(root: Path, absent: Sequence[PosedImage], shots: Sequence[PosedImage]) -> str:
@@ -185,7 +186,7 @@ def fix_of_absent(root: Path, absent: Sequence[PosedImage], shots: Sequence[Pose
         return "restore them or pass --missing skip"
     names = names_elsewhere(shots)(absent[0])
     for folder in (root, *sorted(path for path in root.iterdir() if path.is_dir())):
-        if _find_first(folder, names) is not None:
+        if _find_first(find_image, folder, names) is not None:
             return f"{absent[0].file} lies in {folder}: pass --images {folder.relative_to(root).as_posix()}"
     return "restore them"
 

@@ -144,11 +144,16 @@ def composed(name: str) -> str:
     return unicodedata.normalize("NFC", name)
 
 
-def find_image(folder: Path, name: str) -> Path | None:
+# the photographs of folders, by the part of their names before the ending
+_Listed = dict[Path, dict[str, list[Path]]]
+
+
+def find_image(folder: Path, name: str, listed: _Listed | None = None) -> Path | None:
     """Find the file of an image by its relative name, under another image extension where the exact one is absent.
 
     Files are paired by name and never by their place in a sorted list, so one missing file cannot shift the others. A
-    CaptureError says that two files of the same stem fit and neither is the exact name.
+    CaptureError says that two files of the same stem fit and neither is the exact name. What is found of folders is
+    added to `listed`, by which the next call need not look again.
     """
     exact = folder / name
     if exact.is_file():
@@ -156,19 +161,25 @@ def find_image(folder: Path, name: str) -> Path | None:
     if not exact.parent.is_dir():
         return None
     # nerfstudio and blender name frames with and without their extension, and raw photographs have been developed
-    suffixes = readable_suffixes()
     named = exact.suffix.lower() in (*IMAGE_SUFFIXES, *HEIF_SUFFIXES, *_UNREADABLE)
     stems = {composed(stem) for stem in ({exact.stem, exact.name} if named else {exact.name})}
-    found = sorted(
-        path
-        for path in exact.parent.iterdir()
-        if composed(path.stem) in stems and path.suffix.lower() in suffixes and path.is_file()
-    )
+    listed = {} if listed is None else listed
+    if exact.parent not in listed:
+        inside = listed[exact.parent] = {}
+        for path in _files_ending(readable_suffixes(), list(exact.parent.iterdir())):
+            inside.setdefault(composed(path.stem), []).append(path)
+    found = sorted(path for stem in stems for path in listed[exact.parent].get(stem, ()))
     if len(found) > 1:
         raise CaptureError(
             f"{folder / name}: is absent, and both {found[0].name} and {found[1].name} could be meant; remove one"
         )
     return found[0] if found else None
+
+
+def image_finder() -> Callable[[Path, str], Path | None]:
+    """Make a `find_image` for many names in turn, which lists a folder once."""
+    listed: _Listed = {}
+    return lambda folder, name: find_image(folder, name, listed)
 
 
 def read_image(path: Path) -> np.ndarray:

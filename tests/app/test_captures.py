@@ -19,6 +19,8 @@ from pop_fast.cli.data_check import look_over
 from pop_fast.data import Capture, CaptureError, View, initialize_params, load_capture
 from pop_fast.data.cameras import PINHOLES, make_camera
 from pop_fast.data.colmap import model_name, parameter_count, read_model
+from pop_fast.data.load import list_capture
+from pop_fast.data.read_images import find_masks, find_photographs
 from pop_fast.errors import PopError
 from pop_fast.io import images
 from pop_fast.io.images import find_image
@@ -168,6 +170,22 @@ def test_photographs_that_were_converted_are_found_unless_two_could_be_meant(
     assert shows(raw(root), 3, 3, 2, 3)
     write_photograph(root / "images" / "b.tif", photograph(1))
     assert_one_line(lambda: raw(root), "b.jpeg", "b.PNG", "b.tif", "remove one")
+
+
+def test_a_folder_of_many_photographs_is_listed_once(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for path in list((root / "images").iterdir()):
+        path.rename(path.with_suffix(".jpg"))
+        write_photograph(root / "masks" / f"{path.stem}.png.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    looked, iterdir = [], Path.iterdir
+    monkeypatch.setattr(Path, "iterdir", lambda path: looked.append(path) or iterdir(path))
+    shots = list_capture(root).shots
+    for find, folder in (
+        (lambda: find_photographs(root, shots), "images"),
+        (lambda: find_masks(root / "masks", shots), "masks"),
+    ):
+        looked.clear()
+        assert all(find())
+        assert looked == [root / folder]
 
 
 def test_absent_photographs_are_an_error_or_are_skipped_with_a_note(root: Path) -> None:
