@@ -1,9 +1,9 @@
 """What an image file states before a pixel is decoded: its size and its EXIF tags; and HEIC through pillow-heif.
 
 A few kilobytes of header decide how much memory decoding takes, so the size is held against what is expected first.
-JPEG, PNG, WebP, BMP and TIFF are read, and of HEIC the tags; of any other or damaged file nothing is returned, and the
-decoder judges it. pillow-heif is optional. libheif obeys a file's own rotation, so that pixels come out upright; the
-EXIF orientation that such a file repeats is not to be obeyed again.
+JPEG, PNG, WebP, BMP, TIFF and HEIC are read; of any other or damaged file nothing is returned, and the decoder judges
+it. pillow-heif, which reads HEIC, is optional. libheif obeys a file's own rotation, so that pixels come out upright;
+the EXIF orientation that such a file repeats is not to be obeyed again.
 """
 
 from __future__ import annotations
@@ -105,8 +105,10 @@ def read_size(path: Path) -> tuple[int, int] | None:
     try:
         with open(path, "rb") as file:
             head = file.read(_HEAD)
+            if is_heif(head):
+                return heif_size(head + file.read()) if can_read_heif() else None
             return size_of(head) or (size_of(head + file.read()) if head[:4] in _TIFF else None)
-    except OSError:
+    except (OSError, ValueError):
         return None
 
 

@@ -332,6 +332,11 @@ def test_the_tags_of_a_heic_are_read_and_its_orientation_is_not_obeyed_twice(tmp
     write_heic(tmp_path / "a.heic", photograph(3, 128, 96), exif.tobytes())
     found = read_exif(tmp_path / "a.heic")
     assert (found.camera, found.orientation) == ("Abc Xyz", 1)
+    # by the size, which is that of the upright picture, a run chooses how small photographs are to be
+    height, width = read_image(tmp_path / "a.heic").shape[:2]
+    assert read_size(tmp_path / "a.heic") == (width, height)
+    (tmp_path / "a.heic").write_bytes((tmp_path / "a.heic").read_bytes()[:60])
+    assert read_size(tmp_path / "a.heic") is None
 
 
 @needs_heif
