@@ -53,6 +53,42 @@ def test_the_overview_lists_every_subcommand_without_importing_torch() -> None:
         assert summary in outcome.out
 
 
+_LEAVING = """
+import os, sys
+from pathlib import Path
+from pop_fast.cli import guarded
+
+def run(words):
+    for _ in range(2):
+        print("told", flush=True)
+        print("told", file=sys.stderr)
+    with open(words[1], "wb") as file:
+        os.write(2, b"what a library says")
+    Path(words[2].partition("=")[2]).touch()
+    return int(words[0])
+
+sys.exit(guarded("pop", run, None, "interrupted"))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX pipes")
+@pytest.mark.parametrize("streams", ["whose reader has gone", "closed"])
+@pytest.mark.parametrize("status", [0, 2, 130])
+def test_work_goes_on_to_its_own_status_where_nobody_reads_what_it_prints(tmp_path, streams, status):
+    words = ["env", f"HOME={tmp_path}", sys.executable, "-c", _LEAVING, str(status), f"{tmp_path}/file", "--out=~/mine"]
+    reader, writer = os.pipe()
+    os.close(reader)
+    how = {} if streams == "closed" else {"stdout": writer, "stderr": writer}
+    # as in `pop train >&- 2>&-`
+    shell = ["sh", "-c", '"$@" >&- 2>&-', "sh"] if streams == "closed" else []
+    done = subprocess.run([*shell, *words], **how, cwd=ROOT, check=False)
+    os.close(writer)
+    assert done.returncode == status
+    assert (tmp_path / "file").read_bytes() == b""
+    # `~` after an equals sign, too, is the user's folder
+    assert (tmp_path / "mine").exists()
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_subcommand_explains_itself(pop: Pop, name: str) -> None:
     outcome = pop.done(*name.split(), "--help")
