@@ -503,7 +503,6 @@ def test_no_gpu_is_said_where_there_is_none(tmp_path: Path, monkeypatch: pytest.
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
 def test_bash_completes_commands_options_and_files(tmp_path: Path, pop: Pop) -> None:
     (tmp_path / "pop.bash").write_text(pop("completion", "bash").out)
-    (tmp_path / "scene").mkdir()
     script = 'source ./pop.bash; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _pop; echo "${COMPREPLY[@]}"'
 
     def completed(*words: str) -> list[str]:
@@ -513,14 +512,18 @@ def test_bash_completes_commands_options_and_files(tmp_path: Path, pop: Pop) -> 
     assert completed("pop", "tra") == ["train"]
     assert completed("pop", "data", "") == ["check"]
     assert "--pop.lambda-pop" in completed("pop", "train", "--pop.l")
-    assert completed("pop", "eval", "sc") == ["scene"]
+    # the shell completes a file's name itself
+    assert completed("pop", "eval", "sc") == []
+    assert "complete -o default -F _pop pop" in (tmp_path / "pop.bash").read_text()
     assert set(completed("pop", "")) == {name.split()[0] for name in COMMANDS}
 
 
-def test_every_option_of_every_command_is_completed() -> None:
+@pytest.mark.parametrize("columns", ["80", "300"])
+def test_every_option_of_every_command_is_completed(monkeypatch, columns) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
     words = {name: options_of(name) for name in COMMANDS}
     assert {"--help", "--capture", "--json"} <= set(words["eval"])
-    assert "--max-steps" in words["train"]
+    assert {"--max-steps", "--pop.lambda-pop", "--view"} <= set(words["train"])
     assert all("--help" in options for options in words.values())
     assert "-l max-steps" in fish(words)
     assert "bashcompinit" in bash(words, zsh=True)
