@@ -275,6 +275,8 @@ def message(text: str) -> str:
     return shown if len(shown) <= _LONGEST else f"{shown[: _LONGEST - _END]} ... {shown[-_END:]}"
 
 
+# of torch on Linux and elsewhere, and of the loader of libraries, of which some take hundreds of megabytes
+_NO_MEMORY: Final = ("not enough memory", "can't allocate memory", "failed to map segment from shared object")
 _PACKAGES: Final = ("/pop_fast/", "/pop_ref/", "/cuda_ext/")
 
 
@@ -288,7 +290,7 @@ def describe(error: BaseException) -> str | None:
         return str(error)
     if isinstance(error, OSError):
         return _describe_os_error(error)
-    if isinstance(error, MemoryError) or "not enough memory" in str(error) or "can't allocate memory" in str(error):
+    if isinstance(error, MemoryError) or any(words in str(error) for words in _NO_MEMORY):
         return "out of memory; use smaller images (--factor 2 or more) or fewer Gaussians"
     if isinstance(error, RuntimeError) and "can't start new thread" in str(error):
         return "the system allows no more threads; raise the limit (ulimit -u), or use fewer: --threads 1"

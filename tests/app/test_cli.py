@@ -364,6 +364,7 @@ def test_debug_shows_the_traceback_of_an_error(monkeypatch: pytest.MonkeyPatch) 
         (OSError(errno.EIO, "input/output error", "a"), "a: input/output error"),
         (MemoryError(), "out of memory; use smaller images"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: 9 bytes"), "out of memory"),
+        (ImportError("libtorch_cpu.so: failed to map segment from shared object"), "out of memory"),
         (PopError("two\nlines"), None),
         (ValueError("from a library below"), None),
         (OSError("no number"), None),
