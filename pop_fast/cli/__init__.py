@@ -80,7 +80,10 @@ def guarded(program: str, run: Callable[[list[str]], int], argv: Sequence[str] |
     if argv is not None:
         return _status(program, run, list(argv), interrupted)
     _keep_streams()
+    sys.unraisablehook = _heed
     status = _status(program, run, sys.argv[1:], interrupted)
+    # all is done: in the end of Python, which takes seconds, Ctrl-C would show a traceback and change the status
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     if status > 128:
         _leave(status)
     return status
@@ -94,6 +97,20 @@ def _leave(status: int) -> NoReturn:
         with contextlib.suppress(OSError, ValueError):
             stream.flush()
     os._exit(status)
+
+
+def _heed(found: sys.UnraisableHookArgs) -> None:
+    """Raise a signal's exception again that came where Python lets none through, as in what is called of freed objects.
+
+    One that a loop left its work for (`pop_fast.train.signals.Abandoned`) is known to the loop without it.
+    """
+    error = found.exc_value
+    # Windows has no such call
+    if not isinstance(error, KeyboardInterrupt) or not hasattr(signal, "pthread_kill"):
+        sys.__unraisablehook__(found)
+    elif type(error) in (KeyboardInterrupt, _Terminated):
+        again = [threading.main_thread().ident, getattr(error, "number", signal.SIGINT)]
+        threading.Timer(0.05, signal.pthread_kill, again).start()
 
 
 class _Lasting(io.FileIO):

@@ -448,6 +448,29 @@ def test_sigterm_while_a_capture_is_read_is_one_line_and_the_end(shared_capture:
     assert process.returncode == 143
 
 
+@posix
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_that_comes_while_an_object_is_freed_is_heard(tmp_path: Path, number: int, status: int) -> None:
+    freed = f"""
+import os, time
+from pop_fast import cli
+
+class Freed:
+    def __del__(self):
+        os.kill(os.getpid(), {number:d})
+        time.sleep(0.01)
+
+def run(words):
+    Freed()
+    time.sleep(60.0)
+
+cli.command = lambda name: run
+"""
+    process = start(tmp_path, "doctor", script=_POP.replace("from pop_fast.cli import main", freed + "main = cli.main"))
+    _, err = process.communicate(timeout=30)
+    assert (process.returncode, err) == (status, "pop: interrupted\n")
+
+
 @pytest.mark.slow  # photographs of 12 megapixels
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
