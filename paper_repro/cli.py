@@ -18,11 +18,9 @@ from paper_repro.jobs import ROWS, SEED, WORK, Job, job_named, jobs_of
 from paper_repro.results import RESULTS, existing_folder, read_all
 from paper_repro.scenes import MADE, SCALES, SCENES, find_folder, scale_named, scene_named
 from pop_fast.api.backend import backend_names
+from pop_fast.cli import EXIT_BAD_INPUT, EXIT_INCOMPLETE, EXIT_INTERRUPTED, guarded
 from pop_fast.errors import PopError
 
-EXIT_INCOMPLETE: Final = 1
-EXIT_BAD_INPUT: Final = 2
-EXIT_INTERRUPTED: Final = 130
 _TEXT: Final = """\
 usage: pop-repro COMMAND ...
 
@@ -424,32 +422,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: the words after `pop-repro`; the process's own when None.
 
     Returns:
-        0, or 1 where something is missing or failed, or 2 for bad input and bad usage, or 130 after Ctrl-C or SIGTERM;
+        As `pop_fast.cli.main`, and 1 where something failed;
         of `run` also 69 where this version cannot train the row, and 75 where another process trains it.
     """
-    words = list(sys.argv[1:] if argv is None else argv)
-    debug = "--debug" in words or os.environ.get("POP_DEBUG", "") not in ("", "0")
-    try:
-        status = _run([word for word in words if word != "--debug"])
-        sys.stdout.flush()
-        return status
-    except SystemExit as stop:
-        return stop.code if isinstance(stop.code, int) else 0
-    except KeyboardInterrupt:
-        print("pop-repro: stopped; the same command continues from the last checkpoint", file=sys.stderr)
-        return EXIT_INTERRUPTED
-    except BrokenPipeError:
-        # the reader has gone, as in `pop-repro status | head`: what is still buffered has nowhere to go
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
-    except Exception as error:
-        from pop_fast.cli import describe
-
-        line = str(error) if isinstance(error, PopError) else describe(error)
-        if debug or line is None:
-            raise
-        print(f"pop-repro: error: {line}", file=sys.stderr)
-        return getattr(error, "status", EXIT_BAD_INPUT)
+    return guarded("pop-repro", _run, argv, "stopped; the same command continues from the last checkpoint")
 
 
 def _run(words: list[str]) -> int:

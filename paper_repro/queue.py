@@ -58,7 +58,7 @@ class _Child:
         self._process: subprocess.Popen[bytes] | None = None
 
     def request(self, number: int, frame: FrameType | None) -> None:
-        """Pass the first Ctrl-C or SIGTERM on: the child finishes its step, writes a checkpoint and ends."""
+        """Pass the first Ctrl-C, SIGTERM or SIGHUP on: the child finishes its step, writes a checkpoint and ends."""
         if self._process is not None and not self.stop:
             self._process.terminate()
         self.stop = True
@@ -127,7 +127,10 @@ def _why(status: int) -> str:
 @contextmanager
 def _stoppable() -> Iterator[_Child]:
     child = _Child()
-    before = {number: signal.signal(number, child.request) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    # SIGHUP stays ignored where it is, as under nohup
+    numbers += [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN else []
+    before = {number: signal.signal(number, child.request) for number in numbers}
     try:
         yield child
     finally:

@@ -17,12 +17,15 @@ import io
 import os
 import re
 import signal
+import stat
 import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from types import FrameType
-from typing import Final, NoReturn, TypeVar
+from typing import Any, Final, NoReturn, TypeVar
+
+from pop_fast.errors import PopError
 
 COMMANDS: Final = {
     "train": "fit a splat to a capture or a folder of photographs",
@@ -50,7 +53,6 @@ COMMANDS: Final = {
 EXIT_INCOMPLETE: Final = 1
 EXIT_BAD_INPUT: Final = 2
 EXIT_INTERRUPTED: Final = 130
-EXIT_TERMINATED: Final = 128 + signal.SIGTERM
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -60,12 +62,29 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: the words after `pop`; the process's own when None.
 
     Returns:
-        0, or 1 where something is missing, or 2 for bad input and bad usage, or 130 after Ctrl-C, or 143 after SIGTERM.
+        0, or 1 where something is missing, or 2 for bad input and bad usage, or 130 after Ctrl-C, or 143 after SIGTERM,
+        or 129 after SIGHUP; a training that has stopped returns 130 after each of them.
+    """
+    return guarded("pop", _run, argv, "interrupted")
+
+
+def guarded(program: str, run: Callable[[list[str]], int], argv: Sequence[str] | None, interrupted: str) -> int:
+    """Call what runs a program's words; `main` says what is returned.
+
+    Args:
+        program: its name, with which an error's line begins.
+        run: reads the words and returns the exit status.
+        argv: the words; the process's own when None, which is then ended where it was interrupted.
+        interrupted: what is said then.
     """
     if argv is not None:
-        return _status(list(argv))
-    status = _status(sys.argv[1:])
-    if status in (EXIT_INTERRUPTED, EXIT_TERMINATED):
+        return _status(program, run, list(argv), interrupted)
+    _keep_streams()
+    sys.unraisablehook = _heed
+    status = _status(program, run, sys.argv[1:], interrupted)
+    # all is done: in the end of Python, which takes seconds, Ctrl-C would show a traceback and change the status
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if status > 128:
         _leave(status)
     return status
 
@@ -80,55 +99,115 @@ def _leave(status: int) -> NoReturn:
     os._exit(status)
 
 
-def _status(words: list[str]) -> int:
+def _heed(found: sys.UnraisableHookArgs) -> None:
+    """Raise a signal's exception again that came where Python lets none through, as in what is called of freed objects.
+
+    One that a loop left its work for (`pop_fast.train.signals.Abandoned`) is known to the loop without it.
+    """
+    error = found.exc_value
+    # Windows has no such call
+    if not isinstance(error, KeyboardInterrupt) or not hasattr(signal, "pthread_kill"):
+        sys.__unraisablehook__(found)
+    elif type(error) in (KeyboardInterrupt, _Terminated):
+        again = [threading.main_thread().ident, getattr(error, "number", signal.SIGINT)]
+        threading.Timer(0.05, signal.pthread_kill, again).start()
+
+
+class _Lasting(io.FileIO):
+    """A standard stream that leads nowhere once its reader is gone, as in `pop train 2>&1 | head`: the work goes on."""
+
+    def write(self, data: Any) -> int:
+        try:
+            return super().write(data)
+        except OSError as error:
+            # of a terminal that was closed the system says EIO
+            closed = error.errno == errno.EIO and stat.S_ISCHR(os.fstat(self.fileno()).st_mode)
+            if error.errno != errno.EPIPE and not closed:
+                raise
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, self.fileno())
+            os.close(nowhere)
+            return len(data)
+
+
+def _keep_streams() -> None:
+    """Let the process outlive the readers of what it prints, and have both streams where it was started without."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            # takes the number of the closed one, under which a library would write into a file that is opened next
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - as long as the process
+            continue
+        buffer = getattr(stream, "buffer", None)
+        raw = getattr(buffer, "raw", buffer)
+        if type(raw) is io.FileIO:
+            file = _Lasting(raw.fileno(), "w", closefd=False)
+            how = {"line_buffering": stream.line_buffering, "write_through": stream.write_through}
+            lasting = io.TextIOWrapper(file if raw is buffer else io.BufferedWriter(file), stream.encoding, **how)
+            setattr(sys, name, lasting)
+
+
+def _status(program: str, run: Callable[[list[str]], int], words: list[str], interrupted: str) -> int:
     debug = "--debug" in words or os.environ.get("POP_DEBUG", "") not in ("", "0")
-    words = [word for word in words if word != "--debug"]
+    words = [_at_home(word) for word in words if word != "--debug"]
     for stream in (sys.stdout, sys.stderr):
         # a name that is no text is shown with escapes
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     try:
         with _terminable():
-            status = _run(words)
+            status = run(words)
         sys.stdout.flush()
         return status
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else 0
     except KeyboardInterrupt as stop:
-        print("pop: interrupted", file=sys.stderr)
-        return EXIT_TERMINATED if isinstance(stop, _Terminated) else EXIT_INTERRUPTED
-    except BrokenPipeError:
-        # the reader has gone, as in `pop train --help | head`: what is still buffered has nowhere to go
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        print(f"{program}: {interrupted}", file=sys.stderr)
+        return 128 + stop.number if isinstance(stop, _Terminated) else EXIT_INTERRUPTED
     except Exception as error:
         line = describe(error)
         if debug or line is None:
             raise
-        print(f"pop: error: {message(line)}", file=sys.stderr)
-        return EXIT_BAD_INPUT
+        print(f"{program}: error: {message(line)}", file=sys.stderr)
+        return getattr(error, "status", EXIT_BAD_INPUT)
+
+
+def _at_home(word: str) -> str:
+    """Read `--out=~/x` as the shell reads `--out ~/x`."""
+    name, equals, path = word.partition("=")
+    return f"{name}={os.path.expanduser(path)}" if equals and name.startswith("--") else word
 
 
 class _Terminated(KeyboardInterrupt):
-    """SIGTERM: as orderly an end as after Ctrl-C."""
+    """SIGTERM or SIGHUP: as orderly an end as after Ctrl-C."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
 
 
 @contextlib.contextmanager
 def _terminable() -> Iterator[None]:
-    """Let SIGTERM end the block as Ctrl-C does, so that nothing half made is left, unless somebody handles it."""
-    here = threading.current_thread() is threading.main_thread()
-    if not here or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
-        yield
-        return
+    """Let SIGTERM and SIGHUP end the block as Ctrl-C does, so that nothing half made is left, unless they are handled.
+
+    SIGHUP that is ignored, as under nohup, stays so.
+    """
+    numbers: list[int] = []
+    if threading.current_thread() is threading.main_thread():
+        # SIGHUP is not on Windows
+        known = [signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
+        numbers = [number for number in known if signal.getsignal(number) is signal.SIG_DFL]
 
     def end(number: int, frame: FrameType | None) -> None:
-        raise _Terminated
+        raise _Terminated(number)
 
-    signal.signal(signal.SIGTERM, end)
+    for number in numbers:
+        signal.signal(number, end)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for number in numbers:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def _run(words: list[str]) -> int:
@@ -213,6 +292,8 @@ def message(text: str) -> str:
     return shown if len(shown) <= _LONGEST else f"{shown[: _LONGEST - _END]} ... {shown[-_END:]}"
 
 
+# of torch on Linux and elsewhere, and of the loader of libraries, of which some take hundreds of megabytes
+_NO_MEMORY: Final = ("not enough memory", "can't allocate memory", "failed to map segment from shared object")
 _PACKAGES: Final = ("/pop_fast/", "/pop_ref/", "/cuda_ext/")
 
 
@@ -222,9 +303,11 @@ def describe(error: BaseException) -> str | None:
     A `ValueError` or `NotImplementedError` counts as the user's when the package itself raised it, because then its
     message names field and fix; one that escapes from a library below is a fault, and keeps its traceback.
     """
+    if isinstance(error, PopError):
+        return str(error)
     if isinstance(error, OSError):
         return _describe_os_error(error)
-    if isinstance(error, MemoryError) or "not enough memory" in str(error) or "can't allocate memory" in str(error):
+    if isinstance(error, MemoryError) or any(words in str(error) for words in _NO_MEMORY):
         return "out of memory; use smaller images (--factor 2 or more) or fewer Gaussians"
     if isinstance(error, RuntimeError) and "can't start new thread" in str(error):
         return "the system allows no more threads; raise the limit (ulimit -u), or use fewer: --threads 1"

@@ -21,8 +21,8 @@ _EXAMPLES: Final = """
     eval "$(pop completion zsh)"                                   in ~/.zshrc
     pop completion fish > ~/.config/fish/completions/pop.fish
 """
-# at the start of a line of help, in the frame that is drawn around it
-_OPTION: Final = re.compile(r"^[│|\s]*(-{1,2}[a-zA-Z].*)$", re.MULTILINE)
+# at the start of a line of help, in one of the frames that are drawn beside each other where there is room
+_OPTION: Final = re.compile(r"(?:^|  )[│| ]*(-{1,2}[a-zA-Z][\w.-]*(?:, --[\w.-]+)*)", re.MULTILINE)
 _WORD: Final = re.compile(r"(?<![\w-])--[a-z][\w.-]*")
 _BASH: Final = """_pop() {{
   local current="${{COMP_WORDS[COMP_CWORD]}}" command="${{COMP_WORDS[1]}}" words=""
@@ -35,9 +35,9 @@ _BASH: Final = """_pop() {{
     [[ $current == -* ]] || words=$([[ $command == data && $COMP_CWORD -eq 2 ]] && echo check)
   fi
   COMPREPLY=($(compgen -W "$words" -- "$current"))
-  [[ ${{#COMPREPLY[@]}} -gt 0 || $current == -* ]] || COMPREPLY=($(compgen -f -- "$current"))
 }}
-complete -o filenames -F _pop pop
+# files by the shell's own completion, which knows spaces and ~
+complete -o default -F _pop pop
 """
 
 
@@ -62,7 +62,7 @@ def options_of(name: str) -> list[str]:
     with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
         command(name)(["--help-all" if name == "train" else "--help"])
     shown = text.getvalue()
-    found = {word for line in _OPTION.findall(shown) for word in _WORD.findall(line.split("  ")[0])}
+    found = {word for names in _OPTION.findall(shown) for word in _WORD.findall(names)}
     return sorted(found)
 
 

@@ -39,7 +39,7 @@ from typing import IO, Any, Final, Literal
 from pop_fast.children import python_command
 from pop_fast.data.cameras import require_colmap
 from pop_fast.data.capture import Progress, SfmOptions
-from pop_fast.data.colmap import quiet_colmap
+from pop_fast.data.colmap import quiet_colmap, read_binary
 from pop_fast.data.exports import photographs_of_polycam
 from pop_fast.data.photo_quality import FIX, Shown, about_mixed_cameras, about_use, lens_numbers, measure, number
 from pop_fast.errors import CaptureError
@@ -252,6 +252,8 @@ _TABLES: Final = {
     for again in ("", _AGAIN)
     for stage, table in ((_FEATURES, "descriptors"), (_MATCHES, "two_view_geometries"))
 }
+# bytes that a disk has left on which COLMAP, which does not say why it ends, can go on
+_SPARE: Final = 4 * 2**20
 # letters of what COLMAP says that an error shows
 _LONGEST: Final = 300
 
@@ -320,6 +322,9 @@ def find_cameras(search: Search, progress: Progress | None) -> Any:
             end = f"COLMAP failed: its process ended with status {child.returncode} {said}".strip()[:_LONGEST]
             end += f"; fewer threads and smaller images need less memory; {FIX}"
     if end:
+        if shutil.disk_usage(search.work).free < _SPARE:
+            fix = "free some space, or let TMPDIR name another folder for temporary files"
+            raise CaptureError(f"{search.work}: the disk is full, where COLMAP keeps what it finds; {fix}")
         raise CaptureError(f"{search.photos}: {end}")
     return require_colmap().Reconstruction(Path(search.work, "best"))
 
@@ -389,7 +394,10 @@ def main() -> None:
 
     try:
         with quiet_colmap():
-            _best(search, tell).write_binary(_made(Path(search.work, "best")))
+            best = _made(Path(search.work, "best"))
+            _best(search, tell).write_binary(best)
+            # COLMAP reports no failed write
+            read_binary(best)
         say("")
     except CaptureError as error:
         say(str(error))

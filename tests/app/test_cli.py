@@ -53,6 +53,46 @@ def test_the_overview_lists_every_subcommand_without_importing_torch() -> None:
         assert summary in outcome.out
 
 
+_LEAVING = """
+import atexit, os, signal, sys
+from pathlib import Path
+from pop_fast.cli import guarded
+
+def run(words):
+    for _ in range(2):
+        print("told", flush=True)
+        print("told", file=sys.stderr)
+    with open(words[1], "wb") as file:
+        os.write(2, b"what a library says")
+    Path(words[2].partition("=")[2]).touch()
+    atexit.register(os.kill, os.getpid(), signal.SIGINT)
+    return int(words[0])
+
+sys.exit(guarded("pop", run, None, "interrupted"))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="POSIX pipes")
+@pytest.mark.parametrize("streams", ["whose reader has gone", "closed", "that are read"])
+@pytest.mark.parametrize("status", [0, 2, 130])
+def test_work_goes_on_to_its_own_status_whoever_reads_what_it_prints(tmp_path, streams, status):
+    words = ["env", f"HOME={tmp_path}", sys.executable, "-c", _LEAVING, str(status), f"{tmp_path}/file", "--out=~/mine"]
+    reader, writer = os.pipe()
+    os.close(reader)
+    gone, read = {"stdout": writer, "stderr": writer}, {"capture_output": True, "text": True}
+    how = {"whose reader has gone": gone, "that are read": read}.get(streams, {})
+    # as in `pop train >&- 2>&-`
+    shell = ["sh", "-c", '"$@" >&- 2>&-', "sh"] if streams == "closed" else []
+    done = subprocess.run([*shell, *words], **how, cwd=ROOT, check=False)
+    os.close(writer)
+    assert done.returncode == status
+    # Ctrl-C comes too late
+    assert done.stderr in (None, "told\ntold\nwhat a library says")
+    assert (tmp_path / "file").read_bytes() == b""
+    # `~` after an equals sign, too, is the user's folder
+    assert (tmp_path / "mine").exists()
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_subcommand_explains_itself(pop: Pop, name: str) -> None:
     outcome = pop.done(*name.split(), "--help")
@@ -328,7 +368,8 @@ def test_debug_shows_the_traceback_of_an_error(monkeypatch: pytest.MonkeyPatch) 
         (OSError(errno.EIO, "input/output error", "a"), "a: input/output error"),
         (MemoryError(), "out of memory; use smaller images"),
         (RuntimeError("DefaultCPUAllocator: can't allocate memory: 9 bytes"), "out of memory"),
-        (PopError("two\nlines"), None),
+        (ImportError("libtorch_cpu.so: failed to map segment from shared object"), "out of memory"),
+        (PopError("two\nlines"), "two lines"),
         (ValueError("from a library below"), None),
         (OSError("no number"), None),
     ],
@@ -467,7 +508,6 @@ def test_no_gpu_is_said_where_there_is_none(tmp_path: Path, monkeypatch: pytest.
 @pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
 def test_bash_completes_commands_options_and_files(tmp_path: Path, pop: Pop) -> None:
     (tmp_path / "pop.bash").write_text(pop("completion", "bash").out)
-    (tmp_path / "scene").mkdir()
     script = 'source ./pop.bash; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _pop; echo "${COMPREPLY[@]}"'
 
     def completed(*words: str) -> list[str]:
@@ -477,14 +517,18 @@ def test_bash_completes_commands_options_and_files(tmp_path: Path, pop: Pop) -> 
     assert completed("pop", "tra") == ["train"]
     assert completed("pop", "data", "") == ["check"]
     assert "--pop.lambda-pop" in completed("pop", "train", "--pop.l")
-    assert completed("pop", "eval", "sc") == ["scene"]
+    # the shell completes a file's name itself
+    assert completed("pop", "eval", "sc") == []
+    assert "complete -o default -F _pop pop" in (tmp_path / "pop.bash").read_text()
     assert set(completed("pop", "")) == {name.split()[0] for name in COMMANDS}
 
 
-def test_every_option_of_every_command_is_completed() -> None:
+@pytest.mark.parametrize("columns", ["80", "300"])
+def test_every_option_of_every_command_is_completed(monkeypatch, columns) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
     words = {name: options_of(name) for name in COMMANDS}
     assert {"--help", "--capture", "--json"} <= set(words["eval"])
-    assert "--max-steps" in words["train"]
+    assert {"--max-steps", "--pop.lambda-pop", "--view"} <= set(words["train"])
     assert all("--help" in options for options in words.values())
     assert "-l max-steps" in fish(words)
     assert "bashcompinit" in bash(words, zsh=True)

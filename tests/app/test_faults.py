@@ -302,9 +302,8 @@ EXEMPT = {
     "pop_fast.view.report.source:_read": "puts a film into the page as it is",
     "pop_fast.io.atomic": "takes the lock of a file and reads nothing of it",
     "pop_fast.train.results:ResultFolder.open_metrics": "appends to it",
-    "pop_fast.cli:_status": "the null device",
+    "pop_fast.cli:_Lasting.write": "the null device",
     "pop_fast.view.paths:_no_standard_error": "the null device",
-    "paper_repro.cli:main": "the null device",
     "pop_fast.cli.explain:_explain": "parses what it has made itself",
     "pop_fast.demo.make:_write_model": "makes a model, and reads none",
     **dict.fromkeys(

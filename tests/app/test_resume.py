@@ -358,6 +358,7 @@ def test_sigkill_at_random_moments_changes_nothing(tmp_path):
     [
         pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),
         (signal.SIGTERM, 143),
+        pytest.param(signal.SIGHUP, 129, marks=pytest.mark.slow),
         pytest.param(signal.SIGKILL, -signal.SIGKILL, marks=pytest.mark.slow),
     ],
 )
@@ -445,6 +446,29 @@ def test_sigterm_while_a_capture_is_read_is_one_line_and_the_end(shared_capture:
     assert err == "pop: interrupted\n"
     assert out == "what was registered for the end is done\n"
     assert process.returncode == 143
+
+
+@posix
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_that_comes_while_an_object_is_freed_is_heard(tmp_path: Path, number: int, status: int) -> None:
+    freed = f"""
+import os, time
+from pop_fast import cli
+
+class Freed:
+    def __del__(self):
+        os.kill(os.getpid(), {number:d})
+        time.sleep(0.01)
+
+def run(words):
+    Freed()
+    time.sleep(60.0)
+
+cli.command = lambda name: run
+"""
+    process = start(tmp_path, "doctor", script=_POP.replace("from pop_fast.cli import main", freed + "main = cli.main"))
+    _, err = process.communicate(timeout=30)
+    assert (process.returncode, err) == (status, "pop: interrupted\n")
 
 
 @pytest.mark.slow  # photographs of 12 megapixels

@@ -8,6 +8,7 @@ import struct
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -356,6 +357,15 @@ def test_the_search_for_cameras_is_told_apart_from_loading(known: None, pop: Pop
     stats = json.loads((tmp_path / "out" / "stats" / "val_step0001.json").read_text())
     assert stats["seconds_sfm"] >= 1.0
     assert f"loading {stats['seconds_loading']:.0f} s, finding cameras {stats['seconds_sfm']:.0f} s" in done.out
+
+
+def test_a_full_disk_of_temporary_files_is_told_by_its_name(photographs, tmp_path, monkeypatch):
+    monkeypatch.setattr(sfm, "_listen", lambda child, *_: child.kill())
+    with pytest.raises(CaptureError, match="its process ended with status -9; fewer threads and smaller images"):
+        run_sfm(photographs, tmp_path / "out")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1_000_000))
+    with pytest.raises(CaptureError, match=r"pop_sfm_\w+: the disk is full, .* TMPDIR"):
+        run_sfm(photographs, tmp_path / "out")
 
 
 # Photographs that a camera stored sideways: where the program finds the cameras itself, all is shown upright.
