@@ -7,12 +7,14 @@ import os
 import random
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -311,6 +313,25 @@ def test_views_are_shared_evenly_and_a_process_that_nobody_launched_is_alone(mon
     assert join() is ALONE
 
 
+@pytest.fixture
+def first_of_two(monkeypatch: pytest.MonkeyPatch) -> tuple[str, int]:
+    """Let this process and those that it starts be the first of two; return where the second one would find it."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        host, port = free.getsockname()
+    told = {"RANK": 0, "WORLD_SIZE": 2, "MASTER_ADDR": host, "MASTER_PORT": port}
+    for name, value in told.items():
+        monkeypatch.setenv(name, str(value))
+    return host, port
+
+
+@needs_gloo
+def test_a_process_whose_fellow_does_not_come_says_so(first_of_two, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pop_fast.train.ranks._MEETING", timedelta(seconds=1))
+    with pytest.raises(PopError, match=r"cannot connect to the other processes \(RANK=0, .*\): .*; start them with"):
+        join()
+
+
 # Ctrl-C, SIGTERM, SIGHUP and SIGKILL, at a program that is at work in a process of its own.
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
@@ -392,6 +413,21 @@ def test_training_that_is_told_to_stop_writes_a_checkpoint(shared_capture, tmp_p
     assert process.returncode == 130
     ((step, _),) = ckpt.list_checkpoints(folder)
     assert err == f"pop: stopped after step {step + 1:,}; the same command with --resume continues\n"
+
+
+@posix
+@needs_gloo
+def test_sigterm_ends_a_process_that_waits_for_its_fellow(first_of_two, shared_capture: Path, tmp_path: Path) -> None:
+    process = start(tmp_path, "train", shared_capture, "--out", tmp_path / "r", "--batch-size", "2", *TRAIN)
+
+    def waits() -> bool:
+        with socket.socket() as second:
+            return second.connect_ex(first_of_two) == 0
+
+    wait_until(waits, process)
+    process.terminate()
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out, err.splitlines()[-1]) == (143, "", "pop: interrupted")
 
 
 @posix
