@@ -80,6 +80,13 @@ class Ranks:
         """Tell whether any process says so."""
         return flag
 
+    def require_alike(self, begun_with: Mapping[str, str]) -> None:
+        """Compare what the processes begin with, under the same names.
+
+        Raises:
+            PopError: they differ, as where each has a file system of its own; names the first that does.
+        """
+
     def require_same(self, params: Mapping[str, Tensor], step: int) -> None:
         """Compare what the processes hold, bit by bit.
 
@@ -138,12 +145,23 @@ class TorchRanks(Ranks):
     def any(self, flag: bool) -> bool:
         return any(bool(said) for said in self.gather([torch.tensor(flag)]))
 
-    def require_same(self, params: Mapping[str, Tensor], step: int) -> None:
+    def require_alike(self, begun_with: Mapping[str, str]) -> None:
+        for name, text in begun_with.items():
+            if not self._alike(text.encode()):
+                raise PopError(
+                    f"the {self.size} processes have different {name}: start all with the same options, and let them "
+                    "read the capture and the result folder from one file system"
+                )
+
+    def _alike(self, *parts: Any) -> bool:
         digest = hashlib.sha256()
-        for value in params.values():
-            digest.update(value.contiguous().numpy().data)
+        for part in parts:
+            digest.update(part)
         found = self.gather([torch.frombuffer(bytearray(digest.digest()), dtype=torch.uint8)])
-        if any(not torch.equal(one, found[0]) for one in found):
+        return all(torch.equal(one, found[0]) for one in found)
+
+    def require_same(self, params: Mapping[str, Tensor], step: int) -> None:
+        if not self._alike(*(value.contiguous().numpy().data for value in params.values())):
             raise PopError(
                 f"the {self.size} processes no longer hold the same Gaussians after {step} steps; the latest "
                 "checkpoint is kept: use machines of one kind with the same versions and --threads"

@@ -11,7 +11,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from datetime import timedelta
@@ -225,8 +225,25 @@ def train(folder: Path, backend: str, method: str, resume: bool = False, ranks: 
     TrainingRun(config, tiny_capture(), resume=resume, ranks=ranks).run()
 
 
+def differing(folder: Path, ranks: Ranks) -> Iterator[str]:
+    """Say how runs end in which the second process continues nothing, sees another capture, or has other Gaussians."""
+    own = folder / f"own_{ranks.rank}"
+    if ranks.writes:
+        shutil.copytree(folder / "left", own)
+    plain = tiny_config(own, batch_size=2, checkpoint_every=0, save_steps=(), eval_steps=())
+    config = tiny_config(own, batch_size=SIZE)
+    runs = [TrainingRun(config, tiny_capture(), resume=True, ranks=ranks)]
+    runs += [TrainingRun(plain, tiny_capture(seed), overwrite=True, ranks=ranks) for seed in (ranks.rank, 0)]
+    # none is bright enough to stay after the first change
+    runs[2].params["opacities"].data -= 20.0 * ranks.rank
+    for run in runs:
+        with pytest.raises(PopError) as error:
+            run.run()
+        yield str(error.value)
+
+
 def train_all(folder: Path) -> None:
-    """What each process does: two whole runs, and one that is left after eleven steps."""
+    """What each process does: two whole runs, one that is left after eleven steps, and runs that cannot be."""
     ranks = join()
     # sums of an uneven number of entries, and of numbers whose order matters
     mine = [torch.tensor([1e8, 1.0, -1e8]) * (place + 1.0) / 3.0 for place in ranks.positions(SIZE)]
@@ -237,6 +254,7 @@ def train_all(folder: Path) -> None:
         interrupt(patch, at=11)
         with suppress(KeyboardInterrupt):
             train(folder / "left", "fast", "pop", ranks=ranks)
+    (folder / f"differ_{ranks.rank}").write_text("\n".join(differing(folder, ranks)))
     if ranks.writes:
         os._exit(0)
     try:
@@ -264,6 +282,17 @@ def test_two_processes_train_to_the_bits_of_one(together: Path, tmp_path: Path, 
     # density control had something to decide, and the second process wrote nothing of its own
     assert len(last_checkpoint(theirs)[".splats.means"]) > 70
     assert sorted(path.name for path in theirs.iterdir()) == sorted(path.name for path in alone.iterdir())
+
+
+@pytest.mark.slow
+@needs_gloo
+def test_processes_that_differ_say_in_what(together: Path) -> None:
+    first, second = ((together / f"differ_{rank}").read_text().splitlines() for rank in (0, 1))
+    assert first[:2] == second[:2]
+    fix = ": start all with the same options, and let them read the capture and the result folder from one file system"
+    assert first[:2] == [f"the 2 processes have different {name}{fix}" for name in ("checkpoints", "photographs")]
+    for said in (first[2], second[2]):
+        assert said.startswith("the 2 processes no longer hold the same Gaussians after 5 steps; ")
 
 
 @pytest.mark.slow
