@@ -317,7 +317,9 @@ def test_sums_do_not_depend_on_who_adds_and_a_process_whose_fellow_has_ended_say
 def test_pop_train_is_one_command_for_two_processes(shared_capture: Path, tmp_path: Path) -> None:
     settings = ["--steps-scaler", "0.0003", "--no-progress", "--backend", "fast", "--batch-size", "2", "--threads", "1"]
     settings += ["--skip-sizes", "--skip-checks", "--max-renders", "1"]
-    first, second = launched(["-m", "pop_fast.cli", "train", shared_capture, "--out", tmp_path / "two", *settings])
+    # which one of them unpacks
+    archive = shutil.make_archive(f"{tmp_path}/toy", "zip", shared_capture)
+    first, second = launched(["-m", "pop_fast.cli", "train", archive, "--out", tmp_path / "two", *settings])
     assert (first.status, second.status) == (0, 0), (first.err, second.err)
     assert "Gaussians" in first.out
     assert (second.out, second.err) == ("", "")
