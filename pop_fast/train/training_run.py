@@ -7,7 +7,6 @@ native step do not depend on the number of threads either.
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 import time
@@ -191,7 +190,7 @@ class TrainingRun:
                 self._results.write_settings(self.config, self._beside)
         else:
             self._unwritten = self._opacities().numpy()
-        own = {"settings": json.dumps(self.config.binding()), **self._fingerprint, "checkpoints": str(self.step)}
+        own = {"settings": self.config.digest(), **self._fingerprint, "checkpoints": str(self.step)}
         self._ranks.require_alike(own)
         with self._times.is_loading():
             self._stepper = self.stepper
