@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager, nullcontext, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar
 
 import tyro
 
@@ -55,6 +55,8 @@ if TYPE_CHECKING:
     from pop_fast.data import Capture
     from pop_fast.train.ranks import Ranks
     from pop_fast.train.training_run import TrainingRun
+
+T = TypeVar("T")
 
 _EXAMPLES: Final = """
     pop train photos                         chooses size and schedule; results in out/photos_pop
@@ -151,7 +153,7 @@ def run(argv: Sequence[str]) -> int:
         if _writes(ranks):
             check_output(folder, options)
         options = as_begun(folder, options)
-        config = _in_a_folder(config)
+        config = _in_turn(ranks, _in_a_folder, config)
         config, chosen = choose_backend(config, options.resume)
         check_backend(config)
         idle = check_gpus(config, 1 if ranks is None else ranks.size)
@@ -236,7 +238,7 @@ def train_capture(
     """
 
     folder, start = Path(config.result_dir), time.perf_counter()
-    capture = _open_in_turn(config, options, ranks)
+    capture = _in_turn(ranks, open_capture, config if _writes(ranks) else replace(config, progress=False), options)
     searching = capture.sfm_seconds or 0.0
     loading = time.perf_counter() - start - searching
     from pop_fast.train.environment import keep_freed_memory
@@ -361,16 +363,16 @@ def check_backend(config: TrainConfig) -> None:
         raise PopError(reason)
 
 
-def _open_in_turn(config: TrainConfig, options: Any, ranks: Ranks | None) -> Capture:
-    """Load the capture, the process that writes first: it may find cameras, and keep them for the others to read."""
+def _in_turn(ranks: Ranks | None, read: Callable[..., T], *args: Any) -> T:
+    """Read in the process that writes first: it may unpack photographs or find cameras, which the others find there."""
     if ranks is None:
-        return open_capture(config, options)
+        return read(*args)
     if not ranks.writes:
         ranks.wait()
-        return open_capture(replace(config, progress=False), options)
-    capture = open_capture(config, options)
+        return read(*args)
+    found = read(*args)
     ranks.wait()
-    return capture
+    return found
 
 
 def open_capture(config: TrainConfig, options: Any) -> Capture:

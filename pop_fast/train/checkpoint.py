@@ -401,6 +401,8 @@ def _strategy(packed: Any, sh_rest: Tensor, drawn: int) -> dict[str, Any]:
     checked = {**found, "generator": _generator(found["generator"], "strategy.generator")}
     if "views" in found:
         _whole(found["views"], "strategy.views", most=drawn)
+    if "first_count" in found:
+        _whole(found["first_count"], "strategy.first_count")
     if "scene_scale" in found:
         checked["scene_scale"] = _number(found["scene_scale"], "strategy.scene_scale")
     for key in _ROWS.keys() & found.keys():

@@ -19,11 +19,14 @@ import torch
 from torch import Tensor
 
 from pop_fast.errors import PopError
+from pop_fast.train.signals import heard
 
 T = TypeVar("T")
 
 # what torchrun, and other launchers after it, tell a process of itself
 _VARIABLES: Final = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
+# launchers start processes together; one that does not come in this time will not
+_MEETING: Final = timedelta(minutes=10)
 # rank 0 may load photographs, find cameras or measure held-out views for hours while the others wait
 _PATIENCE: Final = timedelta(days=2)
 
@@ -77,6 +80,13 @@ class Ranks:
         """Tell whether any process says so."""
         return flag
 
+    def require_alike(self, begun_with: Mapping[str, str]) -> None:
+        """Compare what the processes begin with, under the same names.
+
+        Raises:
+            PopError: they differ, as where each has a file system of its own; names the first that does.
+        """
+
     def require_same(self, params: Mapping[str, Tensor], step: int) -> None:
         """Compare what the processes hold, bit by bit.
 
@@ -92,18 +102,19 @@ class Ranks:
 
 
 class TorchRanks(Ranks):
-    """One of the processes of torch's default process group, which `join` makes."""
+    """One of the processes of torch's default process group, which `join` makes; it waits for the others patiently."""
 
     def __init__(self) -> None:
         import torch.distributed
 
-        self._group: Any = torch.distributed
-        self.rank, self.size = self._group.get_rank(), self._group.get_world_size()
+        self._torch: Any = torch.distributed
+        self.rank, self.size = self._torch.get_rank(), self._torch.get_world_size()
+        self._group = self._torch.new_group(timeout=_PATIENCE)
 
     def gather(self, mine: Sequence[Tensor]) -> list[Tensor]:
         sent = torch.stack(list(mine))
         received = [torch.empty_like(sent) for _ in range(self.size)]
-        self._together(lambda: self._group.all_gather(received, sent))
+        self._together(lambda: self._torch.all_gather(received, sent, self._group))
         return [one for part in received for one in part]
 
     def total(self, mine: Iterable[Tensor]) -> Tensor:
@@ -113,43 +124,54 @@ class TorchRanks(Ranks):
         padded = torch.nn.functional.pad(parts, (0, share * self.size - length))
         sent = padded.reshape(len(parts), self.size, share).transpose(0, 1).contiguous()
         received = torch.empty_like(sent)
-        self._together(lambda: self._group.all_to_all_single(received, sent))
+        self._together(lambda: self._torch.all_to_all_single(received, sent, group=self._group))
         added = super().total(received.reshape(-1, share))
         whole = [torch.empty_like(added) for _ in range(self.size)]
-        self._together(lambda: self._group.all_gather(whole, added))
+        self._together(lambda: self._torch.all_gather(whole, added, self._group))
         return torch.cat(whole)[:length]
 
     def exchange(self, sent: Sequence[Tensor], received: Sequence[int]) -> list[Tensor]:
         mine = torch.cat(list(sent))
         theirs = torch.empty((sum(received), *mine.shape[1:]), dtype=mine.dtype, device=mine.device)
         lengths = [len(rows) for rows in sent]
-        self._together(lambda: self._group.all_to_all_single(theirs, mine, list(received), lengths))
+        self._together(lambda: self._torch.all_to_all_single(theirs, mine, list(received), lengths, self._group))
         return list(theirs.split(list(received)))
 
     def share(self, whole: Tensor, bounds: Sequence[int]) -> None:
         for rank, (first, last) in enumerate(itertools.pairwise(bounds)):
             if first < last:
-                self._together(lambda rank=rank, rows=whole[first:last]: self._group.broadcast(rows, rank))
+                self._together(lambda rank=rank, rows=whole[first:last]: self._torch.broadcast(rows, rank, self._group))
 
     def any(self, flag: bool) -> bool:
         return any(bool(said) for said in self.gather([torch.tensor(flag)]))
 
-    def require_same(self, params: Mapping[str, Tensor], step: int) -> None:
+    def require_alike(self, begun_with: Mapping[str, str]) -> None:
+        for name, text in begun_with.items():
+            if not self._alike(text.encode()):
+                raise PopError(
+                    f"the {self.size} processes have different {name}: start all with the same options, and let them "
+                    "read the capture and the result folder from one file system"
+                )
+
+    def _alike(self, *parts: Any) -> bool:
         digest = hashlib.sha256()
-        for value in params.values():
-            digest.update(value.contiguous().numpy().data)
+        for part in parts:
+            digest.update(part)
         found = self.gather([torch.frombuffer(bytearray(digest.digest()), dtype=torch.uint8)])
-        if any(not torch.equal(one, found[0]) for one in found):
+        return all(torch.equal(one, found[0]) for one in found)
+
+    def require_same(self, params: Mapping[str, Tensor], step: int) -> None:
+        if not self._alike(*(value.contiguous().numpy().data for value in params.values())):
             raise PopError(
                 f"the {self.size} processes no longer hold the same Gaussians after {step} steps; the latest "
                 "checkpoint is kept: use machines of one kind with the same versions and --threads"
             )
 
     def wait(self) -> None:
-        self._together(self._group.barrier)
+        self._together(lambda: self._torch.barrier(self._group))
 
     def leave(self) -> None:
-        self._group.destroy_process_group()
+        self._torch.destroy_process_group()
 
     def _together(self, call: Callable[[], T]) -> T:
         try:
@@ -190,8 +212,9 @@ def join() -> Ranks:
         # before anything is put on a GPU; a rank without one of its own is refused where it needs one
         torch.cuda.set_device(local_rank())
     try:
-        group.init_process_group("cpu:gloo,cuda:nccl" if by_gpu else "gloo", timeout=_PATIENCE)
+        how = "cpu:gloo,cuda:nccl" if by_gpu else "gloo"
+        heard(lambda: group.init_process_group(how, timeout=_MEETING))
+        return TorchRanks()
     except (RuntimeError, ValueError) as error:
-        given = ", ".join(f"{name}={os.environ[name]}" for name in _VARIABLES)
-        raise PopError(f"cannot connect to the other processes ({given}): {error}; start them with torchrun") from error
-    return TorchRanks()
+        given, why = ", ".join(f"{name}={os.environ[name]}" for name in _VARIABLES), str(error).partition("\n")[0]
+        raise PopError(f"cannot connect to the other processes ({given}): {why}; start them with torchrun") from error

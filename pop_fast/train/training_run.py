@@ -190,6 +190,8 @@ class TrainingRun:
                 self._results.write_settings(self.config, self._beside)
         else:
             self._unwritten = self._opacities().numpy()
+        own = {"settings": self.config.digest(), **self._fingerprint, "checkpoints": str(self.step)}
+        self._ranks.require_alike(own)
         with self._times.is_loading():
             self._stepper = self.stepper
         due = found and writes and self.step in self.config.eval_steps
@@ -282,6 +284,8 @@ class TrainingRun:
         passes = self._passes if self.strategy.needs_passes(step) else None
         given = (self.params, self.optimizers, self.state, step, self.draws)
         densification = self.strategy.change(*given, passes=passes, sh_degree=self.sh_degree(step))
+        # processes that exchange tensors of other lengths are ended by gloo
+        self._ranks.require_same({"count": torch.tensor(len(self.params["means"]))}, self.step)
         self.stepper.rebind(self.params, self.optimizers, self.state)
         return densification
 

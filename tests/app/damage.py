@@ -156,6 +156,7 @@ FORGED: dict[str, tuple[Callable[[Content], Any], tuple[str, ...]]] = {
     "views true": forged("strategy.views", True, "strategy.views is True"),
     "a scene of no size": forged("strategy.scene_scale", NAN, "strategy.scene_scale is nan"),
     "a scene's size in words": forged("strategy.scene_scale", "1", "strategy.scene_scale is '1'"),
+    "a first count in words": forged("strategy.first_count", "1", "strategy.first_count is '1'"),
     "more in a strategy's state": forged("strategy.more", [1], "strategy.more is list"),
     "random numbers too short": forged(
         "strategy.generator", torch.zeros(7, dtype=torch.uint8), "generator has shape [7]"

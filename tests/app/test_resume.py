@@ -7,12 +7,14 @@ import os
 import random
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -223,8 +225,25 @@ def train(folder: Path, backend: str, method: str, resume: bool = False, ranks: 
     TrainingRun(config, tiny_capture(), resume=resume, ranks=ranks).run()
 
 
+def differing(folder: Path, ranks: Ranks) -> Iterator[str]:
+    """Say how runs end in which the second process continues nothing, sees another capture, or has other Gaussians."""
+    own = folder / f"own_{ranks.rank}"
+    if ranks.writes:
+        shutil.copytree(folder / "left", own)
+    plain = tiny_config(own, batch_size=2, checkpoint_every=0, save_steps=(), eval_steps=())
+    config = tiny_config(own, batch_size=SIZE)
+    runs = [TrainingRun(config, tiny_capture(), resume=True, ranks=ranks)]
+    runs += [TrainingRun(plain, tiny_capture(seed), overwrite=True, ranks=ranks) for seed in (ranks.rank, 0)]
+    # none is bright enough to stay after the first change
+    runs[2].params["opacities"].data -= 20.0 * ranks.rank
+    for run in runs:
+        with pytest.raises(PopError) as error:
+            run.run()
+        yield str(error.value)
+
+
 def train_all(folder: Path) -> None:
-    """What each process does: two whole runs, and one that is left after eleven steps."""
+    """What each process does: two whole runs, one that is left after eleven steps, and runs that cannot be."""
     ranks = join()
     # sums of an uneven number of entries, and of numbers whose order matters
     mine = [torch.tensor([1e8, 1.0, -1e8]) * (place + 1.0) / 3.0 for place in ranks.positions(SIZE)]
@@ -235,6 +254,7 @@ def train_all(folder: Path) -> None:
         interrupt(patch, at=11)
         with suppress(KeyboardInterrupt):
             train(folder / "left", "fast", "pop", ranks=ranks)
+    (folder / f"differ_{ranks.rank}").write_text("\n".join(differing(folder, ranks)))
     if ranks.writes:
         os._exit(0)
     try:
@@ -266,6 +286,17 @@ def test_two_processes_train_to_the_bits_of_one(together: Path, tmp_path: Path, 
 
 @pytest.mark.slow
 @needs_gloo
+def test_processes_that_differ_say_in_what(together: Path) -> None:
+    first, second = ((together / f"differ_{rank}").read_text().splitlines() for rank in (0, 1))
+    assert first[:2] == second[:2]
+    fix = ": start all with the same options, and let them read the capture and the result folder from one file system"
+    assert first[:2] == [f"the 2 processes have different {name}{fix}" for name in ("checkpoints", "photographs")]
+    for said in (first[2], second[2]):
+        assert said.startswith("the 2 processes no longer hold the same Gaussians after 5 steps; ")
+
+
+@pytest.mark.slow
+@needs_gloo
 def test_one_process_continues_what_two_began(together: Path) -> None:
     train(together / "left", "fast", "pop", resume=True)
     assert_same_run(together / "left", together / "pop")
@@ -286,7 +317,9 @@ def test_sums_do_not_depend_on_who_adds_and_a_process_whose_fellow_has_ended_say
 def test_pop_train_is_one_command_for_two_processes(shared_capture: Path, tmp_path: Path) -> None:
     settings = ["--steps-scaler", "0.0003", "--no-progress", "--backend", "fast", "--batch-size", "2", "--threads", "1"]
     settings += ["--skip-sizes", "--skip-checks", "--max-renders", "1"]
-    first, second = launched(["-m", "pop_fast.cli", "train", shared_capture, "--out", tmp_path / "two", *settings])
+    # which one of them unpacks
+    archive = shutil.make_archive(f"{tmp_path}/toy", "zip", shared_capture)
+    first, second = launched(["-m", "pop_fast.cli", "train", archive, "--out", tmp_path / "two", *settings])
     assert (first.status, second.status) == (0, 0), (first.err, second.err)
     assert "Gaussians" in first.out
     assert (second.out, second.err) == ("", "")
@@ -309,6 +342,25 @@ def test_views_are_shared_evenly_and_a_process_that_nobody_launched_is_alone(mon
     assert join() is ALONE
     monkeypatch.setenv("WORLD_SIZE", "2")
     assert join() is ALONE
+
+
+@pytest.fixture
+def first_of_two(monkeypatch: pytest.MonkeyPatch) -> tuple[str, int]:
+    """Let this process and those that it starts be the first of two; return where the second one would find it."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        host, port = free.getsockname()
+    told = {"RANK": 0, "WORLD_SIZE": 2, "MASTER_ADDR": host, "MASTER_PORT": port}
+    for name, value in told.items():
+        monkeypatch.setenv(name, str(value))
+    return host, port
+
+
+@needs_gloo
+def test_a_process_whose_fellow_does_not_come_says_so(first_of_two, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pop_fast.train.ranks._MEETING", timedelta(seconds=1))
+    with pytest.raises(PopError, match=r"cannot connect to the other processes \(RANK=0, .*\): .*; start them with"):
+        join()
 
 
 # Ctrl-C, SIGTERM, SIGHUP and SIGKILL, at a program that is at work in a process of its own.
@@ -393,6 +445,21 @@ def test_training_that_is_told_to_stop_writes_a_checkpoint(shared_capture, tmp_p
     assert process.returncode == 130
     ((step, _),) = ckpt.list_checkpoints(folder)
     assert err == f"pop: stopped after step {step + 1:,}; the same command with --resume continues\n"
+
+
+@posix
+@needs_gloo
+def test_sigterm_ends_a_process_that_waits_for_its_fellow(first_of_two, shared_capture: Path, tmp_path: Path) -> None:
+    process = start(tmp_path, "train", shared_capture, "--out", tmp_path / "r", "--batch-size", "2", *TRAIN)
+
+    def waits() -> bool:
+        with socket.socket() as second:
+            return second.connect_ex(first_of_two) == 0
+
+    wait_until(waits, process)
+    process.terminate()
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out, err.splitlines()[-1]) == (143, "", "pop: interrupted")
 
 
 @posix
