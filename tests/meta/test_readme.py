@@ -374,6 +374,9 @@ def test_authors_place_and_version_are_said_once_and_repeated_rightly() -> None:
     assert (cited["title"], cited["repository-code"]) == (project["name"], project["urls"]["Repository"])
     for key in ("version", "license", "authors"):
         assert cited[key] == project[key]
+    # a file of its own: an archive of pop_ref has no folder above it that a link could lead to
+    assert not (ROOT / "pop_ref" / "LICENSE").is_symlink()
+    assert (ROOT / "pop_ref" / "LICENSE").read_bytes() == (ROOT / "LICENSE").read_bytes()
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / ".github").rglob("*.yml")), ids=lambda path: path.stem)
