@@ -30,7 +30,8 @@ _CHANGES = (
     *((Path, name) for name in ("touch", "mkdir", "unlink", "rmdir")),
     (shutil, "rmtree"),
 )
-CRASHED = 77
+# exit statuses of a child: where it was made to end, and where it came to no such change
+CRASHED, UNREACHED = 77, 78
 _ERRORS = (errno.ENOSPC, errno.EACCES, errno.EIO, errno.EROFS)
 
 
@@ -68,8 +69,9 @@ def _at_points(of: UndisturbedRun, most: int | None, fault: Callable[[int], None
 
             def disturbed(number: int = number, work: Callable[[], int] = work) -> int:
                 run_parts(in_children=False)
-                with disturbing(number, partial(fault, number)):
-                    return work()
+                with disturbing(number, partial(fault, number)) as reached:
+                    status = work()
+                return status if reached[0] > number else UNREACHED
 
             status = ended(*of.together([disturbed, *[work] * (of.kind.ranks - 1)], said))
             text = said.read_text() if said.exists() else ""
@@ -101,7 +103,10 @@ def _writing(of: UndisturbedRun) -> tuple[Callable[[], int], Callable[[], str | 
         return 0
 
     def old_or_new() -> str | None:
-        means = load_splat_file(splat)[0]["means"]
+        try:
+            means = load_splat_file(splat)[0]["means"]
+        except PopError as error:
+            return str(error)
         moved = float((means - load_splat_file(old)[0]["means"]).abs().max())
         return None if moved in (0.0, 0.25) or abs(moved - 0.25) < 1e-6 else "a splat is neither the old nor the new"
 

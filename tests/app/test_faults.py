@@ -201,6 +201,40 @@ def test_another_bit_and_another_stepper_are_noticed(tried: dict[str, Any]) -> N
     assert outcome.out.splitlines() == ["the bits differ", "native step: status 0, steps by torch"]
 
 
+# a writer in the file's own place, and a job of which more changes were counted than it makes
+DIRECT = """
+import os
+from contextlib import contextmanager
+from benchmarks.faults import disk, runs
+from pop_fast.io import atomic
+
+jobs = disk._jobs
+disk._jobs = lambda of: {"write a PLY": jobs(of)["write a PLY"]}
+with runs.scene("native step") as scene:
+    count = disk._count
+    disk._count = lambda *words: count(*words) + 1
+    found = disk.crash_points(scene, None)["write a PLY"]
+    print(found["ended"] == found["points"] - 1, len(found["failures"]), found["failures"][0][-11:])
+    disk._count, replace = count, os.replace
+    atomic._beside = contextmanager(lambda path: (at for at in (path,)))
+    os.replace = lambda a, b: a == b or replace(a, b)
+    for part in (disk.crash_points, disk.failing_writes):
+        print(*(failed[: failed.index(":")] for failed in part(scene, None)["write a PLY"]["failures"]))
+"""
+
+
+@pytest.mark.slow
+def test_half_a_file_in_its_place_and_a_change_that_never_comes_are_failures() -> None:
+    if (reason := runs.why_not()) is not None:
+        pytest.skip(reason)
+    outcome = in_a_child(DIRECT)
+    assert outcome.status == 0, outcome.err[-3000:]
+    never, *halves = outcome.out.splitlines()
+    assert never == "True 1 status 78: "
+    assert all("write a PLY, point 0" in half for half in halves)
+    assert len(halves) == 2
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("check", [*sanitizers.CHECKS, sanitizers.EMULATION])
 def test_the_units_of_cpp_are_clean_under_sanitizers(tried: dict[str, Any], check: str) -> None:
