@@ -89,6 +89,30 @@ def test_notes_hold_the_tables_of_the_results_and_the_curves_of_preset_quick(scr
     assert script("quick_curve").main(["--json", str(BENCHMARKS / "results" / "quick.json"), "--check"]) == 0
 
 
+def test_the_notes_and_the_page_of_speed_tell_in_words_what_their_tables_hold() -> None:
+    timed = read_json(BENCHMARKS / "results" / "cpu.json")
+    blends = [blend for case in timed["raster"] for blend in case["blend"]]
+    pairs, ratios = (
+        [blend[of][name] for blend in blends]
+        for of, name in (("forward_backward_ns_per_pair", "fast"), ("forward_backward_ms", "compiled / fast"))
+    )
+    notes, speed = ((ROOT / page).read_text(encoding="utf-8") for page in ("benchmarks/NOTES.md", "docs/speed.md"))
+    assert f"takes {min(pairs):.1f} to {max(pairs):.1f} ns per pair" in notes
+    assert f"with {timed['machine']['capability']}; the target was 3" in notes
+    assert f"compiled stages take {min(ratios):.2f} to {max(ratios):.2f} of its time" in notes
+    found = {
+        name: [case["engines"][name]["of_fair_share"] for case in timed["busy"]] for name in ("native", "compiled")
+    }
+    assert f"a native step takes {min(found['native']):.2f} to {max(found['native']):.2f} times its fair share" in speed
+    assert f"takes {min(found['compiled']):.1f} to {max(found['compiled']):.1f} times that share" in " ".join(
+        speed.split()
+    )
+    first = timed["first-step"]
+    helped, doctor = (first["commands"][f"pop {name}"]["wall_s"] for name in ("train --help", "doctor"))
+    said = f"on fox takes {first['first_step']['wall_s']:.1f} s; `pop train --help` takes {helped:.1f} s and"
+    assert f"{said} `pop doctor` {doctor:.1f} s" in speed
+
+
 def test_every_table_says_what_was_measured_and_what_was_not(script: Any) -> None:
     tables, text = script("results_table"), (BENCHMARKS / "NOTES.md").read_text()
     assert tables.with_tables(text, {}).count(tables.NOT_YET) == len(tables.TABLES)
@@ -489,8 +513,9 @@ def test_the_laws_run_every_line_of_the_engine_that_computes_what_is_trained() -
     others = {name: lines for name, lines in left.items() if name not in NOT_JUDGED}
     assert all(TOLD.search(line) for lines in others.values() for line in lines), others
     assert counted["lines"] - counted["run"] == sum(map(len, left.values()))
-    said = f"Of the engine's {counted['lines']:,} lines the laws run {counted['run']:,}"
-    assert said in (ROOT / "docs" / "kit.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "kit.md").read_text(encoding="utf-8")
+    assert f"Of the engine's {counted['lines']:,} lines the laws run {counted['run']:,}" in page
+    assert f"engine_mutants --lines`, at commit {counted['commit']})" in page
 
 
 CONDITIONS = json.loads((BENCHMARKS / "results" / "conditions.json").read_text(encoding="utf-8"))
