@@ -138,7 +138,10 @@ def _results_folder(given: Path | None) -> Path:
     folder = given or Path(os.environ.get("OUT") or PLACE / "results")
     if folder.exists() and not folder.is_dir():
         raise SystemExit(f"gpu_check: {folder} is a file; name a folder for the results")
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SystemExit(f"gpu_check: {folder}: {error.strerror}; name another folder for the results") from error
     return folder.resolve()
 
 

@@ -87,6 +87,8 @@ def test_results_go_where_the_environment_says(stages, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     with pytest.raises(SystemExit, match="is a file; name a folder"):
         main([str(tmp_path / "file"), "--stages", "build"])
+    with pytest.raises(SystemExit, match="x: Not a directory; name another folder"):
+        main([str(tmp_path / "file" / "x"), "--stages", "build"])
 
 
 def test_a_call_without_time_says_so_for_every_stage(stages, tmp_path):
