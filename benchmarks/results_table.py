@@ -87,12 +87,12 @@ def _failed(result: dict[str, Any]) -> str:
 
 def loads() -> str:
     """Make the table of large captures and splats: the memory that they took, and the bound that was stated."""
-    rows, measured = [], read_json(RESULTS / "load.json")
-    for name, found in measured["cases"].items():
+    rows, cases = [], read_json(RESULTS / "load.json")["cases"]
+    for name, found in cases.items():
         size = f"{found['width']} x {found['height']}"
         rows.append([name, size, f"{found['peak_gib']:.2f} GiB", f"{found['bound_gib']:.2f} GiB", found["backend"]])
     head = ["load", "photograph or render, px", "peak", "bound", "backend"]
-    return markdown(head, rows) + _commits(measured["machine"])
+    return markdown(head, rows) + _commits(*cases.values())
 
 
 def title(case: Mapping[str, Any]) -> str:

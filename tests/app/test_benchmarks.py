@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -246,6 +247,21 @@ def test_busy_processes_end_with_their_block_and_with_who_started_them(script, m
     assert counting() == 0
     # a fair share is that of all who want a core
     assert (busy.fair_factor(2, 2), busy.fair_factor(1, 16)) == (5.0, 1.0)
+
+
+def test_nothing_is_timed_where_a_gradient_is_no_number(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = script("steps")
+    exact = steps.render_vjp
+
+    def broken(*arguments: Any) -> Any:
+        v = exact(*arguments)
+        return replace(v, quats=np.full_like(v.quats, np.nan))
+
+    monkeypatch.setattr(steps, "backends", lambda: ("fast",))
+    assert set(steps.gate()) == {"fast torch.float64", "fast torch.float32"}
+    monkeypatch.setattr(steps, "render_vjp", broken)
+    with pytest.raises(SystemExit, match="differs from the oracle by nan"):
+        steps.gate()
 
 
 def test_turns_change_order_and_keep_what_counts(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -344,10 +344,14 @@ load.CASES = {"small": load.Case(3, 50, 64, 48)}
 load.PROGRAM = 0.0
 sys.exit(load.main(["--out", sys.argv[1]]))
 """
+    (tmp_path / "load.json").write_text('{"cases": {"large": {"peak_gib": 2.0}}}')
     outcome = in_a_child(script, tmp_path / "load.json")
     assert outcome.status == 1, outcome.err[-2000:]
     assert "small: above its bound" in outcome.out
-    found = json.loads((tmp_path / "load.json").read_text())["cases"]["small"]
+    cases = json.loads((tmp_path / "load.json").read_text())["cases"]
+    # cases that are measured alone leave the others as they were
+    assert cases.pop("large") == {"peak_gib": 2.0}
+    found = cases["small"]
     # what torch and the program take by themselves
     assert 0.1 < found["peak_gib"] < 0.5
 
