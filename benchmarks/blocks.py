@@ -179,7 +179,8 @@ def table(path: Path = RESULTS, capture: str = SHOWN) -> str:
     for number, each in enumerate(found["rounds"], start=1):
         rows.append([f"**after round {number}**", "", f"{each['gaussians']:,}", "", *_measured(each, views)])
     head = ["", "training views", "Gaussians", "kept", "held-out views", "PSNR", "SSIM", "peak memory"]
-    return markdown(head, rows, ["---", "---:", "---:", "---:", "---", "---:", "---:", "---:"])
+    rule = ["---", "---:", "---:", "---:", "---", "---:", "---:", "---:"]
+    return f"{markdown(head, rows, rule)}\n\nCommit {found['machine']['commit']}."
 
 
 def _measured(row: dict[str, Any], views: str) -> list[str]:

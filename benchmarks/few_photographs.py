@@ -142,7 +142,8 @@ def rows_of(args: argparse.Namespace, known: dict[str, Any]) -> Iterator[tuple[s
             for seed in args.seed:
                 name = f"{what}, seed {seed}: {setting}"
                 if name not in known:
-                    known[name] = measured(setting, capture, args.steps, seed, args.capture)
+                    # of its own, because others may have been measured elsewhere
+                    known[name] = {"machine": machine(), **measured(setting, capture, args.steps, seed, args.capture)}
                 yield name, known[name]
 
 

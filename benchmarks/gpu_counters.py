@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
-from gpu_kernels import POP, make_trainer, photograph_of
+from gpu_kernels import POP, about, make_trainer, photograph_of
 from gpu_scenes import CASES, TINY, scenes
 
 from cuda_ext.gpu_check.shared import ROOT, python_path
@@ -168,7 +168,7 @@ def main() -> int:
     metrics = ",".join([*(metric for metric, _ in ASKED.values()), STALLS])
     try:
         printed = _watched(["--metrics", metrics, "--csv"], args)
-        head = {"gpu": torch.cuda.get_device_name(), "torch": torch.__version__, "case": args.cases}
+        head = {**about(), "case": args.cases}
         head["tool"] = f"{' '.join(NCU)}, one POP step launched kernel by kernel"
         args.out.write_text(as_json(head, of_kernels(printed.splitlines())), encoding="utf-8")
         if args.lines is not None:

@@ -17,6 +17,7 @@ import torch
 from gpu_kernels import (
     STEPS,
     Record,
+    about,
     arguments,
     draw,
     forward_backward,
@@ -131,7 +132,7 @@ def main() -> int:
         return 2
     import gsplat
 
-    results: dict[str, Any] = {"gsplat": gsplat.__version__, "cases": {}}
+    results: dict[str, Any] = {**about(), "gsplat": gsplat.__version__, "cases": {}}
 
     def measured(case: GpuCase, scene: dict[str, Tensor], record: Record) -> None:
         beside(case, scene, gsplat.rasterization, record)

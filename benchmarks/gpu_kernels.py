@@ -32,6 +32,7 @@ from gpu_visits import count_tried, count_visits
 from torch import Tensor
 
 import cuda_ext
+from cuda_ext.gpu_check.__main__ import commit_of
 from cuda_ext.gpu_check.shared import write_json
 from cuda_ext.render import lists
 from cuda_ext.training import step_program
@@ -313,9 +314,10 @@ class Record:
 def measure(case: GpuCase, scene: dict[str, Tensor], card: Card, record: Record) -> None:
     """Measure one case, the parts that matter most first."""
     apart = record.part("families_differ", lambda: families_differ(scene, case))
-    worst = max((apart or {}).values(), default=0.0)
-    if not worst < APART:
-        record.result.setdefault("failed", {})["families_differ"] = f"the backward families differ by {worst:.1e}"
+    # one by one: the largest of numbers of which one is not a number may be any of them
+    off = [f"{differ:.1e} in {name}" for name, differ in (apart or {}).items() if not differ < APART]
+    if off:
+        record.result.setdefault("failed", {})["families_differ"] = f"the backward families differ by {', '.join(off)}"
     photograph = record.part("photograph", lambda: photograph_of(scene, case), keep=False)
     if photograph is None:
         return
@@ -355,6 +357,11 @@ def peak_mib() -> float | None:
     return peak
 
 
+def about() -> dict[str, str]:
+    """Say of which commit results are, and on what they were measured."""
+    return {"commit": commit_of(None), "gpu": torch.cuda.get_device_name(), "torch": torch.__version__}
+
+
 def arguments(summary: str | None) -> argparse.Namespace:
     """Read which cases to time, and where to."""
     parser = argparse.ArgumentParser(description=(summary or "").splitlines()[0])
@@ -375,7 +382,7 @@ def main() -> int:
         print(f"gpu_kernels: {reason}", file=sys.stderr)
         return 2
     device = torch.device(args.device)
-    results: dict[str, Any] = {"gpu": torch.cuda.get_device_name(), "torch": torch.__version__, "cases": {}}
+    results: dict[str, Any] = {**about(), "cases": {}}
     card = measured_card(device)
     results["card"] = asdict(card)
     return over_scenes(args, results, device, lambda case, scene, record: measure(case, scene, card, record))

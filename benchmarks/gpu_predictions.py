@@ -34,6 +34,7 @@ from typing import Any
 import torch
 from record import read_json, with_table
 
+from cuda_ext.machine_code.count_sass import sources
 from cuda_ext.training.batch_step import step_bytes
 
 NOTES = Path(__file__).resolve().parent / "NOTES.md"
@@ -125,7 +126,10 @@ def machine_code(sass: dict[str, Any]) -> str:
         lines.append(
             f"| {title} | {an_iteration(both[0])} | {an_iteration(both[1])} | {registers} | {shared} | {warps} |"
         )
-    return "\n".join(lines)
+    now = sources()
+    changed = sorted(name for name in {*now, *sass["sources"]} if now.get(name) != sass["sources"].get(name))
+    since = f" Changed since: {', '.join(f'`{name}`' for name in changed)}." if changed else ""
+    return "\n".join((*lines, "", f"Counted with nvcc {sass['nvcc']}.{since}"))
 
 
 def predictions() -> str:

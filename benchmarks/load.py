@@ -10,7 +10,8 @@ torch included. The bound is stated beforehand, as bytes of a pixel, of a Gaussi
     3M Gaussians         a PLY of them with all colour bands, loaded and rendered at 1920 x 1080
 
 Writes benchmarks/results/load.json, of which docs/reliability.md has the table; exit status 1 where a peak is above its
-bound. --scale makes fewer photographs and Gaussians.
+bound. A case that is done alone replaces its own result; with --scale, which makes fewer photographs and Gaussians,
+results go to --out alone.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ import cv2
 import numpy as np
 import torch
 
-from benchmarks.record import machine, peak_bytes, write_json
+from benchmarks.record import machine, peak_bytes, read_json, write_json
 from pop_fast import rasterization
 from pop_fast.api.backend import get_backend
 from pop_fast.children import module_command
@@ -187,10 +188,14 @@ def main(words: list[str], say: Callable[[str], None] = print) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", choices=tuple(CASES), action="append")
     parser.add_argument("--scale", type=float, default=1.0)
-    parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--out", type=Path, help="default: the published results, where --scale is 1")
     args = parser.parse_args(words)
-    cases = {name: measured(name, CASES[name].scaled(args.scale)) for name in args.only or CASES}
-    write_json(args.out, {"machine": machine(), "cases": cases})
+    now, out = machine(), args.out or (RESULTS if args.scale == 1.0 else None)
+    cases = {
+        name: {**measured(name, CASES[name].scaled(args.scale)), "commit": now["commit"]} for name in args.only or CASES
+    }
+    if out is not None:
+        write_json(out, {"machine": now, "cases": {**read_json(out).get("cases", {}), **cases}})
     for name, found in cases.items():
         say(f"{name}: {found['peak_gib']:.2f} GiB of {found['bound_gib']:.2f} GiB, {found['seconds']:.0f} s")
     above = [name for name, found in cases.items() if found["peak_gib"] > found["bound_gib"]]

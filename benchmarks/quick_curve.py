@@ -126,6 +126,8 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("--write", action="store_true", help="put the tables into benchmarks/NOTES.md")
     parser.add_argument("--check", action="store_true", help="exit with 1 where benchmarks/NOTES.md has others")
     args = parser.parse_args(words)
+    if args.capture is None and not args.json.exists():
+        parser.error(f"{args.json}: no such file; name one that holds runs, or a capture to run")
     kept: dict[str, Any] = read_json(args.json) or {"machine": machine(), "runs": {}}
     if args.capture is not None:
         capture = load_capture(args.capture, factor=args.factor)

@@ -30,15 +30,22 @@ ENGINES = {"fast": "`fast`", "compiled": "`compiled`, autograd", "native": "`com
 
 def fuzzed() -> str:
     """Make the table of damaged files: what came of them, by reader."""
-    found = read_json(RESULTS / "faults.json")["fuzz"]["readers"]
+    whole = read_json(RESULTS / "faults.json")["fuzz"]
+    found = whole["readers"]
     total = {kind: sum(row[kind] for row in found.values()) for kind in _KINDS}
     rows = [[name, *_outcomes(row)] for name, row in found.items()] + [["**all**", *_outcomes(total)]]
     head = ["reader", "inputs", "read", "refused in one line", "system", "failures", "crash", "hang"]
-    return markdown(head, rows, ["---", *["---:"] * 7])
+    return markdown(head, rows, ["---", *["---:"] * 7]) + _commits(whole, *found.values())
+
+
+def _commits(*rows: Mapping[str, Any]) -> str:
+    """Say in a line below a table which commits its rows are of."""
+    found = dict.fromkeys(row["commit"] for row in rows if "commit" in row)
+    return f"\n\nCommit{'s' if len(found) > 1 else ''} {', '.join(found)}."
 
 
 def _outcomes(row: dict[str, int]) -> list[str]:
-    # a reader that was tried again alone has its seed there too
+    # a reader that was tried again alone has its seed and commit there too
     counts = [row[kind] for kind in _KINDS]
     return [f"{count:,}" for count in (sum(counts), *counts)]
 
@@ -59,7 +66,8 @@ def disturbed() -> str:
     for flips in found["flips"].values():
         came = f"{flips['refused']:,} refused, {flips['the same']:,} read as before"
         rows.append(["a flipped bit of a checkpoint", f"{flips['flips']:,}", came, _failed(flips)])
-    return markdown(["event", "tried", "outcome", "failures"], rows, ["---", "---", "---", "---:"])
+    made = [row for part in ("kills", "crashes", "writes", "flips") for row in found[part].values()]
+    return markdown(["event", "tried", "outcome", "failures"], rows, ["---", "---", "---", "---:"]) + _commits(*made)
 
 
 def sanitized() -> str:
@@ -70,7 +78,7 @@ def sanitized() -> str:
         for name, of in found["checks"].items()
     ]
     rows += [[f"`{unit}`", "", f"{run} of {of} lines ran", ""] for unit, (run, of) in found["lines"].items()]
-    return markdown(["code", "sanitizer", "tried", "failures"], rows, ["---", "---", "---", "---:"])
+    return markdown(["code", "sanitizer", "tried", "failures"], rows, ["---", "---", "---", "---:"]) + _commits(found)
 
 
 def _failed(result: dict[str, Any]) -> str:
@@ -79,11 +87,12 @@ def _failed(result: dict[str, Any]) -> str:
 
 def loads() -> str:
     """Make the table of large captures and splats: the memory that they took, and the bound that was stated."""
-    rows = []
-    for name, found in read_json(RESULTS / "load.json")["cases"].items():
+    rows, cases = [], read_json(RESULTS / "load.json")["cases"]
+    for name, found in cases.items():
         size = f"{found['width']} x {found['height']}"
         rows.append([name, size, f"{found['peak_gib']:.2f} GiB", f"{found['bound_gib']:.2f} GiB", found["backend"]])
-    return markdown(["load", "photograph or render, px", "peak", "bound", "backend"], rows)
+    head = ["load", "photograph or render, px", "peak", "bound", "backend"]
+    return markdown(head, rows) + _commits(*cases.values())
 
 
 def title(case: Mapping[str, Any]) -> str:

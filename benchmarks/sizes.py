@@ -177,10 +177,11 @@ def sizes_table() -> str:
     captures, each = found["captures"], found["ply_bytes"]
     shares = sorted({row["final_prune"] for of in captures.values() for row in of["rows"]})
     head = ["capture", "format", *(f"`--final-prune {share:g}`" if share else "whole" for share in shares)]
-    rows, sources = [], []
+    rows, sources, commits = [], [], list[str]()
     for name, of in captures.items():
         whole = of["gaussians"] * each
         sources.append(f"{name}, {of['gaussians']:,} Gaussians, {whole / 1e6:.2f} MB as PLY, {of['psnr']:.2f} dB")
+        commits.append(of["machine"]["commit"])
         cells = {
             (row["format"], row["final_prune"]): f"{row['bytes'] / 1e6:.2f} MB, 1/{whole / row['bytes']:.1f}, "
             f"{row['psnr'] - of['psnr']:+.2f} dB"
@@ -188,7 +189,7 @@ def sizes_table() -> str:
         }
         formats = dict.fromkeys(row["format"] for row in of["rows"])
         rows += [[name, f"`{format}`", *(cells[format, share] for share in shares)] for format in formats]
-    return f"The whole splats are {'; '.join(sources)}.\n\n{markdown(head, rows)}"
+    return f"The whole splats are {'; '.join(sources)}; commits {', '.join(commits)}.\n\n{markdown(head, rows)}"
 
 
 def budgets_table() -> str:

@@ -31,7 +31,7 @@ from paper_repro.status import outcome as outcome_of
 from paper_repro.status import settled as settled_of
 from pop_fast.train.presets import METHODS, options_for
 from pop_ref.conformance.capabilities import STAGES as KIT_STAGES
-from pop_ref.conformance.law_coverage import LIMITS, reason
+from pop_ref.conformance.law_coverage import LIMITS, digest_of, reason
 from pop_ref.conformance.laws import STANDS_IN
 from pop_ref.conformance.mutants import BLACK_BOXES, FAMILIES, MUTANTS, PROGRAM
 from pop_ref.conformance.mutants.trial import every_law
@@ -304,7 +304,7 @@ def _of_seeds(runs: list[Result]) -> str:
 def few_photographs() -> str:
     """Make the table of captures with few photographs left, as benchmarks/few_photographs.py does."""
     settings = ("--depth-lambda 0.1", "--depth-lambda 0.01", "--method gsplat")
-    return with_few.table_of(read_json(RESULTS / "few_photographs.json"), settings)
+    return _with_machine("few_photographs.json", lambda known: with_few.table_of(known, settings))
 
 
 def kinds() -> str:
@@ -338,7 +338,8 @@ def speed() -> str:
             what = f"blend and backward alone, {_size(case)}, {blend['tile']} px tiles"
             rows.append([what, ns["fast"], ns["compiled"], f"{ratio:.2f}"])
     made.append(table(["", "`fast`", "`compiled`", "ratio of times"], rows))
-    made.append(f"{machine['cpu']}, {machine['capability']}, {machine['threads']} threads, torch {machine['torch']}.")
+    where = f"{machine['cpu']}, {machine['capability']}, {machine['threads']} threads, torch {machine['torch']}"
+    made.append(f"{where}, commit {machine['commit']}.")
     return "\n\n".join(made)
 
 
@@ -429,8 +430,9 @@ def reached() -> str:
     logged = read_json(RESULTS / "law_coverage.json")
     ranges = [[name, f"{low:.3g}", f"{high:.3g}", LIMITS[name]] for name, (low, high) in logged["ranges"].items()]
     choices = [[name, ", ".join(f"`{value}`" for value in values)] for name, values in logged["choices"].items()]
-    lines, refusals, others = 0, 0, dict[tuple[str, str], int]()
+    lines, refusals, others, changed = 0, 0, dict[tuple[str, str], int](), list[str]()
     for file, found in logged["modules"].items():
+        changed += [f"`{file}`"] if digest_of(file) != found["sha256"] else []
         lines += found["lines"]
         for function, _ in found["unreached"]:
             why = reason(file, function)
@@ -440,7 +442,8 @@ def reached() -> str:
     rows = [[f"`{file}`", str(count), why] for (file, why), count in others.items()]
     rows.append(["all", str(refusals), "arguments are refused: tests of the oracle give wrong ones, laws give none"])
     run = lines - refusals - sum(others.values())
-    said = f"Of {lines:,} lines in the oracle's functions the laws run {run:,}. The others:"
+    since = f" Changed since that run: {', '.join(changed)}." if changed else ""
+    said = f"Of {lines:,} lines in the oracle's functions the laws ran {run:,}.{since} The others:"
     return "\n\n".join((
         table(["argument", "least", "largest", "why no further"], ranges),
         table(["argument", "values"], choices),

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from paper_repro.jobs import Job
-from paper_repro.results import BINS, LPIPS_VARIANTS, UNTIMED, Result, run_id, settings_hash
+from paper_repro.results import BINS, LPIPS_VARIANTS, UNTIMED, Result, run_id, settings_hash, to_line
 from pop_fast.errors import PopError
 from pop_fast.io.read_back import read_arrays, read_json
 from pop_fast.machine import processor_kind
@@ -100,13 +100,18 @@ def collect(job: Job, folder: Path, files: Mapping[str, str]) -> Result:
         PopError: something of a finished training is absent or damaged; names the file or the folder.
     """
     try:
-        return _collected(job, folder, files)
+        found = _collected(job, folder, files)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         if isinstance(error, PopError):
             raise
         raise PopError(
             f"{folder}: its records are not what a finished training leaves ({error!r}); {_AGAIN}"
         ) from error
+    try:
+        to_line(found)
+    except PopError as error:
+        raise PopError(f"{folder}: {error}") from error
+    return found
 
 
 def _collected(job: Job, folder: Path, files: Mapping[str, str]) -> Result:

@@ -24,20 +24,25 @@ from pop_fast.train import checkpoint as ckpt
 from .corpus import HERE
 from .runs import KINDS, STEPS, TOLD, UndisturbedRun, ended, run_parts, same, start, wait
 
-# what changes a disk; a process may end, and the system may refuse, right before each of them
-_CHANGES = ((os, "replace"), (os, "fsync"), (Path, "mkdir"), (Path, "unlink"), (Path, "rmdir"), (shutil, "rmtree"))
-CRASHED = 77
+# what changes a disk besides writes; a process may end, and the system may refuse, right before each of them
+_CHANGES = (
+    *((os, name) for name in ("replace", "fsync")),
+    *((Path, name) for name in ("touch", "mkdir", "unlink", "rmdir")),
+    (shutil, "rmtree"),
+)
+# exit statuses of a child: where it was made to end, and where it came to no such change
+CRASHED, UNREACHED = 77, 78
 _ERRORS = (errno.ENOSPC, errno.EACCES, errno.EIO, errno.EROFS)
 
 
 def crash_points(of: UndisturbedRun, most: int | None) -> dict[str, Any]:
-    """End the process right before every change of the disk, and look at what is left.
+    """End the process right before every change of the disk and in the middle of writes, and look at what is left.
 
     Args:
         of: what is trained.
         most: so many points of each job at most, spread evenly; None takes all.
     """
-    return _at_points(of, most, lambda number: os._exit(CRASHED), short_writes=False)
+    return _at_points(of, most, lambda number: os._exit(CRASHED))
 
 
 def failing_writes(of: UndisturbedRun, most: int | None) -> dict[str, Any]:
@@ -47,15 +52,13 @@ def failing_writes(of: UndisturbedRun, most: int | None) -> dict[str, Any]:
         code = _ERRORS[number % len(_ERRORS)]
         raise OSError(code, os.strerror(code))
 
-    return _at_points(of, most, refuse, short_writes=True)
+    return _at_points(of, most, refuse)
 
 
-def _at_points(
-    of: UndisturbedRun, most: int | None, fault: Callable[[int], None], short_writes: bool
-) -> dict[str, Any]:
+def _at_points(of: UndisturbedRun, most: int | None, fault: Callable[[int], None]) -> dict[str, Any]:
     results: dict[str, Any] = {}
     for job, (work, check) in _jobs(of).items():
-        points = _count(of, job, work, short_writes)
+        points = _count(of, job, work)
         step = 1 if most is None else max(points / most, 1.0)
         chosen = sorted({int(step * k) for k in range(points) if step * k < points})
         failures, statuses = list[str](), Counter[str]()
@@ -66,8 +69,9 @@ def _at_points(
 
             def disturbed(number: int = number, work: Callable[[], int] = work) -> int:
                 run_parts(in_children=False)
-                with disturbing(number, partial(fault, number), short_writes):
-                    return work()
+                with disturbing(number, partial(fault, number)) as reached:
+                    status = work()
+                return status if reached[0] > number else UNREACHED
 
             status = ended(*of.together([disturbed, *[work] * (of.kind.ranks - 1)], said))
             text = said.read_text() if said.exists() else ""
@@ -99,7 +103,10 @@ def _writing(of: UndisturbedRun) -> tuple[Callable[[], int], Callable[[], str | 
         return 0
 
     def old_or_new() -> str | None:
-        means = load_splat_file(splat)[0]["means"]
+        try:
+            means = load_splat_file(splat)[0]["means"]
+        except PopError as error:
+            return str(error)
         moved = float((means - load_splat_file(old)[0]["means"]).abs().max())
         return None if moved in (0.0, 0.25) or abs(moved - 0.25) < 1e-6 else "a splat is neither the old nor the new"
 
@@ -116,13 +123,13 @@ def _prepare(of: UndisturbedRun, job: str) -> None:
             shutil.copy(HERE / "splats" / "splat.ply", of.folder / name)
 
 
-def _count(of: UndisturbedRun, job: str, work: Callable[[], int], short_writes: bool) -> int:
+def _count(of: UndisturbedRun, job: str, work: Callable[[], int]) -> int:
     """Count the changes of the disk of a job that nobody disturbs."""
     told = of.folder / "count"
 
     def counted() -> int:
         run_parts(in_children=False)
-        with disturbing(-1, lambda: None, short_writes) as reached:
+        with disturbing(-1, lambda: None) as reached:
             status = work()
         told.write_text(str(reached[0]))
         return status
@@ -135,7 +142,7 @@ def _count(of: UndisturbedRun, job: str, work: Callable[[], int], short_writes: 
 
 
 @contextmanager
-def disturbing(at: int, fault: Callable[[], None], short_writes: bool) -> Iterator[list[int]]:
+def disturbing(at: int, fault: Callable[[], None]) -> Iterator[list[int]]:
     """Let something happen right before the change of the disk with this number, and count them all."""
     reached = [0]
 
@@ -152,16 +159,16 @@ def disturbing(at: int, fault: Callable[[], None], short_writes: bool) -> Iterat
         return call
 
     def opening(file: Any, mode: str = "r", *words: Any, **named: Any) -> Any:
-        if mode == "wb" and isinstance(file, Path):
-            return io.BufferedWriter(_Meeting(file, meet), 512)
+        if mode in ("wb", "r+b") and isinstance(file, Path):
+            raw = _Meeting(file, mode, meet)
+            return raw if named.get("buffering") == 0 else io.BufferedWriter(raw, 512)
         return plain(file, mode, *words, **named)
 
     plain, before = builtins.open, [(owner, name, getattr(owner, name)) for owner, name in _CHANGES]
     try:
         for owner, name, function in before:
             setattr(owner, name, wrapped(function))
-        if short_writes:
-            builtins.open = opening  # type: ignore[assignment]
+        builtins.open = opening  # type: ignore[assignment]
         yield reached
     finally:
         builtins.open = plain
@@ -172,8 +179,8 @@ def disturbing(at: int, fault: Callable[[], None], short_writes: bool) -> Iterat
 class _Meeting(io.FileIO):
     """A file of which half a write gets to the disk before something happens, at the first and the third."""
 
-    def __init__(self, path: Path, meet: Callable[[], None]) -> None:
-        super().__init__(path, "w")
+    def __init__(self, path: Path, mode: str, meet: Callable[[], None]) -> None:
+        super().__init__(path, mode)
         self._meet, self._writes = meet, 0
 
     def write(self, data: Any) -> int:  # type: ignore[override]

@@ -99,10 +99,11 @@ def renewed(whole: dict[str, Any], part: dict[str, Any]) -> dict[str, Any]:
     """Put what came of some readers in the place of what came of them in a run of all.
 
     Args:
-        whole: what `fuzz` gave for all readers; seed and minutes stay its.
-        part: what it gave for some, which have their own seed.
+        whole: what `fuzz` gave for all readers; seed, minutes and commit stay its.
+        part: what it gave for some, which have their own seed and commit.
     """
-    again = {name: {**row, "seed": part["seed"]} for name, row in part["readers"].items()}
+    own = {key: part[key] for key in ("seed", "commit")}
+    again = {name: {**row, **own} for name, row in part["readers"].items()}
     readers = {**whole["readers"], **again}
     failures = {key: of for key, of in whole["failures"].items() if of["reader"] not in again} | part["failures"]
     inputs = sum(row[outcome] for row in readers.values() for outcome in OUTCOMES)
@@ -232,7 +233,8 @@ def _outcome(reader: Reader, path: Path) -> tuple[str, ...]:
     except Exception as error:
         # as the command line prints it
         line = message(str(error) if isinstance(error, PopError) else describe(error) or str(error))
-        named = any(name in line for name in (path.name, HERE.name))
+        # not the name alone: "result" and "vectors" are words of many a message that names no file
+        named = any(place in line for place in (str(path), f"/{HERE.name}/"))
         if isinstance(error, OSError) and describe(error) is not None and named:
             return ("told",)
         known = isinstance(error, PopError) or (isinstance(error, ValueError) and describe(error) is not None)

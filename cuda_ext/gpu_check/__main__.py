@@ -8,7 +8,8 @@
 What has to be there: Python 3.11 or newer with torch for CUDA, NumPy, nanobind, hypothesis and pytest, cmake, nvcc.
 Results go to the folder named first, else to $OUT, else to out/gpu_check/results: one JSON file a job, and next to it
 what its stages wrote while they ran. Nothing need survive between the jobs: each builds first, and keeps what it finds
-built. A stage that fails or runs out of time is reported with the reason, and the next one runs.
+built. A stage that fails or runs out of time is reported with the reason, and the next one runs. What an earlier call
+found stays in the file where commit and machine are the same.
 
 What travels is made beforehand, where there is a network, by --pack FOLDER, and read by --packed FOLDER:
     scenes/NAME.npz    trained Gaussians and their cameras, of every folder under --runs
@@ -38,8 +39,10 @@ from pathlib import Path
 from typing import Any
 
 from cuda_ext.gpu_check.shared import (
+    COMMIT,
     ROOT,
     SHORTEST,
+    UNKNOWN,
     Budget,
     StageContext,
     first_line,
@@ -52,7 +55,6 @@ from pop_fast.children import python_command
 
 PLACE = ROOT / "out" / "gpu_check"
 PACKED = ROOT / "out" / "gpu_pack"
-COMMIT = "POP_COMMIT"
 
 
 def commit_of(packed: Path | None) -> str:
@@ -62,7 +64,7 @@ def commit_of(packed: Path | None) -> str:
         commit = first_line(["git", "rev-parse", "HEAD"]) or ""
     if not commit and packed is not None:
         commit = str(read_json(packed / "manifest.json").get("commit", ""))
-    return commit or "unknown"
+    return commit or UNKNOWN
 
 
 def environment(commit: str) -> dict[str, Any]:
@@ -136,7 +138,10 @@ def _results_folder(given: Path | None) -> Path:
     folder = given or Path(os.environ.get("OUT") or PLACE / "results")
     if folder.exists() and not folder.is_dir():
         raise SystemExit(f"gpu_check: {folder} is a file; name a folder for the results")
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SystemExit(f"gpu_check: {folder}: {error.strerror}; name another folder for the results") from error
     return folder.resolve()
 
 
@@ -184,22 +189,29 @@ def main(argv: list[str] | None = None) -> int:
         raise SystemExit(f"gpu_check: {packed}: no such folder; make it with --pack, or leave --packed out")
     commit = commit_of(packed)
     path = out / f"gpu_check_{args.job}.json"
-    report = begun_report(path)
+    report, here = begun_report(path), environment(commit)
+    if (report.get("rehearsal"), report.get("environment")) != (args.rehearse, here):
+        # what another commit, another machine or the emulator came to says nothing of this call
+        report["stages"] = {}
     report |= {"job": args.job, "complete": False, "rehearsal": args.rehearse, "limit_s": args.limit_s}
-    report["environment"] = environment(commit)
+    report["environment"] = here
     check = StageContext(
         *(0.0, out, PLACE if os.access(ROOT, os.W_OK) else Path(tempfile.mkdtemp(prefix="gpu_check_"))),
         *(path.with_suffix(".log"), packed.resolve() if packed else None),
         *(tuple(folder.resolve() for folder in args.captures), args.steps_scaler, commit, args.rehearse),
         note=lambda found: None,
     )
+    names = args.stages or list(JOBS[args.job])
     try:
-        failed = run_stages(args.stages or list(JOBS[args.job]), args.limit_s, check, report, path)
+        failed = run_stages(names, args.limit_s, check, report, path)
     finally:
         # what runs along with the stages is not left behind
         for command in check.beside.values():
             command.kill()
-    print(f"{path}: {'failed: ' + ', '.join(failed) if failed else 'every stage ran'}", flush=True)
+    left_out = [name for name in names if "skipped" in report["stages"][name]]
+    words = [f"failed: {', '.join(failed)}"] if failed else [] if left_out else ["every stage ran"]
+    words += [f"skipped: {', '.join(left_out)}"] if left_out else []
+    print(f"{path}: {'; '.join(words)}", flush=True)
     return 1 if failed else 0
 
 

@@ -20,6 +20,8 @@ from pop_fast.children import python_command
 ROOT = Path(__file__).resolve().parents[2]
 # what puts the emulator in the GPU's place before it runs a command
 REHEARSE = ROOT / "tests" / "cuda" / "emulated" / "rehearse.py"
+COMMIT = "POP_COMMIT"  # the variable that says of which commit this is, where git cannot
+UNKNOWN = "unknown"  # the commit, where nothing says it
 TAIL = 4000  # characters of a command's words that are kept
 GRACE = 20.0  # seconds, at most, between asking a command to stop and making it
 
@@ -237,7 +239,9 @@ class StageContext:
     ) -> dict[str, Any]:
         """Run a command that finds the repository and the packed wheels, with `over` put over its environment."""
         path = python_path(ROOT, self.site)
-        return run(words, limit, self.log, {"PYTHONPATH": path, "PYTHONUNBUFFERED": "1", **over}, stop)
+        told = self.commit != UNKNOWN and not (ROOT / ".git").exists()
+        known = {COMMIT: self.commit} if told else {}
+        return run(words, limit, self.log, {"PYTHONPATH": path, "PYTHONUNBUFFERED": "1", **known, **over}, stop)
 
     def scenes(self) -> list[str]:
         """List the packed scenes."""

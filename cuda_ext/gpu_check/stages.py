@@ -119,6 +119,8 @@ def counters_stage(check: StageContext) -> dict[str, Any]:
     if shutil.which("ncu") is None:
         return skipped("ncu is not installed")
     target, lines = check.out / "gpu_counters.json", check.out / "lines.csv.gz"
+    for earlier in (target, lines):
+        earlier.unlink(missing_ok=True)
     limit = str(max(check.seconds / 2 - MARGIN, 1.0))
     script = str(ROOT / "benchmarks" / "gpu_counters.py")
     path = python_path(ROOT, check.site, ROOT / "benchmarks")

@@ -1,6 +1,6 @@
 """Count the instructions of every kernel's loops in the machine code, with registers, shared memory and occupancy.
 
-    python -m cuda_ext.machine_code.count_sass [--arch sm_80 sm_90] [--only blend] [--json out.json] [--notes NOTES.md]
+    python -m cuda_ext.machine_code.count_sass [--arch sm_80 sm_90] [--only blend] [--json out.json]
 
 Needs nvcc and nvdisasm, but no GPU. Exit status 1 when a file does not compile, 2 when a tool is missing.
 
@@ -13,6 +13,7 @@ jump over something. A region is issued when any lane of the warp takes it, so t
 from __future__ import annotations
 
 import argparse
+import hashlib
 import importlib.util
 import json
 import os
@@ -228,13 +229,20 @@ def count(nvcc: str, nvdisasm: str, archs: list[str], only: str = "", jobs: int 
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(jobs) as pool:
         work = [(nvcc, nvdisasm, source, arch, Path(folder)) for arch in archs for source in files]
         kernels = [entry for found in pool.map(lambda args: count_file(*args), work) for entry in found]
-    return {"nvcc": ".".join(map(str, nvcc_version(nvcc))), "kernels": kernels}
+    return {"nvcc": ".".join(map(str, nvcc_version(nvcc))), "sources": sources(), "kernels": kernels}
+
+
+def sources() -> dict[str, str]:
+    """Return the digest of every file of the kernels, by which it can be told what has changed since a count."""
+    found = (path for path in CSRC.iterdir() if path.suffix in (".cu", ".cuh", ".h"))
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in sorted(found)}
 
 
 def as_json(found: dict[str, Any]) -> str:
     """Lay out the counts, one kernel a line, so that a change shows as the kernels that it changes."""
     kernels = ",\n".join(json.dumps(entry) for entry in found["kernels"])
-    return f'{{"nvcc": {json.dumps(found["nvcc"])}, "kernels": [\n{kernels}\n]}}\n'
+    head = json.dumps({name: value for name, value in found.items() if name != "kernels"})
+    return f'{head[:-1]}, "kernels": [\n{kernels}\n]}}\n'
 
 
 def _text_of(entry: dict[str, Any]) -> list[str]:

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +88,30 @@ def results() -> dict[str, Any]:
 def test_notes_hold_the_tables_of_the_results_and_the_curves_of_preset_quick(script: Any) -> None:
     assert script("results_table").main(["--check"]) == 0, "run 'python benchmarks/results_table.py --write'"
     assert script("quick_curve").main(["--json", str(BENCHMARKS / "results" / "quick.json"), "--check"]) == 0
+
+
+def test_the_notes_and_the_page_of_speed_tell_in_words_what_their_tables_hold() -> None:
+    timed = read_json(BENCHMARKS / "results" / "cpu.json")
+    blends = [blend for case in timed["raster"] for blend in case["blend"]]
+    pairs, ratios = (
+        [blend[of][name] for blend in blends]
+        for of, name in (("forward_backward_ns_per_pair", "fast"), ("forward_backward_ms", "compiled / fast"))
+    )
+    notes, speed = ((ROOT / page).read_text(encoding="utf-8") for page in ("benchmarks/NOTES.md", "docs/speed.md"))
+    assert f"takes {min(pairs):.1f} to {max(pairs):.1f} ns per pair" in notes
+    assert f"with {timed['machine']['capability']}; the target was 3" in notes
+    assert f"compiled stages take {min(ratios):.2f} to {max(ratios):.2f} of its time" in notes
+    found = {
+        name: [case["engines"][name]["of_fair_share"] for case in timed["busy"]] for name in ("native", "compiled")
+    }
+    assert f"a native step takes {min(found['native']):.2f} to {max(found['native']):.2f} times its fair share" in speed
+    assert f"takes {min(found['compiled']):.1f} to {max(found['compiled']):.1f} times that share" in " ".join(
+        speed.split()
+    )
+    first = timed["first-step"]
+    helped, doctor = (first["commands"][f"pop {name}"]["wall_s"] for name in ("train --help", "doctor"))
+    said = f"on fox takes {first['first_step']['wall_s']:.1f} s; `pop train --help` takes {helped:.1f} s and"
+    assert f"{said} `pop doctor` {doctor:.1f} s" in speed
 
 
 def test_every_table_says_what_was_measured_and_what_was_not(script: Any) -> None:
@@ -224,6 +249,21 @@ def test_busy_processes_end_with_their_block_and_with_who_started_them(script, m
     assert (busy.fair_factor(2, 2), busy.fair_factor(1, 16)) == (5.0, 1.0)
 
 
+def test_nothing_is_timed_where_a_gradient_is_no_number(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = script("steps")
+    exact = steps.render_vjp
+
+    def broken(*arguments: Any) -> Any:
+        v = exact(*arguments)
+        return replace(v, quats=np.full_like(v.quats, np.nan))
+
+    monkeypatch.setattr(steps, "backends", lambda: ("fast",))
+    assert set(steps.gate()) == {"fast torch.float64", "fast torch.float32"}
+    monkeypatch.setattr(steps, "render_vjp", broken)
+    with pytest.raises(SystemExit, match="differs from the oracle by nan"):
+        steps.gate()
+
+
 def test_turns_change_order_and_keep_what_counts(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     timing, log = script("cases"), []
     clock = iter(range(1000))
@@ -320,8 +360,11 @@ def test_a_curve_is_read_between_its_points_and_nowhere_else(script: Any) -> Non
     assert math.isnan(quick.seconds_until(points, 30.1))
 
 
-def test_the_tables_of_quick_are_means_of_the_seeds_that_have_both(script: Any) -> None:
+def test_the_tables_of_quick_are_means_of_the_seeds_that_have_both(script: Any, tmp_path: Path) -> None:
     quick = script("quick_curve")
+    # runs that are not there do not empty the tables
+    with pytest.raises(SystemExit):
+        quick.main(["--json", str(tmp_path / "quikc.json"), "--write"])
 
     def run(seconds: float, psnr: float) -> list[dict[str, float]]:
         rest = {"ssim": 0.5, "gaussians": 1_000}
@@ -489,8 +532,9 @@ def test_the_laws_run_every_line_of_the_engine_that_computes_what_is_trained() -
     others = {name: lines for name, lines in left.items() if name not in NOT_JUDGED}
     assert all(TOLD.search(line) for lines in others.values() for line in lines), others
     assert counted["lines"] - counted["run"] == sum(map(len, left.values()))
-    said = f"Of the engine's {counted['lines']:,} lines the laws run {counted['run']:,}"
-    assert said in (ROOT / "docs" / "kit.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "kit.md").read_text(encoding="utf-8")
+    assert f"Of the engine's {counted['lines']:,} lines the laws run {counted['run']:,}" in page
+    assert f"engine_mutants --lines`, at commit {counted['commit']})" in page
 
 
 CONDITIONS = json.loads((BENCHMARKS / "results" / "conditions.json").read_text(encoding="utf-8"))

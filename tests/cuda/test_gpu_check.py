@@ -65,10 +65,15 @@ def test_a_stage_that_fails_takes_nothing_from_the_others(stages, tmp_path, caps
     assert found["complete"]
     assert list(found["stages"]) == ["build", "laws", "bench"]
     assert "the card fell off" in found["stages"]["laws"]["output"]
-    assert "laws: FAILED" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "laws: FAILED" in said
+    assert said.endswith("failed: laws; skipped: bench\n")
+    assert main([str(out), "--stages", "bench"]) == 0
+    assert capsys.readouterr().out.endswith("gpu_check_1.json: skipped: bench\n")
     # a later call fills the same file
     stages["laws"] = lambda check: {"status": 0, "seconds": 3.0}
     assert main([str(out), "--stages", "laws"]) == 0
+    assert capsys.readouterr().out.endswith("gpu_check_1.json: every stage ran\n")
     assert [stage["status"] for stage in report(out)["stages"].values()] == [0, 0, 0]
 
 
@@ -82,6 +87,8 @@ def test_results_go_where_the_environment_says(stages, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     with pytest.raises(SystemExit, match="is a file; name a folder"):
         main([str(tmp_path / "file"), "--stages", "build"])
+    with pytest.raises(SystemExit, match="x: Not a directory; name another folder"):
+        main([str(tmp_path / "file" / "x"), "--stages", "build"])
 
 
 def test_a_call_without_time_says_so_for_every_stage(stages, tmp_path):
@@ -294,14 +301,46 @@ def test_gsplat_that_was_not_compiled_is_told_and_is_no_failure(tmp_path):
     assert "nvcc does not know this" in found["compilation"]["output"]
 
 
-@pytest.mark.parametrize("stages_before", ["[]", '"x"', "null", '{"old": {"status": 0}}'])
-def test_a_report_of_an_earlier_call_is_gone_on_with_or_begun_anew(stages, tmp_path, stages_before):
-    (tmp_path / "gpu_check_1.json").write_text(f'{{"job": 1, "stages": {stages_before}}}')
+OLD = '{"old": {"status": 0}}'
+
+
+@pytest.mark.parametrize(
+    ("stages_before", "changed", "kept"),
+    [
+        *(("[]", {}, False), ('"x"', {}, False), ("null", {}, False), (OLD, {}, True)),
+        # what the emulator, another commit or another card came to is none of this call's
+        (OLD, {"rehearsal": True}, False),
+        (OLD, {"environment": {"commit": "beef"}}, False),
+    ],
+)
+def test_a_report_of_an_earlier_call_is_gone_on_with_or_begun_anew(
+    stages, tmp_path, monkeypatch, stages_before, changed, kept
+):
+    monkeypatch.setenv(gpu_check.COMMIT, "c0ffee")
+    before = {"job": 1, "rehearsal": False, "environment": {"commit": "c0ffee"}, "stages": json.loads(stages_before)}
+    (tmp_path / "gpu_check_1.json").write_text(json.dumps(before | changed))
     stages["laws"] = lambda check: {"status": 0, "seconds": 1.0}
     assert main([str(tmp_path), "--stages", "laws"]) == 0
     found = report(tmp_path)["stages"]
     assert found["laws"]["status"] == 0
-    assert ("old" in found) == ("old" in stages_before)
+    assert ("old" in found) == kept
+
+
+def test_counters_of_an_earlier_call_are_not_those_of_one_that_fails(tmp_path, monkeypatch):
+    write_json(tmp_path / "gpu_counters.json", {"kernels": ["old"]})
+    monkeypatch.setattr(gpu_check_stages.shutil, "which", lambda name: name)
+    monkeypatch.setattr(StageContext, "run", lambda *_: {"status": 1, "seconds": 1.0, "output": "ncu failed"})
+    assert gpu_check_stages.counters_stage(check(tmp_path))["results"] == {}
+
+
+def test_a_node_without_git_tells_its_commands_the_commit(tmp_path, monkeypatch):
+    monkeypatch.setattr(gpu_check_tools, "run", lambda words, limit, log, environment, stop: environment)
+    monkeypatch.setattr(gpu_check_tools, "ROOT", tmp_path)
+    assert check(tmp_path).run([], 1.0)["POP_COMMIT"] == "c0ffee"
+    assert "POP_COMMIT" not in check(tmp_path, commit="unknown").run([], 1.0)
+    # git also knows of changes
+    (tmp_path / ".git").mkdir()
+    assert "POP_COMMIT" not in check(tmp_path).run([], 1.0)
 
 
 def test_a_damaged_wheel_costs_no_other(tmp_path):

@@ -144,9 +144,23 @@ def test_what_is_missing_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch, ca
 
 def test_every_kernel_of_the_sources_is_committed_for_both_architectures() -> None:
     told = json.loads(COUNTS.read_text())["kernels"]
-    written = re.findall(r"__global__[^;{]*?(\w+_kernel)\(", "".join(p.read_text() for p in CSRC.glob("*.cu")))
+    files = {path.name: re.findall(r"__global__[^;{]*?(\w+_kernel)\(", path.read_text()) for path in CSRC.glob("*.cu")}
+    written = {(name, kernel) for name, kernels in files.items() for kernel in kernels}
     for arch in count_sass.ARCHS:
-        assert {entry["kernel"].split("<")[0] for entry in told if entry["arch"] == arch} == set(written)
+        found = {(entry["file"], entry["kernel"].split("<")[0]) for entry in told if entry["arch"] == arch}
+        assert found == written, "run 'make sass'"
+
+
+def test_the_notes_say_which_sources_have_changed_since_they_were_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(COUNTS.parents[1]))
+    import gpu_predictions
+
+    told = json.loads(COUNTS.read_text()) | {"sources": count_sass.sources()}
+    assert gpu_predictions.machine_code(told).endswith(f"\n\nCounted with nvcc {told['nvcc']}.")
+    was = told["sources"] | {"tiles.cuh": "", "a.cu": ""}
+    del was["step.cu"]
+    assert "Changed since: `a.cu`, `step.cu`, `tiles.cuh`." in gpu_predictions.machine_code(told | {"sources": was})
+    assert json.loads(count_sass.as_json(told)) == told
 
 
 def test_the_notes_hold_what_the_counts_give(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,15 +186,16 @@ def test_the_notes_hold_what_the_counts_give(monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.slow
 @pytest.mark.skipif(find_nvcc() is None or find_nvdisasm() is None, reason="no nvcc or no nvdisasm: nothing to count")
-def test_the_committed_counts_are_those_of_the_sources() -> None:
+@pytest.mark.parametrize("file", ["blend_forward", "tiles"])
+def test_the_committed_counts_are_those_of_the_sources(file: str) -> None:
     told = json.loads(COUNTS.read_text())
     nvcc, nvdisasm = find_nvcc(), find_nvdisasm()
     assert nvcc is not None
     assert nvdisasm is not None
-    found = count_sass.count(nvcc, nvdisasm, ["sm_90"], "blend_forward")
+    found = count_sass.count(nvcc, nvdisasm, ["sm_90"], file)
     if found["nvcc"] != told["nvcc"]:
         pytest.skip(f"the counts were taken with nvcc {told['nvcc']}, this is {found['nvcc']}")
-    same = [entry for entry in told["kernels"] if (entry["file"], entry["arch"]) == ("blend_forward.cu", "sm_90")]
+    same = [entry for entry in told["kernels"] if (entry["file"], entry["arch"]) == (f"{file}.cu", "sm_90")]
     assert found["kernels"] == same
 
 

@@ -60,6 +60,7 @@ def test_every_number_of_the_benchmark_is_measured(bench, gpu, monkeypatch, tmp_
 
     status, told = run(bench, monkeypatch, tmp_path / "bench.json")
     assert (status, list(told["cases"])) == (0, ["tiny"])
+    assert told.keys() >= {"commit", "gpu", "torch", "card"}
     found = told["cases"]["tiny"]
     assert all(math.isfinite(number) for number in numbers(found))
     loads = found["pixel_parallel_by_kernel"]["loads"]
@@ -88,7 +89,8 @@ def test_gsplat_is_measured_beside_the_same_case(bench, monkeypatch, tmp_path):
     for module in (bench, gpu_gsplat):
         monkeypatch.setattr(module, "kernel_sums", lambda run, calls=1: (run() and None) or {"kernels_ms": next(sums)})
     status, told = run(gpu_gsplat, monkeypatch, tmp_path / "beside.json")
-    assert (status, told["gsplat"]) == (0, "stand-in")
+    assert (status, told["gsplat"], told["gpu"]) == (0, "stand-in", "emulated")
+    assert told["commit"]
     found = told["cases"]["tiny"]
     ours, theirs = found["ours"], found["gsplat"]
     assert found["ratios"]["forward"] == theirs["forward_ms"] / ours["forward_ms"]
@@ -116,10 +118,10 @@ def test_what_fails_is_told_and_takes_nothing_from_the_rest(bench, monkeypatch, 
 
 def test_families_that_differ_are_told_beside_the_times(bench, monkeypatch):
     parts = bench.Record({}, lambda: None)
-    monkeypatch.setattr(bench, "families_differ", lambda scene, case: {"means": float("nan")})
+    monkeypatch.setattr(bench, "families_differ", lambda scene, case: {"means": 1e-6, "quats": float("nan")})
     monkeypatch.setattr(bench, "photograph_of", lambda scene, case: None)
     bench.measure(None, {}, None, parts)
-    assert "differ by nan" in parts.result["failed"]["families_differ"]
+    assert "differ by nan in quats" in parts.result["failed"]["families_differ"]
 
 
 def test_kernel_times_are_added_up_by_name(bench):
