@@ -229,7 +229,7 @@ KINDS: Final[dict[str, Kind]] = {
     "facade": Kind("a facade, 36 photographs along it", _facade, _SOUND, {}),
     "walk": Kind("a walk, a video of 8 seconds", _walk, _SOUND, {}, video=True),
     "moved": Kind(
-        "the object, beside which something moved",
+        "the object, next to which something moved",
         _moved,
         {"Fit": ("look", "bad"), "Exposure": ("good",)},
         {"Fit": "moved"},
