@@ -164,7 +164,7 @@ def _around(boxes: tuple[Box, ...] = _OBJECT) -> list[Photograph]:
 
 
 def _moved() -> list[Photograph]:
-    """The object, beside which something the size of a cat stands in another place in every photograph."""
+    """The object, next to which something the size of a cat stands in another place in every photograph."""
     generator = np.random.default_rng(3)
     return [
         Photograph(one.viewmat, (*one.boxes, Box((*generator.uniform(-1.3, 1.3, 2), 0.2), (0.35, 0.35, 0.4), 8)))
