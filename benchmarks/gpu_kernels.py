@@ -3,9 +3,10 @@
     python benchmarks/gpu_kernels.py out.json [--cases 270k_1.6MP] [--scenes packed/scenes/garden.npz ...]
 
 Correctness first: every case begins with the gradients of the two backward families, which must agree; where they do
-not, `failed` says so. Every part of a case is written when it is there, and one that raises takes nothing from the
-others. Times are medians of CUDA events after warm-up, in milliseconds; with each stands the sum of the kernels' own
-times by the profiler. Wall times of a step hold value checks, waits of the host and Python's own time; the profiler's
+not, `failed` says so. Every part of a case is written when it is there, and one that raises takes
+nothing from the others. Times are medians of CUDA events after warm-up, in milliseconds; with each stands the sum of
+the kernels' own times by the profiler, and with every kernel what it has to do at least and its floor on this card
+(`gpu_predictions`). Wall times of a step hold value checks, waits of the host and Python's own time; the profiler's
 sums compare kernels. `gpu_gsplat.py` adds gsplat's times.
 """
 
@@ -19,13 +20,15 @@ import traceback
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import torch
+from gpu_predictions import Card, Loads, elapsed_ms, floors, measured_card
 from gpu_scenes import CASES, FULL_SIZE, TINY, GpuCase, scenes
+from gpu_visits import count_tried, count_visits
 from torch import Tensor
 
 import cuda_ext
@@ -96,27 +99,23 @@ def step_kernels(scene: dict[str, Tensor], photograph: Tensor, steps: int, **set
     return kernel_sums(lambda: trainer.run(trainer.step + 1, PLAIN), calls=steps)
 
 
-def step_loads(trainer: FusedTrainer) -> dict[str, int]:
-    """Count what the trainer's last step had to do; it must have returned dominant Gaussians and counts.
-
-    Returns:
-        `gaussians`; `visible`, with an extent on the screen; `instances`, pairs of a splat and a 16 x 8 tile that it
-        reaches; `evaluated`, pairs of a list entry and a pixel up to where the last pixel of the tile stops;
-        `contributing`, those of them that are blended; `pixels`; `longest`, entries of one tile's list at most.
-    """
+def step_loads(trainer: FusedTrainer) -> Loads:
+    """Count what the trainer's last step had to do; it must have returned dominant Gaussians and counts."""
     ((size, stats),) = trainer.render_stats().items()
     width, height = size
     tiles = torch.nn.functional.pad(stats["n_traversed"], (0, -width % 16, 0, -height % 8)).view(-(-height // 8), 8, -1)
     longest = tiles.view(tiles.shape[0], 8, -1, 16).amax((1, 3))
-    return {
-        "gaussians": trainer.n,
-        "visible": int((trainer.splats["radii"] > 0).all(1).sum()),
-        "instances": trainer.n_instances,
-        "evaluated": int(longest.long().sum()) * 16 * 8,
-        "contributing": int(stats["n_blended"].long().sum()),
-        "pixels": width * height,
-        "longest": int(longest.max()),
-    }
+    return Loads(
+        trainer.n,
+        int((trainer.splats["radii"] > 0).all(1).sum()),
+        trainer.n_instances,
+        int(longest.long().sum()) * 16 * 8,
+        int(stats["n_blended"].long().sum()),
+        width * height,
+        int(longest.max()),
+        *count_visits(trainer.lists()[size], trainer.splats, stats["n_traversed"]),
+        count_tried(trainer.splats["means2d"], trainer.splats["radii"], width, height),
+    )
 
 
 @dataclass
@@ -159,7 +158,7 @@ def _timed_kernels() -> Iterator[_TimedKernels]:
 
 def kernel_times(
     scene: dict[str, Tensor], photograph: Tensor, steps: int, **settings: Any
-) -> tuple[dict[str, float], dict[str, int]]:
+) -> tuple[dict[str, float], Loads]:
     """Return the median time of every kernel of a POP step in ms, launched one by one, and what the step has to do."""
     trainer = make_trainer(scene, photograph, 2 * steps, replay=False, **settings)
     trainer.run(steps, POP)
@@ -216,16 +215,6 @@ def summed(events: Iterable[Any], calls: int) -> dict[str, Any]:
 # Cases, and what is written of them.
 
 
-def elapsed_ms(run: Callable[[], Any]) -> float:
-    """Time a run on the GPU, from what was asked before it to its own end."""
-    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-    start.record()
-    run()
-    end.record()
-    end.synchronize()
-    return start.elapsed_time(end)
-
-
 def timed(run: Callable[[], Any]) -> float:
     """Return the median time of a run in ms."""
     for _ in range(WARM_UP):
@@ -280,15 +269,18 @@ def photograph_of(scene: dict[str, Tensor], case: GpuCase) -> Tensor:
     return ((image + noise).clamp(0.0, 1.0) * 255.0).to(torch.uint8)
 
 
-def by_kernel(scene: dict[str, Tensor], photograph: Tensor, backward: str) -> dict[str, Any]:
-    """Time every kernel of a POP step, and count its work."""
+def by_kernel(scene: dict[str, Tensor], photograph: Tensor, card: Card, backward: str) -> dict[str, Any]:
+    """Time every kernel of a POP step, with its work and floor."""
     times, loads = kernel_times(scene, photograph, max(STEPS // 4, 1), backward=backward)
+    least = floors(loads, card)
+    pixels = loads.pixels
     return {
-        "loads": loads,
-        "evaluated_per_pixel": loads["evaluated"] / loads["pixels"],
-        "contributing_per_pixel": loads["contributing"] / loads["pixels"],
-        "kernels": {name: {"ms": ms} for name, ms in times.items()},
+        "loads": asdict(loads),
+        "evaluated_per_pixel": loads.evaluated / pixels,
+        "contributing_per_pixel": loads.contributing / pixels,
+        "kernels": {name: {"ms": ms, **least.get(name, {})} for name, ms in times.items()},
         "sum_ms": sum(times.values()),
+        "floor_ms": sum(entry["floor_ms"] for entry in least.values()),
     }
 
 
@@ -318,7 +310,7 @@ class Record:
         return found
 
 
-def measure(case: GpuCase, scene: dict[str, Tensor], record: Record) -> None:
+def measure(case: GpuCase, scene: dict[str, Tensor], card: Card, record: Record) -> None:
     """Measure one case, the parts that matter most first."""
     apart = record.part("families_differ", lambda: families_differ(scene, case))
     worst = max((apart or {}).values(), default=0.0)
@@ -328,7 +320,7 @@ def measure(case: GpuCase, scene: dict[str, Tensor], record: Record) -> None:
     if photograph is None:
         return
     for backward in BACKWARDS:
-        record.part(f"{backward}_by_kernel", lambda backward=backward: by_kernel(scene, photograph, backward))
+        record.part(f"{backward}_by_kernel", lambda backward=backward: by_kernel(scene, photograph, card, backward))
     for deterministic in (True, False):
         for backward in BACKWARDS:
             options = {"backward": backward, "deterministic": deterministic}
@@ -384,7 +376,9 @@ def main() -> int:
         return 2
     device = torch.device(args.device)
     results: dict[str, Any] = {"gpu": torch.cuda.get_device_name(), "torch": torch.__version__, "cases": {}}
-    return over_scenes(args, results, device, measure)
+    card = measured_card(device)
+    results["card"] = asdict(card)
+    return over_scenes(args, results, device, lambda case, scene, record: measure(case, scene, card, record))
 
 
 def over_scenes(

@@ -1,5 +1,6 @@
-"""Machine code: the parser on a fragment, samples laid on the lines of a source, tables of what a card measured."""
+"""Machine code: the parser on a fragment, samples laid on the lines of a source, floors that follow from counts."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -39,11 +40,25 @@ def test_source_lines_are_read_with_what_they_were_inlined_into() -> None:
     assert code.instructions[3].frames == (("a.cu", 2),)
 
 
-def test_the_notes_hold_what_was_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_notes_hold_what_counts_and_measurements_give(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "benchmarks"))
-    import gpu_tables
+    import gpu_predictions
 
-    assert gpu_tables.main(["--check"]) == 0
+    assert gpu_predictions.main(["--check"]) == 0
+    # twice the issue rate halves what is bound by it
+    slow = gpu_predictions.floors(gpu_predictions.CASE, gpu_predictions.H200)
+    card, case = gpu_predictions.H200, gpu_predictions.CASE
+    fast = gpu_predictions.floors(case, replace(card, instructions_per_s=2.0 * card.instructions_per_s))
+    assert fast["blend_backward"]["floor_ms"] == pytest.approx(slow["blend_backward"]["floor_ms"] / 2.0)
+    # a list that is long enough bounds the blend whatever the others are
+    long = gpu_predictions.floors(replace(case, longest=50_000), card)
+    assert (slow["blend_forward"]["bound"], long["blend_forward"]["bound"]) == ("issue", "longest list")
+    again = gpu_predictions.floors(replace(case, longest=100_000), card)
+    assert again["blend_forward"]["floor_ms"] == pytest.approx(2.0 * long["blend_forward"]["floor_ms"])
+    # what goes through the half-rate pipe is a part of what is issued
+    for name in ("blend_forward", "blend_backward"):
+        times = slow[name]["times_ms"]
+        assert 0.5 * times["half rate"] < times["issue"]
 
 
 # What a profile says of every instruction, laid on the source's lines.
