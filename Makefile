@@ -7,7 +7,7 @@ WORKERS ?= $(shell $(PYTHON) -c "import os; print((os.cpu_count() or 1) + 1)")
 TORCH := $(shell sed -n 's/^\(torch==.*\)/\1/p' constraints.txt)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo walkthrough repro site test test-all test-fast explore lint kit bench faults wheel cuda emulate gpu-check docs-check clean
+.PHONY: help setup demo walkthrough repro site test test-all test-fast explore lint kit bench faults wheel cuda sass emulate gpu-check docs-check clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1\t\2/p' Makefile | expand -t 20
@@ -92,6 +92,11 @@ wheel: setup  ## build both distributions into dist/, pop-splatting's with compi
 cuda: setup  ## compile the CUDA extension (needs nvcc; no GPU)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[cuda-build]'
 	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python -m cuda_ext.build
+
+sass: setup  ## count the kernels' machine instructions into benchmarks (needs nvcc; no GPU)
+	$(BIN)/python -m pip install --quiet -e '.[sass]'
+	$(BIN)/python -m cuda_ext.machine_code.count_sass --json benchmarks/results/sass.json
+	$(BIN)/python benchmarks/gpu_predictions.py --write
 
 emulate: setup  ## run the CUDA kernels' own source on the host, warp by warp: every law, training steps (minutes)
 	POP_CUDA_ON=emulated POP_EMULATED_LAWS=1 POP_CUDA_KINDS="pixel_parallel atomics gaussian_parallel" \

@@ -4,12 +4,13 @@
     python benchmarks/gpu_predictions.py --write    put them into NOTES.md, between their marks
     python benchmarks/gpu_predictions.py --check    exit with 1 when NOTES.md holds others
 
-The first is computed from counted instructions (`ISSUED`) and from the bytes of each kernel, for one case on an H200:
+The first holds counts (`results/sass.json`, made by `make sass`). The second is computed from them and from the bytes
+of each kernel, for one case on an H200:
 
     predicted = the largest time of `floors` / USED + NODE * nodes of the graph
 
-Next to it stands what `gpu_check` has measured (`results/gpu/kernels.json`), with the floor on that card. The second
-compares with gsplat (`results/gpu/gsplat.json`), the third is what the hardware's counters say of every kernel
+Beside it stands what `gpu_check` has measured (`results/gpu/kernels.json`), with the floor on that card. The third
+compares with gsplat (`results/gpu/gsplat.json`), the fourth is what the hardware's counters say of every kernel
 (`results/gpu/counters.json`). The last is `cuda_ext.training.batch_step.step_bytes`, which a test holds to what
 emulated ranks count.
 
@@ -64,23 +65,67 @@ BETWEEN = 100
 LEAST_SHOWN = 10.0  # us
 # of the blend, besides those of memory and issue
 OTHER_TIMES = ("half rate", "shared memory", "longest list")
+# the instantiations that training takes, and what else is compared with them
+SHOWN = {
+    "project_kernel<3, false>": "project",
+    "blend_forward_kernel<3, 0, false>": "blend forward",
+    "blend_forward_kernel<3, 1, false>": "blend forward with dominant ids",
+    "blend_forward_kernel<3, 2, false>": "the same with counts of splats",
+    "columns_kernel<3, false, false, false>": "blend backward, columns",
+    "columns_kernel<3, false, false, true>": "the same, atomic",
+    "splats_kernel<3, false, false, false>": "blend backward, splats",
+    "sum_slots_kernel": "sum of gradient slots",
+    "tile_order_kernel": "order of tiles",
+    "windows_kernel<true, false>": "loss, windows",
+    "pixels_kernel": "loss, pixels",
+    "update_kernel<3>": "update",
+}
 LANES_PER_SM = 128
 TILE_PIXELS = 128
 ROW = 48  # bytes of a packed splat, and of a gradient slot
 PARAMETERS = 59  # floats of a Gaussian
 GEOMETRY = 11  # of these, what a culled Gaussian is read for
+HALF_RATE = ("compare", "integer")  # classes of instructions, by the tables of arithmetic throughput for sm_90
 WARP, SCHEDULERS = 32, 4
-# what a warp issues for a unit of its kernel's loop without the loops in it, and of it comparisons, selections and
-# integers, whose pipe has half the rate on sm_90: counted in the machine code of commit 11906e5, by nvcc 13.0
-ISSUED = {
-    "blend_forward": {"visit": (91.25, 37.75), "32 records": (223.0, 65.0)},
-    "blend_backward": {"visit": (129.75, 33.0), "8 visits": (212.0, 53.0), "32 records": (253.0, 54.0)},
-}
-PER_TILE_COUNTED, PER_TILE_LISTED = 129.0, 67.0  # of `count_kernel` and `emit_kernel`, for 32 tiles
+SASS = read_json(NOTES.parent / "results" / "sass.json")
+# what a POP step launches
+FORWARD, BACKWARD = "blend_forward_kernel<3, 1, false>", "columns_kernel<3, false, false, false>"
+COUNT, EMIT = "count_kernel", "emit_kernel<unsigned short>"
+BLENDS = {"blend_forward": FORWARD, "blend_backward": BACKWARD}
 # cycles of shared memory: of a visit, three pieces of 16 bytes for each of four quarters, and going back a lane's 24
 # bytes of sums; of eight visits, these again and a row of 48 bytes, read and written; of a batch, 48 bytes a lane in
 # and, going back, 96 cleared and 96 read
 SHARED = {"blend_forward": (12, 0, 12), "blend_backward": (18, 72, 60)}
+
+
+def an_iteration(kernel: dict[str, Any]) -> str:
+    """Say what an iteration of a kernel's loop over visits, steps or slots issues, or what its whole body does."""
+    found: list[str] = []
+    # an update has a loop over slots too, and much besides
+    units = ("visit", "step", "8 visits", "16 slots", "32 slots", "32 records")
+    for unit in () if kernel["kernel"].startswith("update") else units:
+        # what is unrolled has several loops of one unit
+        if loops := [loop for loop in kernel["loops"] if loop["per"] == unit]:
+            least = min(loop["always"] / loop["iterations"] for loop in loops)
+            most = max(loop["all"] / loop["iterations"] for loop in loops)
+            found.append(f"{most:.0f} per {unit}" if most - least < 1.5 else f"{least:.0f} to {most:.0f} per {unit}")
+    return ", ".join(found) or f"{kernel['instructions']} in all, per {kernel['per']}"
+
+
+def machine_code(sass: dict[str, Any]) -> str:
+    """Make the table of counted instructions."""
+    head = "| kernel | instructions of a warp, sm_80 | sm_90 | registers | shared memory, bytes | warps a processor |"
+    lines = [head, "|---|---|---|---|---|---|"]
+    found = {(entry["kernel"], entry["arch"]): entry for entry in sass["kernels"]}
+    for kernel, title in SHOWN.items():
+        both = [found[kernel, arch] for arch in ("sm_80", "sm_90")]
+        registers, shared, warps = (
+            " / ".join(dict.fromkeys(str(one[name]) for one in both)) for name in ("registers", "shared", "warps")
+        )
+        lines.append(
+            f"| {title} | {an_iteration(both[0])} | {an_iteration(both[1])} | {registers} | {shared} | {warps} |"
+        )
+    return "\n".join(lines)
 
 
 def predictions() -> str:
@@ -163,8 +208,8 @@ def exchanged() -> str:
 
 def tables() -> dict[str, str]:
     """Make the tables, by their marks in NOTES.md."""
-    of_steps = {"predictions": predictions(), "beside gsplat": beside_gsplat()}
-    return {**of_steps, "counters": counters(), "ranks": exchanged()}
+    of_kernels = {"machine code": machine_code(SASS), "predictions": predictions(), "beside gsplat": beside_gsplat()}
+    return {**of_kernels, "counters": counters(), "ranks": exchanged()}
 
 
 def with_tables(text: str) -> str:
@@ -248,12 +293,23 @@ def _clock_hz() -> float:
     return 1e6 * float(printed[0]) if printed else 1e9
 
 
+def issued_per(kernel: str, unit: str) -> tuple[float, float]:
+    """Return what a warp issues for a unit of a kernel's loop, without the loops in it, and how much at half rate."""
+    (entry,) = (entry for entry in SASS["kernels"] if (entry["kernel"], entry["arch"]) == (kernel, "sm_90"))
+    (loop,) = (loop for loop in entry["loops"] if loop["per"] == unit)
+    half = sum(loop["always_by_class"].get(name, 0) for name in HALF_RATE)
+    return loop["all"] / loop["iterations"], half / loop["iterations"]
+
+
 def blend_work(name: str, loads: Loads) -> tuple[float, float, float]:
     """Return what a blend's warps issue altogether, how much of it at half rate, and their cycles of shared memory."""
     parts = {"visit": loads.visits, "8 visits": loads.eights, "32 records": loads.batches}
     issued = half = 0.0
-    for unit, (one, at_half) in ISSUED[name].items():
-        issued, half = issued + parts[unit] * one, half + parts[unit] * at_half
+    for unit, times in parts.items():
+        if unit == "8 visits" and name == "blend_forward":
+            continue
+        one, at_half = issued_per(BLENDS[name], unit)
+        issued, half = issued + times * one, half + times * at_half
     return issued, half, float(sum(cycles * times for cycles, times in zip(SHARED[name], parts.values(), strict=True)))
 
 
@@ -265,13 +321,13 @@ def work(loads: Loads) -> dict[str, tuple[float, float]]:
         # 36 bytes for the lists, and a packed splat where one is seen
         "project": (4 * (GEOMETRY * (n - seen) + PARAMETERS * seen) + 36 * n + ROW * seen, 0.0),
         # what a tile is tried by, a count for each splat and a bit for each tile that was tried
-        "count_tiles": ((32 + 4) * n + loads.tried / 8, PER_TILE_COUNTED * loads.tried),
+        "count_tiles": ((32 + 4) * n + loads.tried / 8, issued_per(COUNT, "32 tiles tried")[0] * loads.tried),
         # depths and extents read, four passes of an 8-byte pair over 32-bit depths
         "sort_by_depth": ((8 + 8 + 4 * 16) * n, 0.0),
         # the order read twice, counts read, first slots written
         "number_instances": (4 * 4 * n, 0.0),
         # emitted once, two passes of a 6-byte pair over 16-bit tiles, ids and slots written
-        "make_tile_lists": ((6 + 2 * 12 + 12) * entries, PER_TILE_LISTED * loads.tried),
+        "make_tile_lists": ((6 + 2 * 12 + 12) * entries, issued_per(EMIT, "32 tiles listed")[0] * loads.tried),
         "blend_forward": ((ROW + 4) * entries + 20 * pixels, WARP * blend_work("blend_forward", loads)[0]),
         # a pixel and channel: 215 for its window, 162 for its gradient
         "photometric": (8 * 12 * pixels, (215.0 + 162.0) * 3 * pixels),
@@ -286,7 +342,7 @@ def floors(loads: Loads, card: Card) -> dict[str, dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
     for name, (moved, issued) in work(loads).items():
         times = {"memory": moved / card.bytes_per_s, "issue": issued / card.instructions_per_s}
-        if name in ISSUED:
+        if name in BLENDS:
             of_warps, half, shared = blend_work(name, loads)
             times["half rate"] = 2.0 * WARP * half / card.instructions_per_s
             # lanes issue on four schedulers of a processor, which has one path to its shared memory

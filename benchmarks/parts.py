@@ -7,7 +7,7 @@ must read and write, at the rate of a pass over an array of that size.
 What is counted (`NativeTrainer.counts`, exact): Gaussians, list entries, chunks of sixteen entries, strips of sixteen
 pixels that an entry is blended into. What a strip or a chunk costs is read off `pop_fast/compiled`: arithmetic,
 comparisons and selections on vectors of sixteen floats; moves, broadcasts and loads are left out. What a Gaussian costs
-is the arithmetic in the machine code of the CUDA kernels whose functions the step calls (`PROJECTED`, `UPDATED`).
+is the arithmetic in the machine code of the CUDA kernels (`results/sass.json`), whose functions the step calls.
 
 A machine of more cores is simulated. A step is a row of works, each cut into parts that no thread changes
 (`pop_fast/compiled/threads.h`). One thread takes steps of which every part is timed, cut as for the threads of the
@@ -38,16 +38,15 @@ from typing import Any, Final
 
 import numpy as np
 from cases import Case, capture_of
+from record import read_json
 from steps import run_of_case
 
 from cuda_ext.toolkit import find_compiler, no_compiler
 from pop_fast.train.environment import reproducible
 from pop_fast.train.schedule import phase_at
 
+SASS: Final = Path(__file__).resolve().parent / "results" / "sass.json"
 TILE: Final = 16
-# arithmetic of a Gaussian by the degree of its harmonics, counted in the machine code for sm_90 of `project_kernel` and
-# `update_kernel` at commit 11906e5
-PROJECTED, UPDATED = (514, 583, 612, 655), (1215, 1435, 1510, 1646)
 # of a strip: f3 x^2 + linear x + constant; what is left of e after its integer, six terms, the integer, the scaling;
 # ceiling, floor and stop with their selections, T - T alpha, T alpha
 EXPONENT, POWER, TAKE = 2, 9, 8
@@ -110,7 +109,7 @@ def works(row: Mapping[str, Any]) -> dict[str, Work]:
     adam = n * numbers * 24  # three arrays, read and written
     return {
         "project": Work(
-            visible * PROJECTED[degree] / LANES,
+            visible * _of_gaussian(f"project_kernel<{degree}, false>") / LANES,
             4 * (n * SHORT + visible * rest) + n * SEEN + visible * SPLAT,
         ),
         "list": Work(0, visible * (8 * 9 + 2 * SEEN) + entries * LISTED),
@@ -119,7 +118,7 @@ def works(row: Mapping[str, Any]) -> dict[str, Work]:
         "image_gradient": Work(channels * (TAPS + SLOPE) / LANES, 24 * channels),
         "transpose": Work(back, lists + 4 * COLUMNS * entries + 4 * channels),
         "update": Work(
-            (visible * UPDATED[degree] + (n - visible) * numbers * ADAM) / LANES,
+            (visible * _of_gaussian(f"update_kernel<{degree}>") + (n - visible) * numbers * ADAM) / LANES,
             adam + n * SEEN + 4 * COLUMNS * entries,
         ),
     }
@@ -145,6 +144,12 @@ def floors(row: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
                 f"{part} took {ms:.2f} ms, and {bound} alone need {by[bound]:.2f}: peak.cpp measures too little"
             )
     return found
+
+
+def _of_gaussian(kernel: str) -> int:
+    """Return the arithmetic instructions that a kernel spends on a Gaussian, in machine code for sm_90."""
+    classes = next(k["by_class"] for k in read_json(SASS)["kernels"] if (k["kernel"], k["arch"]) == (kernel, "sm_90"))
+    return int(classes["float"] + classes.get("special", 0))
 
 
 @cache

@@ -10,7 +10,7 @@
 //
 // Both are bounded by the issue of instructions: columns by four pixels a lane, about four fifths, and the sums over
 // lanes; splats by what a pair costs and by the steps that fill and drain a warp. sum_slots is bounded by the latency of
-// memory, a few rows a splat. Counts: benchmarks/NOTES.md.
+// memory, a few rows a splat. Counts: benchmarks/NOTES.md, `make sass`.
 
 #include "warp_sums.cuh"
 

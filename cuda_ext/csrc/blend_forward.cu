@@ -3,7 +3,7 @@
 //
 // Bounded by the issue of instructions: a record is read from shared memory by eight lanes at once, and what is left is
 // arithmetic on registers, half of it multiplications and additions. Next to it stands the special function unit, which
-// takes eight cycles for the exponentials of a warp. Counts: benchmarks/NOTES.md.
+// takes eight cycles for the exponentials of a warp. Counts: benchmarks/NOTES.md, `make sass`.
 
 #include "quarters.cuh"
 

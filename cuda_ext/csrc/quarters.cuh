@@ -2,7 +2,7 @@
 // a quarter is left out there: every quarter goes through its own queue of a batch, all four in the same instructions,
 // so that a warp makes as many visits as the longest queue has splats, rounded up to four. In the case that times are
 // predicted for these are 77 for 100 entries, and queues take about 8 of the 79 instructions an entry of the forward
-// pass. Both are counted by benchmarks/gpu_visits.py.
+// pass. Both are counted by benchmarks/gpu_visits.py and `make sass`.
 //
 // What is left out blends nothing and has no gradient, so that no bit depends on it.
 #pragma once

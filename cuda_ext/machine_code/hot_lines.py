@@ -13,11 +13,6 @@ from __future__ import annotations
 import argparse
 import csv
 import gzip
-import importlib.util
-import os
-import re
-import shutil
-import subprocess
 import sys
 import tempfile
 from collections import Counter, defaultdict
@@ -27,32 +22,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cuda_ext.machine_code.check_ptxas import CSRC, compile_and_read, is_own
+from cuda_ext.machine_code.count_sass import NO_NVCC, NO_NVDISASM, Code, Instruction, disassemble, find_nvdisasm
 from cuda_ext.toolkit import find_nvcc
 
 SAMPLES, EXECUTED = "# Samples", "Instructions Executed"
 STALL, NOT_ISSUED = "stall_", "(Not Issued)"
-NO_NVCC = "nvcc was not found; install a CUDA toolkit or set CUDACXX"
-NO_NVDISASM = (
-    "nvdisasm was not found; install the extra that brings it, pip install 'pop-splatting[sass]', or a CUDA toolkit"
-)
-Frame = tuple[str, int]
-_SECTION = re.compile(r"^\s*\.section\s+\.text\.(\w+)")
-_FRAME = re.compile(r'//## File "([^"]+)", line (\d+)')
-_INSTRUCTION = re.compile(r"^\s*/\*[0-9a-f]+\*/\s+(?:@!?U?P\w+\s+)?([A-Z][\w.]*).*;")
-
-
-class Instruction(NamedTuple):
-    """An instruction as it is compiled here: opcode, and the source lines that it is of, innermost first."""
-
-    opcode: str
-    frames: tuple[Frame, ...]
-
-
-class Code(NamedTuple):
-    """A kernel's name and instructions."""
-
-    name: str
-    instructions: list[Instruction]
 
 
 class Profiled(NamedTuple):
@@ -71,54 +45,6 @@ class Line:
     samples: int = 0
     executed: int = 0
     stalls: Counter[str] = field(default_factory=Counter)
-
-
-def find_nvdisasm() -> str | None:
-    """Return the path of nvdisasm: the PATH, next to nvcc, or inside the package triton; or None."""
-    nvcc = find_nvcc()
-    candidates = [Path(shutil.which("nvdisasm") or "")]
-    if nvcc is not None:
-        candidates.append(Path(nvcc).resolve().parent / "nvdisasm")
-    # looked up, not imported: triton is large, and only its folder is asked for
-    package = importlib.util.find_spec("triton")
-    for folder in (package.submodule_search_locations or []) if package is not None else []:
-        candidates.append(Path(folder) / "backends" / "nvidia" / "bin" / "nvdisasm")
-    found = (str(one) for one in candidates if one.is_file() and os.access(one, os.X_OK))
-    return next(found, None)
-
-
-def disassemble(nvdisasm: str, cubin: Path) -> list[Code]:
-    """Disassemble one object with the source lines of every instruction.
-
-    Raises:
-        RuntimeError: it cannot be read; nvdisasm's words are in the message.
-    """
-    done = subprocess.run([nvdisasm, "-c", "-gi", str(cubin)], capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise RuntimeError(f"nvdisasm cannot read {cubin.name}:\n{done.stderr}")
-    return parse_sass(done.stdout)
-
-
-def parse_sass(text: str) -> list[Code]:
-    """Read the kernels of `nvdisasm -c -gi`."""
-    found: list[Code] = []
-    frames: list[Frame] = []
-    in_frames = False
-    for line in text.splitlines():
-        if match := _SECTION.match(line):
-            found.append(Code(match.group(1), []))
-            frames, in_frames = [], False
-        elif not found:
-            continue
-        elif match := _FRAME.search(line):
-            # consecutive lines are one stack, innermost first
-            frames = frames if in_frames else []
-            frames.append((match.group(1).rsplit("/", 1)[-1], int(match.group(2))))
-            in_frames = True
-        elif match := _INSTRUCTION.match(line):
-            found[-1].instructions.append(Instruction(match.group(1), tuple(frames)))
-            in_frames = False
-    return found
 
 
 def read_profile(lines: Iterable[str]) -> dict[str, list[Profiled]]:

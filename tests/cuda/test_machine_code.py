@@ -1,14 +1,31 @@
-"""Machine code: the parser on a fragment, samples laid on the lines of a source, floors that follow from counts."""
+"""Instruction counts from machine code: the parser on a fragment whose counts are plain to see; the committed file."""
 
+import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from cuda_ext.machine_code import hot_lines
-from cuda_ext.machine_code.hot_lines import parse_sass
+from cuda_ext.machine_code import count_sass, hot_lines
+from cuda_ext.machine_code.check_ptxas import CSRC, KernelUse
+from cuda_ext.machine_code.count_sass import (
+    CLASSES,
+    PROCESSORS,
+    Flow,
+    class_of,
+    find_loops,
+    find_nvdisasm,
+    kernel_entry,
+    loop_line,
+    outside_loops,
+    parse_sass,
+    warps_per_processor,
+)
+from cuda_ext.toolkit import find_nvcc
 
-# nvdisasm -c -gi of a loop that adds where a pixel is hit
+COUNTS = Path(__file__).resolve().parents[2] / "benchmarks" / "results" / "sass.json"
+# nvdisasm -c -gi of a loop that looks every so often whether to stop, and adds where a pixel is hit
 FRAGMENT = """
 	.section	.text._ZN3pop20blend_forward_kernelE,"ax",@progbits
 .text._ZN3pop20blend_forward_kernelE:
@@ -20,28 +37,120 @@ FRAGMENT = """
 .L_x_1:
 	//## File "/somewhere/a.cu", line 2
         /*0030*/                   LOP3.LUT P0, RZ, R20, 0x7, RZ, 0xc0, !PT ;
+        /*0040*/                   BSSY B2, `(.L_x_3) ;
+        /*0050*/               @P0 BRA `(.L_x_2) ;
+        /*0060*/                   BRA.DIV UR6, `(.L_x_9) ;
+        /*0070*/                   VOTE.ANY P0, P0 ;
+.L_x_8:
+        /*0080*/              @!P0 BRA `(.L_x_7) ;
+.L_x_2:
+        /*0090*/                   BSYNC B2 ;
+.L_x_3:
 	//## File "/somewhere/a.cu", line 3
         /*00a0*/                   LDS.128 R16, [R22] ;
+        /*00b0*/                   FFMA R18, R12, R51, R23 ;
         /*00c0*/               @P0 BRA `(.L_x_5) ;
+        /*00d0*/                   MUFU.EX2 R22, -R51 ;
+        /*00e0*/                   FMUL R22, R13, R22 ;
         /*00f0*/               @P0 FFMA R6, R15, R22.reuse, R6 ;
 .L_x_5:
 	//## File "/somewhere/a.cu", line 2
+        /*0100*/                   VIADD R20, R20, 0x1 ;
+        /*0110*/                   ISETP.GE.AND P0, PT, R20, R21, PT ;
         /*0120*/              @!P0 BRA `(.L_x_1) ;
+.L_x_7:
         /*0130*/                   STG.E desc[UR4][R16.64+0x4], R41 ;
+        /*0140*/                   NOP ;
+        /*0150*/                   EXIT ;
+.L_x_9:
+        /*0160*/                   WARPSYNC.COLLECTIVE R12, `(.L_x_8) ;
+        /*0170*/                   BRA `(.L_x_8) ;
+.L_x_10:
         /*0180*/                   BRA `(.L_x_10);
 """
+SOURCES = {"a.cu": ["__global__ void f() {", "for (;;) {  // per record", "} }"]}
+
+
+def test_a_loop_is_counted_by_what_is_always_issued_and_what_may_be_skipped() -> None:
+    (code,) = parse_sass(FRAGMENT)
+    flow = Flow(code)
+    (loop,) = find_loops(flow)
+    assert loop.always == {"integer": 2, "branch": 5, "shared": 1, "float": 1, "compare": 1}
+    # the path of diverged warps is nowhere: neither WARPSYNC nor the jump back
+    assert {(r.kind, sum(r.counts.values())) for r in loop.regions} == {("look", 3), ("exponential", 3)}
+    assert sum(loop.total.values()) == 16
+    assert loop.exponentials == 1
+    assert outside_loops(flow, [loop]) == {"move": 1, "compare": 1, "branch": 2, "global": 1}
+    assert loop_line(loop, SOURCES) == ("a.cu", 2, "for (;;) {  // per record")
 
 
 def test_source_lines_are_read_with_what_they_were_inlined_into() -> None:
     (code,) = parse_sass(FRAGMENT)
-    opcodes = "S2R ISETP.GE.AND EXIT LOP3.LUT LDS.128 BRA FFMA BRA STG.E BRA"
-    assert [one.opcode for one in code.instructions] == opcodes.split()
     assert code.instructions[0].frames == (("a.cuh", 4), ("a.cu", 1))
     assert code.instructions[3].frames == (("a.cu", 2),)
 
 
-def test_the_notes_hold_what_counts_and_measurements_give(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "benchmarks"))
+def test_an_entry_names_its_loops_and_the_kernel() -> None:
+    (code,) = parse_sass(FRAGMENT)
+    use = KernelUse("a.cu", "blend_forward_kernel<3, false, false>", "sm_90", 56, 6144, 0, 0, 0)
+    entry = kernel_entry(code, use, SOURCES)
+    assert (entry["per"], entry["warps"], entry["outside_loops"]) == ("tile", 36, 5)
+    (loop,) = entry["loops"]
+    assert (loop["per"], loop["loop"], loop["iterations"]) == ("record", "a.cu: for (;;)", 1)
+    with pytest.raises(RuntimeError, match=r"a\.cu: add other_kernel to"):
+        kernel_entry(code, KernelUse("a.cu", "other_kernel", "sm_90", 1, 0, 0, 0, 0), SOURCES)
+
+
+OPCODES = {
+    "REDUX.MAX": "vote",
+    "RED.E.ADD": "global",
+    "LDC.64": "constant",
+    "LDG.E": "global",
+    "STS.128": "shared",
+    "ULDC": "uniform",
+    "SHFL.BFLY": "shuffle",
+    "SHF.L.U32": "integer",
+    "IMAD.MOV.U32": "multiply",
+    "Q": "other",
+}
+
+
+@pytest.mark.parametrize(("opcode", "name"), OPCODES.items())
+def test_classes(opcode: str, name: str) -> None:
+    assert class_of(opcode) == name
+    assert name in CLASSES
+
+
+def test_warps_that_fit() -> None:
+    hopper = PROCESSORS["sm_90"]
+    # registers: 64 x 32 a warp, 65,536 in all; shared memory: 1 KiB a block is the system's; the most there are
+    assert warps_per_processor(64, 0, 128, hopper) == 32
+    assert warps_per_processor(120, 17920, 128, hopper) == 16
+    assert warps_per_processor(16, 45 << 10, 128, hopper) == 16
+    assert warps_per_processor(16, 0, 128, hopper) == 64
+
+
+def test_what_is_missing_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    monkeypatch.setattr("sys.argv", ["count_sass"])
+    monkeypatch.setattr(count_sass, "find_nvcc", lambda: "nvcc")
+    monkeypatch.setattr(count_sass, "find_nvdisasm", lambda: None)
+    assert count_sass.main() == 2
+    told = r"count_sass: nvdisasm was not found; install .*'pop-splatting\[sass\]'.*\n"
+    assert re.fullmatch(told, capsys.readouterr().err)
+    monkeypatch.setattr(count_sass, "find_nvcc", lambda: None)
+    assert count_sass.main() == 2
+    assert capsys.readouterr().err == f"count_sass: {count_sass.NO_NVCC}\n"
+
+
+def test_every_kernel_of_the_sources_is_committed_for_both_architectures() -> None:
+    told = json.loads(COUNTS.read_text())["kernels"]
+    written = re.findall(r"__global__[^;{]*?(\w+_kernel)\(", "".join(p.read_text() for p in CSRC.glob("*.cu")))
+    for arch in count_sass.ARCHS:
+        assert {entry["kernel"].split("<")[0] for entry in told if entry["arch"] == arch} == set(written)
+
+
+def test_the_notes_hold_what_the_counts_give(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(COUNTS.parents[1]))
     import gpu_predictions
 
     assert gpu_predictions.main(["--check"]) == 0
@@ -61,6 +170,20 @@ def test_the_notes_hold_what_counts_and_measurements_give(monkeypatch: pytest.Mo
         assert 0.5 * times["half rate"] < times["issue"]
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(find_nvcc() is None or find_nvdisasm() is None, reason="no nvcc or no nvdisasm: nothing to count")
+def test_the_committed_counts_are_those_of_the_sources() -> None:
+    told = json.loads(COUNTS.read_text())
+    nvcc, nvdisasm = find_nvcc(), find_nvdisasm()
+    assert nvcc is not None
+    assert nvdisasm is not None
+    found = count_sass.count(nvcc, nvdisasm, ["sm_90"], "blend_forward")
+    if found["nvcc"] != told["nvcc"]:
+        pytest.skip(f"the counts were taken with nvcc {told['nvcc']}, this is {found['nvcc']}")
+    same = [entry for entry in told["kernels"] if (entry["file"], entry["arch"]) == ("blend_forward.cu", "sm_90")]
+    assert found["kernels"] == same
+
+
 # What a profile says of every instruction, laid on the source's lines.
 
 
@@ -70,7 +193,7 @@ def profile_of(instructions, samples):
     head += ["stall_wait (Not Issued)"]
     rows = []
     for k, (one, n) in enumerate(zip(instructions, samples, strict=True)):
-        source = f"@!P0 {one.opcode}  R1" if k % 2 else f"      {one.opcode} R1"
+        source = f"@{one.predicate} {one.opcode}  {one.operands}" if one.predicate else f"      {one.opcode} R1"
         rows.append([f"0x7f{k:02x}", source, n, 10, n, 0, 99])
     table = [["Kernel Name", "void pop::<unnamed>::blend_kernel<(int)3>(int)", ""], head, *rows]
     return [",".join(f'"{value}"' for value in row) for row in (*table, *table)]
@@ -101,7 +224,7 @@ def test_another_source_than_the_profiled_one_is_told():
         hot_lines.by_line(profiled, code.instructions[:-1])
 
 
-def test_a_profile_that_is_none_and_a_missing_tool_are_told_in_a_line(tmp_path, capsys, monkeypatch):
+def test_a_profile_that_is_none_is_told_in_a_line(tmp_path, capsys):
     path = tmp_path / "lines.csv"
     path.write_text("no,table\n")
     assert hot_lines.main([str(path)]) == 1
@@ -112,10 +235,3 @@ def test_a_profile_that_is_none_and_a_missing_tool_are_told_in_a_line(tmp_path, 
     assert f"{2 * len(code.instructions)} samples  void pop" in capsys.readouterr().out
     assert hot_lines.main([str(path), "--kernel", "missing"]) == 1
     assert "0 kernels have 'missing' in their names" in capsys.readouterr().err
-    monkeypatch.setattr(hot_lines, "find_nvcc", lambda: "nvcc")
-    monkeypatch.setattr(hot_lines, "find_nvdisasm", lambda: None)
-    assert hot_lines.main([str(path), "--kernel", "blend"]) == 1
-    assert f"hot_lines: {path}: nvdisasm was not found; install" in capsys.readouterr().err
-    monkeypatch.setattr(hot_lines, "find_nvcc", lambda: None)
-    assert hot_lines.main([str(path), "--kernel", "blend"]) == 1
-    assert capsys.readouterr().err == f"hot_lines: {path}: {hot_lines.NO_NVCC}\n"
