@@ -36,7 +36,7 @@ Times = tuple[float, ...]
 
 
 class Checkout:
-    """The package as one checkout has it, beside any other that is loaded already."""
+    """The package of one checkout, next to any other that is loaded already."""
 
     def __init__(self, root: Path) -> None:
         """Import from a checkout.

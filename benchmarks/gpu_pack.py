@@ -72,7 +72,7 @@ def pack_scene(run: Path, folder: Path) -> Path:
 
 
 def pack_capture(source: Path, folder: Path, pixels: float) -> Path:
-    """Write a capture with photographs of at most so many pixels, undistorted, as JPEG beside a COLMAP text model.
+    """Write a capture with photographs of at most so many pixels, undistorted, as JPEG with a COLMAP text model.
 
     Raises:
         CaptureError: the capture cannot be read.

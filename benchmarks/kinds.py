@@ -164,7 +164,7 @@ def _around(boxes: tuple[Box, ...] = _OBJECT) -> list[Photograph]:
 
 
 def _moved() -> list[Photograph]:
-    """The object, beside which something the size of a cat stands in another place in every photograph."""
+    """The object, next to which something the size of a cat stands in another place in every photograph."""
     generator = np.random.default_rng(3)
     return [
         Photograph(one.viewmat, (*one.boxes, Box((*generator.uniform(-1.3, 1.3, 2), 0.2), (0.35, 0.35, 0.4), 8)))
@@ -229,7 +229,7 @@ KINDS: Final[dict[str, Kind]] = {
     "facade": Kind("a facade, 36 photographs along it", _facade, _SOUND, {}),
     "walk": Kind("a walk, a video of 8 seconds", _walk, _SOUND, {}, video=True),
     "moved": Kind(
-        "the object, beside which something moved",
+        "the object, next to which something moved",
         _moved,
         {"Fit": ("look", "bad"), "Exposure": ("good",)},
         {"Fit": "moved"},

@@ -146,7 +146,7 @@ class SideStream:
 
     @contextmanager
     def beside(self) -> Iterator[None]:
-        """Ask for what follows beside what the current stream is asked for next, after what it was asked for before."""
+        """Run what follows in parallel with the current stream's next work, after its earlier work."""
         if self._stream is None:
             yield
             return

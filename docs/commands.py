@@ -298,8 +298,9 @@ def with_sections_of(names: list[str], text: str) -> str:
 
 _HEAD = """# Every command
 
-One run of each on the demo capture, with what it printed, next to other programs, so that times are longer than they
-need be; `pop COMMAND --help` has its options. What to do in which order is in [the guide](guide.md). `photos` holds the
+This page shows one run of each command on the demo capture, with its output. Other programs ran at the same time, so
+the times are longer than on an idle machine. `pop COMMAND --help` lists the options of a command.
+[The guide](guide.md) says in which order to use the commands. The folder `photos` contains the
 demo's photographs alone, without their cameras.
 `python docs/commands.py --write` makes this page."""
 

@@ -62,10 +62,10 @@ MUTANT_HEAD = """# Mutants
 
 Made by `python docs/tables.py --write`; a test holds it to the code.
 
-{n} copies of the oracle and {programs} of the program that trains, each with one line broken as somebody once broke it.
-A kit that lets one live is not worth its time, so for each a law is named that breaks on it within the `ci` profile;
-`tests/meta/test_mutants.py` tries them all. `python -m pop_ref.conformance.mutants` puts them on trial again, `--every`
-lists all laws that notice.
+This page lists {n} copies of the oracle and {programs} of the program that trains. Each copy has one line broken.
+For each the table names a law that fails on it within the `ci` profile, and
+`tests/meta/test_mutants.py` tries them all. `python -m pop_ref.conformance.mutants` tries them again, and `--every`
+lists all laws that fail.
 
 """
 
@@ -73,8 +73,8 @@ BOX_HEAD = """
 
 ## Behind gsplat's signature
 
-{n} rasterizers that draw one small view rightly and break one argument around it, or two together, judged as any
-`--rasterizer` is: by what they return alone.
+These {n} rasterizers draw one small view correctly, and handle one argument or a combination of two wrongly. They are
+judged as any `--rasterizer` is, by their results alone.
 
 """
 RECIPE_NOTES = {

@@ -2,7 +2,7 @@
 
 A step's own record is of the one view that it trained on, and engines that take the whole step at once neither count
 what a pixel visits nor take the losses apart. So the same views are rendered every so often, and what they say is kept
-beside the records; figures 4a and 4b are made of it. The training itself is not touched, and its seconds do not
+next to the records; figures 4a and 4b are made of it. The training itself is not touched, and its seconds do not
 contain this.
 """
 

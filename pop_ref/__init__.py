@@ -1,10 +1,5 @@
 """The oracle: rendering, gradients, dominance, losses and density control, exactly and slowly, in NumPy float64."""
 
-import sys
-import warnings
-from types import ModuleType
-from typing import Any
-
 from pop_ref.constants import (
     DECISIONS,
     GSPLAT_1_5,
@@ -46,23 +41,3 @@ __all__ = [
     "Margins",
     "CloseDecision",
 ]
-
-
-class _Records(ModuleType):
-    """The module `pop_ref.types` of older code: a file of that name shadows the standard library's."""
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__"):
-            raise AttributeError(name)
-        warnings.warn("pop_ref.types is now pop_ref.records", DeprecationWarning, stacklevel=2)
-        return getattr(sys.modules["pop_ref.records"], name)
-
-
-sys.modules["pop_ref.types"] = _Records("pop_ref.types")
-
-
-def __getattr__(name: str) -> Any:
-    if name != "Doubt":
-        raise AttributeError(f"module 'pop_ref' has no attribute {name!r}")
-    warnings.warn("pop_ref.Doubt is now pop_ref.CloseDecision", DeprecationWarning, stacklevel=2)
-    return CloseDecision

@@ -1,7 +1,7 @@
 """One splat at one pixel: exponent, falloff, alpha, and their transposes, as scalars.
 
 These are the innermost formulas. They are written on Python floats, one statement a step, so that a compiled
-implementation can be read beside them line by line.
+implementation can be read next to them line by line.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ from pop_ref.conformance.scenes import save_scene
 from pop_ref.conformance.vectors import export
 
 ARCHIVE = Path(__file__).resolve().with_name("corpus.zip")
-# beside the files: the digest of the archive that they are from
+# next to the files: the digest of the archive that they are from
 _STAMP = ".archive"
 WIDTH, HEIGHT, FOCAL, VIEWS, POINTS = 24, 16, 20.0, 3, 12
 
@@ -306,7 +306,7 @@ def _write_blocks(folder: Path) -> None:
 
 
 def _write_records(result: Path, folder: Path) -> None:
-    """Write what lies in a result beside a run's first files, and records of other commands."""
+    """Write what a result holds besides a run's first files, and records of other commands."""
     step = 3
     (result / "commands.json").write_text(json.dumps([{"words": ["pop", "train", "colmap"], "folder": "."}], indent=2))
     (result / "row.json").write_text(json.dumps({"data_hash": "0" * 64, "commit": "0" * 40, **_PROTOCOL}))

@@ -35,7 +35,7 @@ class DrawProgram:
         self._photographs, self._objective = shared.views.photographs(), _objective(phase)
         self._loss = _loss(shared, frame)
         self._forward, self._backward = _blends(shared, drawn, frame, phase)
-        # where nothing is replayed, single kernels are told apart by time, so that none runs beside another there
+        # where nothing is replayed, single kernels are told apart by time, so that no two run at once
         self.side = SideStream(shared.device, used=shared.settings.replay)
         self.counts: Tensor | None = frame.render_stats["dominant_counts"] if phase.dominance else None
 

@@ -19,7 +19,7 @@ FIGURES: Final = {
     "3": ("artifact", "six_panels", "What becomes of 3DGS when every opacity is pushed to 1"),
     "4a": ("curves", "gradients_of_losses", "Gradients of the losses"),
     "4b": ("curves", "gaussians_per_pixel", "Gaussians per pixel"),
-    "5": ("qualitative", "renders_and_photographs", "Renders beside the photographs"),
+    "5": ("qualitative", "renders_and_photographs", "Renders next to the photographs"),
     "6a": ("curves", "count_under_losses", "Gaussians under different losses"),
     "6b": ("tradeoffs", "psnr_against_count", "PSNR against the number of Gaussians"),
     "7": ("curves", "count_of_methods", "Gaussians of every method"),

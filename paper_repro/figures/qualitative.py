@@ -1,4 +1,4 @@
-"""Figure 5: renders of held-out views by POP and 3DGS beside the photographs, with the place where they differ most.
+"""Figure 5: renders of held-out views by POP and 3DGS next to the photographs, with the place where they differ most.
 
 The renders are those that a run keeps in its work folder. Photographs of captures appear in this figure, so it is drawn
 where the captures are, and only that of the demo capture, which is ray-traced, belongs into the repository.

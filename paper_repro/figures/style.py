@@ -184,7 +184,7 @@ class End:
 def label_ends(axes: Axes, ends: Sequence[End]) -> None:
     """Write names to the right of the axes, at the heights of the curves' ends, moved apart where they would touch.
 
-    A thin line leads from a curve to its name where the name is not beside its end.
+    A thin line leads from a curve to its name where the name is not next to its end.
 
     Args:
         axes: whose limits and place are settled.

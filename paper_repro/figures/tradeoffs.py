@@ -223,7 +223,7 @@ def _plane(axes: Axes, points: Sequence[_Point], label: str, room: float) -> Non
     """Settle the axes around points, with some room for their names."""
     xs, ys = [p.x for p in points], [p.y for p in points]
     stretch = max((max(xs) / min(xs)) ** room, 1.08)
-    # names stand beside their markers where they can
+    # names stand next to their markers where they can
     low, high = min(xs) / stretch**2.0, max(xs) * stretch**2.0
     axes.set_xscale("log")
     axes.set_xlim(low, high)
@@ -236,7 +236,7 @@ def _plane(axes: Axes, points: Sequence[_Point], label: str, room: float) -> Non
 
 
 def _name(axes: Axes, points: Sequence[_Point], joined: Sequence[str] = ()) -> None:
-    """Write each point's name beside its marker.
+    """Write each point's name next to its marker.
 
     Args:
         axes: whose limits and place are settled.

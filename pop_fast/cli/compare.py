@@ -30,7 +30,7 @@ class Args(CaptureArguments):
     """Put several results side by side: quality, Gaussians, Gaussians per pixel, opacities, seconds.
 
     Of a result folder these are the numbers that its training left. The file of a splat is measured; the options say on
-    which photographs, by default those that the results beside it were trained on, in the same way.
+    which photographs, by default those of the results that are compared with it.
     """
 
     results: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|FILE [RESULT|FILE ...]")]
@@ -76,7 +76,7 @@ def _of_file(path: Path, runs: Sequence[Path], args: Args) -> dict[str, Any]:
 
 
 def _photographed_as(splat: Splat, runs: Sequence[Path]) -> Splat:
-    """Return a file's splat with what all runs beside it agree on about their photographs."""
+    """Return a file's splat with what all runs that it is compared with agree on about their photographs."""
     configs = [read_config(run) for run in runs]
     records = [replace(read_record(run) or CaptureRecord(), chosen=[]) for run in runs]
     agreed = {name: getattr(configs[0], name) for name in _PHOTOGRAPHS if configs}

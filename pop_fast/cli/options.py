@@ -51,7 +51,7 @@ class LimitOptions:
         crop: keep those with their centres in the box XMIN YMIN ZMIN XMAX YMAX ZMAX, in the capture's own world frame.
         without_floaters: leave out those that stand, in the picture of a photograph's camera or of one that turns about
             the subject, nearer than half the distance of the nearest sparse points there: haze and veils. Those that
-            reach into such a picture from beside it, and hide more of the turn than they show of the photographs, go
+            reach into such a picture from outside, and hide more of the turn than they show of the photographs, go
             too where the rest can be tuned on the photographs.
         final_prune: leave out those that contribute least and together make up this share of all blending weights in
             the training views, as 0.003, and those that no training view shows.

@@ -77,7 +77,7 @@ def read_polycam(folder: Path, root: Path, images: str) -> tuple[list[PosedImage
     del images
     photos = folder.parent / dict(_FOLDERS)[folder.name]
     relative = photos.relative_to(root).as_posix()
-    # hidden are what a Mac puts beside every file on a disk of another system
+    # hidden are what a Mac puts next to every file on a disk of another system
     files = enumerate(sorted(folder.glob("[!.]*.json")), start=1)
     find = image_finder()
     return [_shot(path, photos, relative, number, find) for number, path in files], []

@@ -5,15 +5,15 @@ incremental mapping. Every random choice is seeded and the largest model is kept
 photographs, they are searched again with features that are recognised from further aside.
 
 Cameras are found for the pixels as they are stored, as COLMAP does. Which photographs a viewer would turn by their EXIF
-orientation is written beside the model (`sparse/upright.json`), and `load_capture` turns these and their cameras.
+orientation is written next to the model (`sparse/upright.json`), and `load_capture` turns these and their cameras.
 
 The search runs in a process of its own. COLMAP computes for minutes inside one call, where no signal is heard. A
 process can be ended at any moment, and takes COLMAP's threads, its log and its memory with it. The words of the two
 processes are lines of JSON: one job, and for it any number of reports of progress and one end. Between two reports the
 one that waits counts what COLMAP has written to its database: photographs with features, and pairs that were compared.
 
-It leaves a list of its files, with which replacing a result never removes anything else. The list lies beside the model
-as `sparse/sfm.sha256`, in the format of `sha256sum`, with paths relative to the capture.
+It leaves a list of its files, so that replacing a result removes nothing else. The list lies next to the model as
+`sparse/sfm.sha256`, in the format of `sha256sum`, with paths relative to the capture.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def run_sfm(
     Args:
         photo_dir: the photographs, in subfolders too; of a capture that has a folder `images`, those in there.
         out_dir: the capture to make, with copies of the photographs in `images`. Without it, `sparse/0` is written
-            beside the photographs: in the parent of a folder named `images`, else in `photo_dir` itself; and there too
+            next to the photographs: in the parent of a folder named `images`, else in `photo_dir` itself; and there too
             where `photo_dir` is given as `out_dir`.
         progress: called with (stage, done, total) while features, matches and cameras are found.
         max_size: as `SfmOptions`, and so the four below.
@@ -178,7 +178,7 @@ def _place(photos: Path, out_dir: str | Path | None) -> tuple[Path, Path]:
     if not in_place and given.is_relative_to(capture.resolve()):
         raise CaptureError(
             f"{capture}: holds the photographs of {photos}, which a new capture there would replace; "
-            "choose another --out, or none to write sparse/0 beside them"
+            "choose another --out, or none to write sparse/0 next to them"
         )
     target = capture.resolve() / "sparse" if in_place else capture.resolve()
     return capture, target

@@ -59,7 +59,7 @@ def capture_folder(path: Path, progress: Progress | None = None) -> tuple[Path, 
         return target, f"{path}: {what}{taken.lost}"
     # one that was cut short is not known by its end, but by its name
     if zipfile.is_zipfile(path) or path.suffix.lower() == ".zip":
-        # beside x.zip, what x.usdz holds has a folder of its own
+        # next to x.zip, what x.usdz holds has a folder of its own
         target = path.with_name(f"{path.stem if path.suffix.lower() == '.zip' else path.name}_unpacked")
         if not _made_before(path, target):
             unpack(path, target)
@@ -68,7 +68,7 @@ def capture_folder(path: Path, progress: Progress | None = None) -> tuple[Path, 
 
 
 def frames_folder(video: Path) -> Path:
-    """Name the folder of a video's frames beside it; by its whole name where another video differs in its suffix alone.
+    """Name the folder of a video's frames next to it; by its whole name where another video differs by suffix only.
 
     Otherwise `walk.mov` would be trained on by the frames of `walk.mp4`.
     """

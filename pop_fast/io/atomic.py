@@ -146,7 +146,7 @@ def folder_atomically(
             folder is replaced when all of its files are written anew, which is known only when the block has ended.
 
     Yields:
-        The folder to fill, beside `path`.
+        The folder to fill, next to `path`.
 
     Raises:
         PopError: `path` exists, is not an empty folder, and `overwrite` is not set or the folder must not be replaced;
@@ -157,7 +157,7 @@ def folder_atomically(
             write_png(folder / "a.png", picture)
     """
     path = Path(path)
-    # renamed is the folder itself and not a link to it, and ".." has no name to put a partial beside
+    # renamed is the folder itself and not a link to it, and ".." has no name to put a partial next to
     path = path.resolve() if path.is_symlink() or path.name in ("", "..") else path
     inputs = [Path(kept) for kept in keeps]
     if path.parent.is_dir():
@@ -218,7 +218,7 @@ def _files(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def _beside(path: Path) -> Iterator[Path]:
-    """Name a partial beside `path` for the block to make and rename; nothing of it is left, whatever happens."""
+    """Name a partial next to `path` for the block to make and rename; nothing of it is left, whatever happens."""
     with _os_errors_name(path):
         _check_ordinary(path)
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The stages that laws speak of, and what an implementation may be able to do beside single stage functions.
+"""The stages of the laws, and what an implementation may be able to do besides single stage functions.
 
 A law that needs more than an implementation offers is skipped by name.
 """

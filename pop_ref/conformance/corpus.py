@@ -3,7 +3,7 @@
 They are made by formula, of integers and of elementwise arithmetic alone, and every number is one of float32, so that
 all precisions read the same scene. What the oracle says of them is kept in a file, because the oracle would take
 minutes: `python -m pop_ref.conformance.corpus` writes it anew. Of an image it has weighted sums over blocks of 8 x 8
-pixels and some pixels in full, of a gradient weighted sums over runs of rows, each beside what rounding may cost it.
+pixels and some pixels in full, of a gradient weighted sums over runs of rows, each with what rounding may cost it.
 Pixels at which float32 could turn a decision take no part. A test computes a part of it again.
 """
 

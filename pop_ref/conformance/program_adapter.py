@@ -392,7 +392,7 @@ class Pipe:
 
     def _send(self, line: str, arrays: list[Any]) -> None:
         body = b"".join(np.ascontiguousarray(a, dtype="<f8").tobytes() for a in arrays)
-        # beside the reading, because a program may begin to answer before it has read everything
+        # at the same time as the reading, because a program may begin to answer before it has read everything
         threading.Thread(target=_write, args=(self._process, line.encode() + b"\n" + body), daemon=True).start()
 
     def _line(self) -> str:

@@ -32,7 +32,7 @@ class Entry:
         detail: the first line of the failure, or why it was skipped.
         seconds: how long it took.
         differences: of a failure, what differs first and where, a line each.
-        cpu: seconds of this process; a program that is judged has its own beside.
+        cpu: seconds of this process; a judged program has its own besides.
     """
 
     backend: str

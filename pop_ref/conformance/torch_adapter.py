@@ -67,7 +67,7 @@ class TorchAdapter(Adapter):
         name: how reports call it.
         rasterization: a function with gsplat's signature, or None to judge stage functions only.
         package: a package whose stage modules carry the oracle's names, or None.
-        stages: stage functions on tensors by the oracle's names, beside those of the package.
+        stages: stage functions on tensors by the oracle's names, besides those of the package.
         without_gradients: names of gradients that the program does not offer.
         dtype: "float64" or "float32".
         device: a torch device.

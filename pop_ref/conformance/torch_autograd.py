@@ -17,7 +17,7 @@ import numpy as np
 from pop_ref.conformance.scenes import Scene
 
 NAMES: Final = ("means", "quats", "scales", "opacities", "sh", "viewmat", "background")
-# how a tensor may lie in memory beside densely from its beginning
+# how a tensor may lie in memory, other than densely from its beginning
 LAYOUTS: Final = ("transposed", "offset", "sliced", "reversed")
 
 

@@ -34,7 +34,7 @@ class Trainer:
     Attributes:
         optimizers: makes one for each parameter.
         move: moves the parameters after a step, given parameters, optimizers, the step and the strategy's state.
-        extras: arguments of `change` beside parameters, optimizers, state and step, given the step.
+        extras: arguments of `change` besides parameters, optimizers, state and step, given the step.
     """
 
     optimizers: Callable[[dict[str, Any]], dict[str, Any]]

@@ -93,7 +93,7 @@ def check(folder: Path, results: Path, precision: str = "float32") -> Judgement:
     # what the index says is taken as it stands: where it does not fit the arrays, any step of the rules may fail
     except Exception as error:
         raise VectorsError(
-            f"{folder / 'index.json'}: does not fit the vectors beside it ({error!r}); {AGAIN}"
+            f"{folder / 'index.json'}: does not fit the vectors next to it ({error!r}); {AGAIN}"
         ) from error
 
 
@@ -438,7 +438,7 @@ def output(name: str, shape: str, meaning: str, key: str, where: str | None = No
 
 
 def schema(kinds: dict[str, dict[str, Any]]) -> dict[str, Any]:
-    """Return what the index says beside the list of vectors.
+    """Return what the index says besides the list of vectors.
 
     Args:
         kinds: of vectors, by name: what each is about, and its arrays.

@@ -158,7 +158,7 @@ def _bars(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
     for k in range(len(order)):
         for value, offset, color in ((a[order[k]], 0.1, YOURS), (b[order[k]], 0.5, ORACLES)):
             left, right = int((k + offset) * wide), int((k + offset + 0.38) * wide)
-            # a number that is 0 beside the other is a line that can be seen
+            # a number that is 0 next to the other is a line that can be seen
             height = np.copysign(max(abs(0.85 * middle * float(value / size[k])), 2.0 * _FINER), value)
             top = middle - round(float(height))
             canvas[min(top, middle) : max(top, middle) + 1, left:right] = color

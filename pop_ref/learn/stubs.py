@@ -43,7 +43,7 @@ _SETTINGS: Final = {
     "look": {"recipe": "what is minimised, for `objective`. The course draws harmonics of degree 0.", **_NOT_HERE},
     "train_step": {
         "recipe": "what is minimised: `look` and `update` read it, `accumulate` and `control` take its `density`."
-        " `state.step` counts from 0. `waiting` is what `update` gives beside the rows; it goes into the new"
+        " `state.step` counts from 0. `waiting` is what `update` gives besides the rows; it goes into the new"
         " `Training`.",
         **_NOT_HERE,
     },

@@ -221,7 +221,7 @@ picture(fig, "To Adam a gradient has a sign and hardly a size, down to about $\\
 # $$v_x = J^\top v_y .$$
 #
 # The function that computes it is the *vjp* of $f$, its vector-Jacobian product. In `pop_ref` each function `f` has its
-# `f_vjp` beside it, which takes what `f` took and the cotangent of what `f` gave, and returns the cotangents of what
+# `f_vjp` next to it, which takes what `f` took and the cotangent of what `f` gave, and returns the cotangents of what
 # `f` took. $J$ is never written down: it would have a row for every number of the image and a column for every
 # parameter. Training calls all functions forwards, and then all their vjps backwards.
 #
@@ -343,7 +343,7 @@ assert abs(opacities_from_logits(last["opacities"])[0] - 0.9) > 0.05
 
 # %% answer
 # By 0.05 down, and by 0.05 up: at the first step $m / (1 - \beta_1) = g$ and $\sqrt{v / (1 - \beta_2)} = \lvert g
-# \rvert$, so only the sign is left (as long as $\lvert g \rvert$ is large beside $\epsilon = 10^{-15}$).
+# \rvert$, so only the sign is left (as long as $\lvert g \rvert$ is large compared with $\epsilon = 10^{-15}$).
 zero = {"x": np.zeros(2)}
 moved, _, _ = adam_step(zero, {"x": np.array([1000.0, -1e-9])}, zero, zero, 1, {"x": 0.05})
 print(moved["x"])

@@ -372,6 +372,6 @@ assert np.isclose(psnr(spot, black), 20.0)
 # {{bug: halved_l2}}
 
 # %% answer
-# It is half of the mean square. Alone that would not matter; beside SSIM and the prior, whose weights are fixed, it
+# It is half of the mean square. Alone that would not matter; next to SSIM and the prior, whose weights are fixed, it
 # shifts the balance by two (eq. 9), and eq. 3 compares its gradients with a fixed threshold.
 print(caught("halved_l2"))

@@ -92,8 +92,8 @@ picture(
 # %% [markdown]
 # Why is a small gradient enough to survive on? Because Adam divides a gradient by its own running size, so that one
 # which keeps its sign moves a parameter by about the learning rate a step, however small it is. This holds as long as
-# the gradient is large beside Adam's $\epsilon$, the number added to the divisor to keep it from being 0. The programs
-# of 3DGS and gsplat set $\epsilon = 10^{-15}$, so for them it holds for practically every gradient; with
+# the gradient is large compared with Adam's $\epsilon$, the number added to the divisor to keep it from being 0. The
+# programs of 3DGS and gsplat set $\epsilon = 10^{-15}$, so for them it holds for practically every gradient; with
 # $\epsilon = 10^{-8}$, the default of torch, gradients much smaller than that would move next to nothing. An opacity
 # reset does not help where a small gradient keeps its sign.
 

@@ -286,7 +286,7 @@ assert curve("prior", "psnr")[1][-5:].mean() > curve("prior", "psnr")[1][:5].mea
 # %% [markdown]
 # ## The report
 #
-# `report.html` shows all of this and more on one page, from held-out views beside their photographs to every setting.
+# `report.html` shows all of this and more on one page, from held-out views next to their photographs to every setting.
 # It is one file that loads nothing. `pop train` writes it at the end, `pop report FOLDER` writes it again, and `pop
 # compare A B` puts two side by side. (The runs of this page are in a temporary folder; set `home` to keep them.)
 
@@ -296,7 +296,7 @@ page = report.read_text(encoding="utf-8")
 assert "<html" in page
 # what the page shows is inside it
 assert "https://" not in page
-print(f"{report.name}, {report.stat().st_size / 1024:.0f} KiB; beside it:")
+print(f"{report.name}, {report.stat().st_size / 1024:.0f} KiB; next to it:")
 print(*sorted(path.name for path in report.parent.iterdir() if path != report))
 
 # %% [markdown]

@@ -11,7 +11,7 @@
 #
 # A **law** is a sentence that must hold for every input: doubling all scales quadruples the covariance; a pixel that no
 # splat reaches has no dominant Gaussian. The kit draws inputs and looks for one that breaks it. A **mutant** is the
-# oracle with one line replaced. `living` imports it beside the oracle under another name, so that both can be asked the
+# oracle with one line replaced. `living` imports it under another name, so that it and the oracle can be asked the
 # same. Here is one of each: an alpha that equals the floor is blended (decision D5), and a copy in which it is not.
 
 # %%

@@ -207,7 +207,7 @@ def metashape(capture: Capture, source: Path, folder: Path, lens: str = "", kind
 
 
 def realitycapture(capture: Capture, source: Path, folder: Path) -> Path:
-    """Write cameras.csv beside the photographs."""
+    """Write cameras.csv next to the photographs."""
     shutil.copytree(source / "images", folder)
     lines = ["#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"]
     for view in capture.views:

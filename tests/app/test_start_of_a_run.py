@@ -53,7 +53,7 @@ def old_results(folder: Path) -> Path:
 
 
 def visible(folder: Path) -> dict[str, bytes]:
-    """Read all but what a killed writer leaves beside its target."""
+    """Read all but what a killed writer leaves next to its target."""
     named = {path.relative_to(folder).as_posix(): data for path, data in contents(folder).items()}
     return {name: data for name, data in named.items() if not name.endswith(".partial")}
 

@@ -32,7 +32,7 @@ BACKGROUND = (0.2, 0.4, 0.1)
 
 
 def raw_params(n: int = 60, dtype: torch.dtype = torch.float64) -> dict[str, Tensor]:
-    """Scatter Gaussians before the cameras: some opaque, some hardly visible, two behind and beside them."""
+    """Scatter Gaussians before the cameras: some opaque, some hardly visible, two behind and next to them."""
     generator = torch.Generator().manual_seed(1)
 
     def normal(*size: int) -> Tensor:

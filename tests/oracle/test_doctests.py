@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 
 import pop_ref
-from pop_ref.margins import CloseDecision
 from pop_ref.notation import AXES, SYMBOLS, symbol_named
 from pop_ref.records import Camera, Gaussians, Render, Splats
 
@@ -85,16 +84,6 @@ def test_every_axis_in_a_shape_is_explained() -> None:
 def test_an_unknown_symbol_is_refused_by_name() -> None:
     with pytest.raises(ValueError, match="'rotation' is not in the notation table"):
         symbol_named("rotation")
-
-
-def test_records_and_close_decisions_are_found_under_their_old_names_with_a_warning() -> None:
-    with pytest.warns(DeprecationWarning, match=r"pop_ref\.records"):
-        from pop_ref.types import Camera as Old  # pyright: ignore[reportMissingImports]
-    assert Old is Camera
-    with pytest.warns(DeprecationWarning, match="CloseDecision"):
-        assert pop_ref.Doubt is CloseDecision
-    with pytest.raises(AttributeError, match="no attribute 'Doubts'"):
-        _ = pop_ref.Doubts
 
 
 def test_no_module_of_the_oracle_has_a_name_of_the_standard_library() -> None:

@@ -258,7 +258,7 @@ def _file(folder: Path, name: str, path: Path) -> bytes:
             raise PopError(f"{path}: has {size} bytes; {WRITE_AGAIN}")
         return (folder / name).read_bytes()
     except FileNotFoundError:
-        raise PopError(f"{folder / name}: is absent, and {path.name} names it; copy it beside {path.name}") from None
+        raise PopError(f"{folder / name}: is absent, and {path.name} names it; copy it next to {path.name}") from None
     except OSError as error:
         raise PopError(f"{folder / name}: could not be read: {error.strerror}; check its permissions") from error
 

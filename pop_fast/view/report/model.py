@@ -37,7 +37,7 @@ _PARTS: Final = 0.006  # of a training view, on average: what does not fit where
 _PARTS_BY_COLOUR: Final = 0.0025  # the same of patches that have another mean colour
 _EPOCHS: Final = 30  # how often each photograph is to be seen
 # the same before its detail is there: an object from 38 photographs had 25.6 dB after 45 times and 26.5 after 82, one
-# beside which something moved 24.3 after 41 and 25.1 after 83
+# next to which something moved 24.3 after 41 and 25.1 after 83
 _EPOCHS_FOR_DETAIL: Final = 60
 _LOST: Final = 0.1  # of the photographs, without a camera
 # a run of too few steps is asked for again so many times as long at least, and so long that these are not few any more

@@ -210,7 +210,7 @@ def test_the_small_are_cloned_and_the_large_are_split_by_gradient_or_blur(backen
 
 @law("density", "prune_mask", opacity=st.lists(opacities(), max_size=3), scene_scale=scene_scales)
 def test_the_faint_are_pruned_and_later_the_far_too_large(backend, opacity, scene_scale):
-    # beside what is drawn, a large and a small one that are not faint
+    # besides what is drawn, a large and a small one that are not faint
     o = np.array([*opacity, 0.5, 0.5]).astype(backend.dtype).astype(np.float64)
     n = len(o)
     # the longest axis decides, whichever it is

@@ -246,7 +246,7 @@ EVERYTHING = ("means", "quats", "scales", "opacities", "sh", "means2d", "means2d
 
 @law("gradients", GRADIENTS)
 def test_a_centre_in_the_plane_of_the_camera_has_no_gradient(backend):
-    # z = 0: 0/0 on the axis, 1/0 beside it
+    # z = 0: 0/0 on the axis, 1/0 next to it
     scene = _scene([[0.0, 0.0, 0.0], [1.0, -0.5, 0.0], [0.0, 2.0, -0.0]])
     _assert_only_the_others_have_gradients(backend, scene, EVERYTHING)
 

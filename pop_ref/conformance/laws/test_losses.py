@@ -146,7 +146,7 @@ def _agrees(backend, name, image, target, error_bounds, arguments):
     assert_close("agreement.losses", found, expected, of_value, backend.dtype, against_oracle=True)
     pulled = ORACLE.stage(f"{name}_vjp")(image, target, 0.75, *arguments)
     found = backend.stage(f"{name}_vjp")(image, target, 0.75, *arguments)
-    # one unit of a pixel's share beside its own error bound: a gradient may vanish where its terms cancel
+    # one unit of a pixel's share on top of its own error bound: a gradient may vanish where its terms cancel
     size = of_gradient + 1.0 / image.size
     assert_close("agreement.losses_vjp", found, pulled, size, backend.dtype, against_oracle=True)
 

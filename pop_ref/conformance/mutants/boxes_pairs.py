@@ -606,7 +606,7 @@ _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("batch_ids_count_images", "batch_ids of packed rows number images, not scenes",
      telling(_batch_ids_count_images),
      "test_signature_arguments:packed_rows_are_those_of_the_visible_gaussians_and_draw_the_same"),
-    ("depth_lost_behind_a_full_chunk", "beside 32 channels of colour, or a multiple, the depth is 0",
+    ("depth_lost_behind_a_full_chunk", "with 32 channels of colour, or a multiple, the depth is 0",
      telling(_depth_lost_behind_a_full_chunk),
      "test_signature_arguments:depth_follows_plain_colours_of_several_cameras"),
     ("one_empty_camera_fails", "a call fails where one of several cameras sees nothing",

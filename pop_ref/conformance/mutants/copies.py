@@ -1,4 +1,4 @@
-"""A copy of the oracle, or of the program, with one line changed, importable beside what it is a copy of."""
+"""A copy of the oracle, or of the program, with one line changed, importable next to its original."""
 
 from __future__ import annotations
 

@@ -441,7 +441,7 @@ _LINES: Final[Lines] = {
          "else np.zeros(1)", "else background[:1]",
          "test_signature_arguments:the_accumulated_depth_is_the_oracles_alone_and_behind_colours"),
         ("depth_beside_colours_moves_nobody",
-         "depth that is drawn beside colours has no gradient by the centres' depths",
+         "depth that is drawn with colours has no gradient by the centres' depths",
          'v_depths=None if render_mode == "RGB" else v.v_colors[:, -1]',
          'v_depths=None if render_mode.startswith("RGB") else v.v_colors[:, -1]',
          "test_signature_arguments:the_accumulated_depth_is_the_oracles_alone_and_behind_colours"),

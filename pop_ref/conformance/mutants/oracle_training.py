@@ -26,7 +26,7 @@ _LINES: Final[Lines] = {
          "height * width * channels if mask is None else int(np.sum(mask))",
          "test_losses:pixelwise_losses_of_what_a_mask_keeps_are_the_oracles"),
         ("l1_objective_pulls_by_whole_windows",
-         "beside L1 the gradient of D-SSIM is of whole windows, whatever the padding",
+         "with L1 the gradient of D-SSIM is of whole windows, whatever the padding",
          "v_pixelwise = l1_vjp(image, target, v_loss * (1.0 - lambda_ssim) * l1_scale, mask)\n"
          "    return v_pixelwise + d_ssim_vjp(image, target, v_loss * lambda_ssim, padding, mask, halved)",
          "v_pixelwise = l1_vjp(image, target, v_loss * (1.0 - lambda_ssim) * l1_scale, mask)\n"

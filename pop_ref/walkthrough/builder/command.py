@@ -40,7 +40,7 @@ _EXAMPLES: Final = """examples:
   python -m pop_ref.walkthrough --notebooks out/notebooks        Jupyter notebooks, which run anew
   python -m pop_ref.walkthrough --slides out/slides.html         a lecture of ninety minutes: arrows turn, N shows notes
   python -m pop_ref.walkthrough --pdf out/walkthrough.pdf        a book for the printer, by a headless Chromium
-  python -m pop_ref.walkthrough out/walkthrough --all            pages with all of these beside them
+  python -m pop_ref.walkthrough out/walkthrough --all            pages with all of these next to them
 """
 
 

@@ -86,7 +86,7 @@ class _FormulaError(Exception):
 
 
 def asset(name: str) -> str:
-    """Read a style sheet or a script that lies beside this file."""
+    """Read a style sheet or a script that lies next to this file."""
     return (Path(__file__).resolve().parent / name).read_text(encoding="utf-8")
 
 
@@ -398,7 +398,7 @@ def _formula(latex: str, options: dict[str, Any]) -> str:
 
 
 def _spaced(found: re.Match[str]) -> str:
-    """Set thin spaces around a function's name as TeX does: none beside an operator or a parenthesis."""
+    """Set thin spaces around a function's name as TeX does: none next to an operator or a parenthesis."""
     before, opened, name, rest = found[1] or "", found[2], found[4], found[5]
     # an mo would be spaced as a relation is
     return f"{before}{_THIN if before else ''}{opened}<mi>{name}</mi>{rest}{_THIN if found[6] else ''}"
@@ -409,7 +409,7 @@ def _label(found: re.Match[str]) -> str:
 
 
 def _link(self: Any, tokens: Any, at: int, options: Any, env: Any) -> str:
-    # chapters name each other by file; their pages lie beside each other
+    # chapters name each other by file; their pages lie in one folder
     target = tokens[at].attrs.get("href", "")
     tokens[at].attrs["href"] = re.sub(r"^(chapter_\w+)\.py$", r"\1.html", target)
     return self.renderToken(tokens, at, options, env)

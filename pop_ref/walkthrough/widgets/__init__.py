@@ -2,7 +2,7 @@
 
 None needs a network but "python", which runs `splat.py` in Pyodide, and asks for that when its button is pressed.
 
-Each is one plain script beside this file. Its mathematics stands apart in `math/`, its functions named as the
+Each is one plain script next to this file. Its mathematics stands apart in `math/`, its functions named as the
 oracle's; a test runs those against the oracle. The constants are those of the profile `paper`.
 """
 
