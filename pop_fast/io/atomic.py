@@ -162,7 +162,7 @@ def folder_atomically(
     inputs = [Path(kept) for kept in keeps]
     if path.parent.is_dir():
         # a folder that another writer had set aside when it was killed is seen again
-        with _os_errors_name(path):
+        with os_errors_name(path):
             _sweep(path)
     _check_replaceable(path, overwrite, inputs, recognise)
     with _beside(path) as partial:
@@ -219,7 +219,7 @@ def _files(folder: Path) -> Iterator[Path]:
 @contextmanager
 def _beside(path: Path) -> Iterator[Path]:
     """Name a partial next to `path` for the block to make and rename; nothing of it is left, whatever happens."""
-    with _os_errors_name(path):
+    with os_errors_name(path):
         _check_ordinary(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         _sweep(path)
@@ -330,7 +330,8 @@ def _sync_folder(path: Path) -> None:
 
 
 @contextmanager
-def _os_errors_name(path: Path) -> Iterator[None]:
+def os_errors_name(path: Path) -> Iterator[None]:
+    """Turn what the system refuses in the block into a PopError that names the file and what to do."""
     try:
         yield
     except OSError as error:

@@ -49,7 +49,15 @@ import numpy as np
 
 from pop_fast.density.protocol import DensificationStep
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import FolderLock, check_place, is_left_behind, write_atomically, write_file, write_json
+from pop_fast.io.atomic import (
+    FolderLock,
+    check_place,
+    is_left_behind,
+    os_errors_name,
+    write_atomically,
+    write_file,
+    write_json,
+)
 from pop_fast.io.read_back import parse_json, read_json
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.steps import Phase, StepStats
@@ -89,8 +97,9 @@ class ResultFolder:
             PopError: the folder is in use and neither `resume` nor `overwrite` is set, or it is not a result folder, or
                 another run is writing to it.
         """
-        if self.path.exists() and not self.path.is_dir():
-            raise PopError(f"{self.path}: is a file; choose another result folder")
+        if os.path.lexists(self.path) and not self.path.is_dir():
+            what = "a file" if self.path.exists() else "a link to nothing"
+            raise PopError(f"{self.path}: is {what}; choose another result folder")
         if not self.path.exists():
             check_place(self.path)
         if self._lock.held:
@@ -201,7 +210,7 @@ class ResultFolder:
         self._metrics = open(path, "r+b", buffering=0)  # noqa: SIM115 - stays open as long as the run
         self._metrics.truncate(keep_bytes)
         self._metrics.seek(keep_bytes)
-        self._metrics.write(b"".join(self._waiting))
+        self._append(b"".join(self._waiting))
         self._waiting.clear()
 
     def log(self, record: dict[str, Any]) -> None:
@@ -210,7 +219,13 @@ class ResultFolder:
         if self._metrics is None:
             self._waiting.append(line)
         else:
-            self._metrics.write(line)
+            self._append(line)
+
+    def _append(self, data: bytes) -> None:
+        with os_errors_name(self.path / "metrics.jsonl"):
+            # a disk that is nearly full takes a part, and says so with the rest
+            while data:
+                data = data[self._metrics.write(data) :]
 
     def flush_metrics(self) -> int:
         """Hand all records to the operating system and return the length of the file."""

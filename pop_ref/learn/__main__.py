@@ -26,7 +26,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: default the process's own.
 
     Returns:
-        The exit status: 0; 1 for a stage that has not passed yet; 2, with one line on stderr, for what cannot be done.
+        The exit status: 0; 1 for a stage that has not passed yet; 2, with one line on stderr, for what cannot be done,
+        and so 130 after Ctrl-C.
     """
     given = _parser().parse_args(arguments)
     if given.action == "check" and given.all:
@@ -45,6 +46,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"pop-learn: error: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("pop-learn: interrupted", file=sys.stderr)
+        return 130
 
 
 def _parser() -> argparse.ArgumentParser:

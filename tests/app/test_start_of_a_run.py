@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import shutil
@@ -135,6 +136,29 @@ def test_the_new_run_has_only_what_it_wrote_and_what_is_not_a_result(tmp_path: P
     run_to(tmp_path / "new")
     TrainingRun(tiny_config(old_results(tmp_path / "old")), tiny_capture(), overwrite=True).run()
     assert_same_run(tmp_path / "old", tmp_path / "new")
+
+
+def test_a_record_that_a_disk_takes_in_parts_is_whole_and_one_that_it_refuses_is_told_by_its_file(tmp_path):
+    class Nearly(io.FileIO):
+        def write(self, data: Any) -> int:
+            if self.tell() > 40:
+                raise OSError(errno.ENOSPC, "full")
+            return super().write(data[:10])
+
+    results = ResultFolder(tmp_path)
+    results.open_metrics(0)
+    results._metrics = Nearly(tmp_path / "metrics.jsonl", "w")
+    results.log({"step": 0, "view": "a"})
+    with pytest.raises(PopError, match=r"metrics\.jsonl: could not be written: the disk is full; free some space"):
+        results.log({"step": 1, "view": "b"})
+    results.close()
+    assert (tmp_path / "metrics.jsonl").read_text().startswith('{"step": 0, "view": "a"}\n{"step": 1, ')
+
+
+def test_a_link_to_nothing_is_no_folder_for_results(tmp_path: Path) -> None:
+    (tmp_path / "r").symlink_to(tmp_path / "absent")
+    with pytest.raises(PopError, match="r: is a link to nothing; choose another result folder"):
+        ResultFolder(tmp_path / "r").check(resume=False, overwrite=False)
 
 
 @pytest.mark.parametrize("exists", [True, False])

@@ -28,6 +28,7 @@ from pop_fast.demo import make_demo
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.law import Law
 from pop_ref.conformance.mutants.trial import every_law
+from pop_ref.learn import __main__ as alone
 from pop_ref.learn import stubs
 from pop_ref.learn.course import BY_NAME, COURSE, NOT_TAUGHT, Stage
 from pop_ref.learn.diagnosis import diagnose
@@ -434,6 +435,15 @@ def test_bad_input_gets_one_line(
     told_to = capsys.readouterr().err
     assert message in told_to
     assert told_to.count("\n") == 1
+
+
+def test_ctrl_c_ends_a_check_with_a_line(mine, capsys, monkeypatch):
+    def pressed(*_: object) -> int:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(alone, "check", pressed)
+    assert alone.main(["check", "alpha", str(mine)]) == 130
+    assert capsys.readouterr().err == "pop-learn: interrupted\n"
 
 
 def test_a_file_that_is_not_python_spoils_its_own_stage_only(mine: Path, capsys: pytest.CaptureFixture[str]) -> None:
