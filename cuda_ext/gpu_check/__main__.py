@@ -209,7 +209,7 @@ def main(argv: list[str] | None = None) -> int:
         for command in check.beside.values():
             command.kill()
     left_out = [name for name in names if "skipped" in report["stages"][name]]
-    words = [f"failed: {', '.join(failed)}"] if failed else [] if left_out else ["every stage ran"]
+    words = [f"failed: {', '.join(failed)}" if failed else "none failed" if left_out else "every stage ran"]
     words += [f"skipped: {', '.join(left_out)}"] if left_out else []
     print(f"{path}: {'; '.join(words)}", flush=True)
     return 1 if failed else 0

@@ -69,7 +69,7 @@ def test_a_stage_that_fails_takes_nothing_from_the_others(stages, tmp_path, caps
     assert "laws: FAILED" in said
     assert said.endswith("failed: laws; skipped: bench\n")
     assert main([str(out), "--stages", "bench"]) == 0
-    assert capsys.readouterr().out.endswith("gpu_check_1.json: skipped: bench\n")
+    assert capsys.readouterr().out.endswith("gpu_check_1.json: none failed; skipped: bench\n")
     # a later call fills the same file
     stages["laws"] = lambda check: {"status": 0, "seconds": 3.0}
     assert main([str(out), "--stages", "laws"]) == 0

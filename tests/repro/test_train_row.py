@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.faults.corpus import HERE as CORPUS
 from paper_repro import prepared
 from paper_repro import train_row as module
 from paper_repro.collect import PROBE, collect, file_hash, first_change
@@ -249,6 +250,15 @@ def test_an_unfinished_folder_is_not_collected(tmp_path, monkeypatch):
             train_row(job, how)
     with pytest.raises(PopError, match=r"val_step0029\.json: is absent, so the training is not finished"):
         collect(job, job.work(how.work), {})
+
+
+def test_a_record_that_is_wrong_is_told_with_the_folder_that_it_lies_in(tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(CORPUS / "result", folder)
+    said = json.loads((folder / "row.json").read_text())
+    (folder / "row.json").write_text(json.dumps(said | {"height": -1}))
+    with pytest.raises(PopError, match=rf"^{folder}: the result of pop on demo, seed 42: protocol: height is -1"):
+        collect(job_named("pop", "demo", "toy"), folder, {})
 
 
 def test_what_an_earlier_training_left_does_not_reach_a_result(tmp_path):
