@@ -42,7 +42,7 @@ ROWS: Final[Registry[Path]] = Registry(
 # floats of one Gaussian in the files whose size the tables give: gsplat's checkpoint, and Inria's PLY with its normals
 _BYTES: Final = (236, 248)
 # git ignores it; everything in it can be made again
-WORK: Final = Path(__file__).resolve().parent / "work"
+WORK: Final = results.HOME / "work"
 SEED: Final = 42
 # how often the held-out views are measured, evenly over the schedule: curves of Gaussians per pixel are made of these
 _MEASURED: Final = 15

@@ -449,7 +449,16 @@ def _per_view(take: _Fields) -> dict[str, dict[str, float]]:
 
 
 SCALES: Final = tuple(_SCALES)
-RESULTS: Final = Path(__file__).resolve().parent / "results"
+
+
+def home(package: Path) -> Path:
+    """Return the folder of results and work: the package's own in a clone, else `paper_repro` of the current folder."""
+    # pip neither installs nor keeps what a command would write between the files of a package
+    return package if (package.parent / "pyproject.toml").is_file() else Path("paper_repro").absolute()
+
+
+HOME: Final = home(Path(__file__).resolve().parent)
+RESULTS: Final = HOME / "results"
 # what a line begins with, by which it is known without its curve
 _HEAD: Final = re.compile(
     rf'\{{"schema":{SCHEMA},"scale":"(\w+)","row":"(\w+)","scene":"(\w+)","seed":(\d+),', flags=re.ASCII
@@ -462,7 +471,7 @@ def path_of(scale: str, row: str, folder: Path = RESULTS) -> Path:
 
 
 def existing_folder(folder: Path) -> Path:
-    """Return a folder of results that is to be read; the package's own may be absent, as it is where pip has put it.
+    """Return a folder of results that is to be read; the default one may be absent, as it is where nothing was trained.
 
     Raises:
         PopError: it is not there: a name that was typed wrong would else be a folder without results.

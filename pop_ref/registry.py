@@ -14,7 +14,10 @@ from __future__ import annotations
 import functools
 import importlib
 from collections.abc import Iterator, Mapping
-from typing import Any, Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 __all__ = ["Registry"]
 
@@ -80,14 +83,40 @@ class Registry(Mapping[str, T], Generic[T]):
             return self._loaded[name]
         value = self._given.get(name)
         if value is None:
-            found = self._declared().get(name)
-            if found is None:
-                raise self._error(f"{self.kind} {name!r} is unknown; use one of {', '.join(self)}")
-            value = found
-        if isinstance(value, str):
-            value = self._imported(name, value)
+            value = self._of_another(name)
+        elif isinstance(value, str):
+            value = self._imported(name, value, value)
         self._loaded[name] = value
         return value
+
+    def usable(self) -> Iterator[tuple[str, T]]:
+        """Give all names with their values, but for those of other packages that cannot be loaded."""
+        for name in self:
+            try:
+                value = self.named(name)
+            except self._error:
+                if name in self._given:
+                    raise
+                continue
+            yield name, value
+
+    def packages(self, name: str) -> tuple[str, ...]:
+        """Return the packages that declare a name, each with its version; none for a name of the package itself."""
+        if name in self._given:
+            return ()
+        return tuple(_package(entry) for entry in self._declared().get(name, ()))
+
+    def added(self) -> Iterator[tuple[str, str, str | None]]:
+        """Give what other packages declare: the name, whose it is, and why it cannot be used, or None."""
+        for name, entries in self._declared().items():
+            package, fault = " and ".join(sorted(map(_package, entries))), None
+            try:
+                self.named(name)
+            except self._error as error:
+                fault = str(error)
+            if name in self._given:
+                fault = f"that of {package} is not used; another {self.kind} has its name"
+            yield name, package, fault
 
     def __getitem__(self, name: str) -> T:
         if name not in self:
@@ -108,7 +137,7 @@ class Registry(Mapping[str, T], Generic[T]):
     def __repr__(self) -> str:
         return f"Registry({self.kind!r}, {self.group!r}: {', '.join(self)})"
 
-    def _declared(self) -> Mapping[str, str]:
+    def _declared(self) -> Mapping[str, tuple[EntryPoint, ...]]:
         return _declared(self.group)
 
     def look_again(self) -> None:
@@ -116,14 +145,28 @@ class Registry(Mapping[str, T], Generic[T]):
         self._loaded.clear()
         _declared.cache_clear()
 
-    def _imported(self, name: str, path: str) -> T:
-        place = f"the {self.kind} at {path}"
-        module, _, attribute = path.partition(":")
+    def _of_another(self, name: str) -> T:
+        """Return the value of a name that another package declares."""
+        entries = self._declared().get(name)
+        if not entries:
+            raise self._error(f"{self.kind} {name!r} is unknown; use one of {', '.join(self)}")
+        entry, *others = entries
+        if others:
+            both = " and ".join(sorted(map(_package, entries)))
+            raise self._error(f"{self.kind} {name!r} is declared by {both}; uninstall all but one of them")
+        return self._imported(name, entry, f"{entry.value} of {_package(entry)}")
+
+    def _imported(self, name: str, path: str | EntryPoint, where: str) -> T:
+        place = f"the {self.kind} at {where}"
         try:
-            value: Any = getattr(importlib.import_module(module), attribute)
+            if isinstance(path, str):
+                module, _, attribute = path.partition(":")
+                value: Any = getattr(importlib.import_module(module), attribute)
+            else:
+                value = path.load()
         # whatever another package raises while it is imported
-        except Exception as error:
-            raise self._error(f"{place} cannot be loaded: {error}") from error
+        except (Exception, SystemExit) as error:
+            raise self._error(f"{place} cannot be loaded: {type(error).__name__}: {error}") from error
         self._check(name, value, place)
         return cast("T", value)
 
@@ -139,9 +182,16 @@ class Registry(Mapping[str, T], Generic[T]):
 
 
 @functools.cache
-def _declared(group: str) -> Mapping[str, str]:
+def _declared(group: str) -> Mapping[str, tuple[EntryPoint, ...]]:
     """Return what installed packages declare under a group, by name; looked up once."""
     # 10 ms, which a render by a profile of this package does not wait for
     from importlib.metadata import entry_points
 
-    return {entry.name: entry.value for entry in entry_points(group=group)}
+    found: dict[str, dict[str, EntryPoint]] = {}
+    for entry in entry_points(group=group):
+        found.setdefault(entry.name, {}).setdefault(entry.value, entry)
+    return {name: tuple(entries.values()) for name, entries in found.items()}
+
+
+def _package(entry: EntryPoint) -> str:
+    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else f"the package of {entry.module}"

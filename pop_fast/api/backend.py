@@ -181,14 +181,7 @@ def get_backend(name: str) -> Backend:
 
 def by_speed() -> Iterator[Backend]:
     """Give the backends that "auto" may take, the fastest first; one that cannot be imported is none."""
-    found: list[tuple[int, Backend]] = []
-    for name in BACKENDS:
-        try:
-            backend = BACKENDS.named(name)
-        except PopError:
-            continue
-        if backend.speed is not None:
-            found.append((backend.speed, backend))
+    found = [(backend.speed, backend) for _, backend in BACKENDS.usable() if backend.speed is not None]
     yield from (backend for _, backend in sorted(found, key=lambda pair: pair[0], reverse=True))
 
 

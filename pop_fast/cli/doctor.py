@@ -14,7 +14,7 @@ from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Final, Literal
 
-from pop_fast.api.backend import backend_names, get_backend
+from pop_fast.api.backend import BACKENDS
 from pop_fast.cli import parse
 from pop_fast.machine import machine_name, memory_bytes
 
@@ -96,7 +96,7 @@ def run(argv: Sequence[str]) -> int:
     args = parse(Args, argv, "doctor")
     findings = [*packages(), *machine()]
     if not any(finding.name == "torch" and finding.state == "missing" for finding in findings):
-        findings += [*torch_build(), *backends()]
+        findings += [*torch_build(), *backends(), *plugins()]
     findings += [cuda_build(), *lpips(args)]
     width = max(len(finding.name) for finding in findings) + 2
     marks = {"ok": "ok", "missing": "MISSING", "off": "-"}
@@ -142,12 +142,23 @@ def torch_build() -> Iterator[DoctorLine]:
 
 def backends() -> Iterator[DoctorLine]:
     """Ask every backend whether it can run here and, if not, why; all of them need torch."""
-    for name in backend_names():
-        backend = get_backend(name)
+    for name, backend in BACKENDS.usable():
         if backend.available():
             yield DoctorLine(f"backend {name}", "ok", "can run here")
         else:
             yield DoctorLine(f"backend {name}", "off", f"{backend.why_not()} (optional)")
+
+
+def plugins() -> Iterator[DoctorLine]:
+    """Load what other packages add, and tell which package each is of and why one cannot be used."""
+    from pop_fast.io.formats import FORMATS
+    from pop_fast.train.presets import LOSSES, METHODS
+    from pop_ref.constants import PROFILES
+
+    for registry in (METHODS, PROFILES, LOSSES, FORMATS, BACKENDS):
+        for name, package, fault in registry.added():
+            found = f"of {package}" if fault is None else f"{fault} (optional)"
+            yield DoctorLine(f"{registry.kind} {name}", "ok" if fault is None else "off", found)
 
 
 def cuda_build() -> DoctorLine:

@@ -41,6 +41,7 @@ from pop_fast.cli.train_options import (
 from pop_fast.cli.view import LiveView, check_viewer
 from pop_fast.data.capture import SfmOptions
 from pop_fast.errors import PopError
+from pop_fast.io.formats import FORMATS
 from pop_fast.io.heartbeat import bars, duration
 from pop_fast.train.automatic import TERMS, begun, check_minutes
 from pop_fast.train.choose import check_gpus, choose_backend
@@ -146,6 +147,9 @@ def run(argv: Sequence[str]) -> int:
     folder = Path(config.result_dir)
     options.check()
     check_minutes(options.minutes, config, chooses)
+    for name in options.export:
+        if name in FORMATS:
+            FORMATS.named(name)
     check_viewer(options)
     check_blocks(config, options)
     ranks = _ranks()

@@ -57,8 +57,11 @@ _USUAL: Final = {
 }
 # settings of density control that are gone, with the value at which they did nothing: results with it still open
 _GONE: Final = {"blur_stop_gain": 0.0, "blur_stop_span": 5}
-# the two parts of cfg.json
-_GIVEN, _RESOLVED = "given", "resolved"
+# the two parts of cfg.json, and the packages of others that the run uses, where there are some
+_GIVEN, _RESOLVED, _PACKAGES = "given", "resolved", "packages"
+# settings that are names of a table, to which other packages may add
+_TABLES: Final = {"method": METHODS, "profile": PROFILES, "photometric": LOSSES, "backend": BACKENDS}
+_OF_OTHERS: Final = "; one from another package is known only where that is installed"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,7 +273,7 @@ class TrainConfig:
     @property
     def method(self) -> str:
         """The name of the method that is trained."""
-        return method_of(self.strategy)
+        return method_of(type(self.strategy))
 
     @property
     def preset(self) -> str | None:
@@ -307,7 +310,9 @@ class TrainConfig:
         """Write the settings as JSON, in reading order: as given (null where no preset was), and as they are run."""
         given = None if self.given is None else self.given.to_plain()
         resolved = {"method": self.method, **{n: to_plain(v) for n, v in _as_dict(self).items()}}
-        return json.dumps({_GIVEN: given, _RESOLVED: resolved}, indent=2) + "\n"
+        of_others = [r.packages(resolved[name]) for name, r in _TABLES.items() if resolved[name] != "auto"]
+        added = {_PACKAGES: sorted({package for found in of_others for package in found})} if any(of_others) else {}
+        return json.dumps({_GIVEN: given, _RESOLVED: resolved, **added}, indent=2) + "\n"
 
     @classmethod
     def from_json(cls, text: str) -> Self:
@@ -325,12 +330,18 @@ class TrainConfig:
             raise PopError(f"config is not JSON: {error.msg} at line {error.lineno}, column {error.colno}") from error
         except (ValueError, RecursionError) as error:
             raise PopError(f"config is not JSON that can be read: {error}") from error
+        packages = plain.pop(_PACKAGES, []) if isinstance(plain, dict) else []
         if not isinstance(plain, dict) or plain.keys() != {_GIVEN, _RESOLVED} or type(plain[_RESOLVED]) is not dict:
             raise PopError(f"config is not {{{_GIVEN}, {_RESOLVED}}}, so it is of an older version of pop or damaged")
         values = dict(plain[_RESOLVED])
+        for name, registry in _TABLES.items():
+            if isinstance(packages, list) and packages and values.get(name, "auto") not in ("auto", *registry):
+                made_with = f"made with {' and '.join(map(str, packages))}, not all of which is installed here"
+                raise PopError(f"config.{name} is {values[name]!r}, of another package; the run was {made_with}")
         method = values.pop("method", "pop")
         if method not in METHODS:
-            raise PopError(f"config.method is {method!r}; it must be one of {', '.join(map(repr, METHODS))}")
+            names = ", ".join(map(repr, METHODS))
+            raise PopError(f"config.method is {method!r}; it must be one of {names}{_OF_OTHERS}")
         config = cls._from_values(values, method)
         if plain[_GIVEN] is None:
             return config
@@ -456,13 +467,12 @@ def check_values(config: TrainConfig) -> None:
 
 def _check_names(values: dict[str, Any]) -> None:
     """Check what is one of a table, to which other packages may add."""
-    for name, known in (("profile", PROFILES), ("photometric", LOSSES), ("backend", BACKENDS)):
+    for name, known in _TABLES.items():
         value = values[name]
-        if (name == "backend" and value == "auto") or value in known:
+        if name == "method" or (name == "backend" and value == "auto") or value in known:
             continue
         names = ", ".join((*(("auto",) if name == "backend" else ()), *known))
-        where = "; one from another package is known only where that is installed"
-        raise PopError(f"{name} is {value!r}; it must be one of {names}{where}")
+        raise PopError(f"{name} is {value!r}; it must be one of {names}{_OF_OTHERS}")
 
 
 def _check_number(name: str, value: float, is_share: bool) -> None:

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 class Method(NamedTuple):
     """A method that can be trained."""
 
-    strategy: type[DensityControl]  # density control, with the method's defaults
+    strategy: type[DensityControl]  # density control, with the method's defaults; a class of its own
     recipe: Recipe  # that the rest of its defaults are from
     title: str  # what tables and pages call it
 
@@ -139,6 +139,7 @@ class Given:
     def __post_init__(self) -> None:
         if self.method not in METHODS:
             raise PopError(f"config.method is {self.method!r}; it must be one of {', '.join(map(repr, METHODS))}")
+        _check_method(self.method, METHODS[self.method])
         scaler = self.steps_scaler
         if scaler is not None and not 0.0 < scaler < math.inf:
             raise PopError(f"steps_scaler is {scaler}; it must be > 0 and finite")
@@ -165,10 +166,10 @@ class Given:
             group, dot, rest = name.partition(".")
             known = group == "strategy" or ALIASES.get(group, group) == given.method
             path = f"{given.method}{dot}{rest}" if known else name
-            if isinstance(value, DensityControl) and method_of(value) != given.method:
+            if isinstance(value, DensityControl) and method_of(type(value)) != given.method:
                 raise PopError(
                     f"{name} is a {type(value).__name__}, but the method is {given.method!r}; "
-                    f"give a {METHODS[given.method].strategy.__name__}, or method={method_of(value)!r}"
+                    f"give a {METHODS[given.method].strategy.__name__}, or method={method_of(type(value))!r}"
                 )
             plain = to_plain(value)
             whole = isinstance(plain, dict) or is_dataclass(value)
@@ -204,10 +205,24 @@ class Given:
         return self.preset == "quick" or (self.preset == AUTOMATIC and self.scaler <= QUICK_SCALER)
 
 
-def method_of(strategy: DensityControl) -> str:
-    """Return the name of the method that a strategy belongs to; that of its class for a third-party strategy."""
-    names = (name for name, method in METHODS.items() if type(strategy) is method.strategy)
-    return next(names, type(strategy).__name__)
+def _check_method(name: str, method: Method) -> None:
+    """Refuse what another package calls a method and is none."""
+    kind: Any = method.strategy
+    fault = None
+    if not (isinstance(kind, type) and issubclass(kind, DensityControl)):
+        fault = f"its strategy is {kind!r}; it must be a class derived from DensityControl"
+    elif not isinstance(method.recipe, Recipe):
+        fault = f"its recipe is {method.recipe!r}; it must be a pop_ref.recipes.Recipe"
+    elif (owner := method_of(kind)) != name:
+        fault = f"its {kind.__name__} is that of method {owner!r}, by which runs tell theirs; derive a class of its own"
+    if fault is not None:
+        raise PopError(f"method {name!r}{''.join(f' of {p}' for p in METHODS.packages(name))}: {fault}")
+
+
+def method_of(strategy: type[DensityControl]) -> str:
+    """Return the name of the method that a strategy's class belongs to; that of the class for a third-party one."""
+    names = (name for name, method in METHODS.usable() if strategy is method.strategy)
+    return next(names, strategy.__name__)
 
 
 def defaults(given: Given) -> dict[str, Any]:

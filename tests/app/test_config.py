@@ -449,9 +449,11 @@ def test_the_options_of_a_run_say_its_numbers_to_the_last_digit():
 
 
 def test_a_method_may_be_any_object_that_has_what_one_needs(monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = SimpleNamespace(**METHODS["gsplat"]._asdict())
+    own = type("Own", (GsplatStrategy,), {})
+    plain = SimpleNamespace(**{**METHODS["gsplat"]._asdict(), "strategy": own})
     monkeypatch.setitem(METHODS._given, "mine", plain)
-    assert TrainConfig.of(method="mine").strategy == GsplatStrategy()
+    asked = TrainConfig.of(method="mine")
+    assert (asked.method, type(asked.strategy)) == ("mine", own)
     METHODS.look_again()
 
 

@@ -26,8 +26,11 @@ from pop_fast.api.backends import FAST, TorchBackend
 from pop_fast.api.rasterize import rasterization
 from pop_fast.density import DensificationStep, POPStrategy
 from pop_fast.errors import PopError
+from pop_fast.io.ply import save_ply
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train import checkpoint as ckpt
+from pop_fast.train.presets import METHODS, Method
+from pop_ref.recipes import RECIPES
 from tests.app.conftest import ROOT, TRAIN
 from tests.app.tiny import assert_same_run, records, run_until, tiny_capture, tiny_config
 from tests.fast.test_rasterization import cameras, scene
@@ -318,7 +321,7 @@ def test_a_registered_backend_is_known_by_its_name_and_draws_and_one_that_cannot
     expected = rasterization(**scene(), **cameras(), backend="fast")[0]
     for mine in ("mine", api_backend.get_backend("mine")):
         assert torch.equal(rasterization(**scene(), **cameras(), backend=mine)[0], expected)
-    with pytest.raises(PopError, match=r"the backend at no_such_package:BACKEND cannot be loaded: No module named"):
+    with pytest.raises(PopError, match=r"no_such_package cannot be loaded: ModuleNotFoundError: No module named"):
         backend.get_backend("broken")
 
 
@@ -330,7 +333,7 @@ def test_a_name_that_nobody_registers_is_refused_before_anything_is_written(inst
     for make in (TrainConfig, TrainConfig.of):
         with pytest.raises(PopError, match=names):
             make(backend="mine")
-    with pytest.raises(PopError, match="where that is installed"):
+    with pytest.raises(PopError, match=f"backend is 'mine', of another package; .* with the package of {__name__}"):
         TrainConfig.from_json(made)
     assert pop("train", shared_capture, *TRAIN, "--backend", "mine", "--out", tmp_path / "none").status == 2
     assert not (tmp_path / "none").exists()
@@ -341,3 +344,72 @@ def test_names_of_this_package_are_known_without_a_look_at_what_is_installed(mon
     for name in (FAST.name, "auto"):
         BACKENDS.look_again()
         assert TrainConfig.from_json(TrainConfig(backend=name).to_json()).backend == name
+
+
+# What other packages do wrong is said with the package's name, where it is asked for and nowhere else.
+
+
+def distribution(site: Path, name: str, source: str, **entries: str) -> None:
+    """Install a distribution of one module, of the same name, with one entry called `mine` for each group."""
+    (site / f"{name}.py").write_text(source)
+    about = site / f"{name}-1.0.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("".join(f"[pop_splatting.{k}]\n{v}\n" for k, v in entries.items()))
+
+
+def test_a_name_that_two_packages_declare_is_refused_with_both(tmp_path: Path) -> None:
+    imports = "from dataclasses import replace\nfrom pop_ref.constants import PAPER\n"
+    for name in ("one", "two"):
+        distribution(tmp_path, name, f"{imports}MINE = replace(PAPER, name='mine')\n", profiles=f"mine = {name}:MINE")
+    asks = (
+        "from pop_ref.constants import PROFILES\ndef main(words):\n    try:\n        print(PROFILES.named('mine').name)"
+    )
+    (tmp_path / "asks.py").write_text(f"{asks}\n    except ValueError as error:\n        print(error)\n")
+    refused = "profile 'mine' is declared by one 1.0 and two 1.0; uninstall all but one of them\n"
+    assert call(tmp_path, "asks") == refused
+    # unless both name the same thing, as a package under its old name and its new one does
+    (tmp_path / "two-1.0.dist-info" / "entry_points.txt").write_text("[pop_splatting.profiles]\nmine = one:MINE\n")
+    assert call(tmp_path, "asks") == "mine\n"
+
+
+def test_a_package_that_cannot_be_loaded_disturbs_nobody_who_does_not_ask_for_it(tmp_path: Path) -> None:
+    kinds = dict.fromkeys(("formats", "backends", "methods"), "mine = broken:X")
+    distribution(tmp_path, "broken", "import sys\nsys.exit('needs libfoo')\n", **kinds, profiles="paper = broken:X")
+    shapes = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh0": (1, 3), "shN": (15, 3)}
+    save_ply(tmp_path / "a.ply", {name: torch.ones(2, *shape) for name, shape in shapes.items()})
+    call(tmp_path, "pop_fast.cli", "convert", "a.ply", "a.spz")
+    why = "at broken:X of broken 1.0 cannot be loaded: SystemExit: needs libfoo"
+    doctor = call(tmp_path, "pop_fast.cli", "doctor")
+    assert doctor.count(why) == 3
+    assert "that of broken 1.0 is not used; another profile has its name" in doctor
+    # before the training, not after it
+    assert f"the format {why}" in call(tmp_path, "pop_fast.cli", "train", "x", "--export", "mine", status=2)
+    assert f"the method {why}" in call(tmp_path, "pop_fast.cli", "train", "x", "--method", "mine", status=2)
+
+
+@pytest.mark.parametrize(
+    ("strategy", "recipe", "said"),
+    [
+        (int, RECIPES["POP"], "its strategy is <class 'int'>; it must be a class derived from DensityControl"),
+        (POPStrategy, None, "its recipe is None; it must be a"),
+        (POPStrategy, RECIPES["POP"], "its POPStrategy is that of method 'pop', by which runs tell theirs"),
+    ],
+)
+def test_a_method_is_of_the_right_types_and_has_a_class_of_its_own(monkeypatch, strategy, recipe, said) -> None:
+    monkeypatch.setitem(METHODS._given, "mine", Method(strategy, recipe, "Mine"))
+    with pytest.raises(PopError, match=f"method 'mine': {said}"):
+        TrainConfig.of(method="mine")
+    METHODS.look_again()
+
+
+def test_a_result_names_the_packages_that_it_was_made_with(site: Path, tmp_path: Path) -> None:
+    script = (
+        "from pop_fast.train import TrainConfig\ndef main(words):\n    print(TrainConfig.of(method='mine').to_json())"
+    )
+    (site / "makes_settings.py").write_text(script)
+    made = call(site, "makes_settings")
+    assert json.loads(made)["packages"] == [f"{NAME} 1.0"]
+    with pytest.raises(PopError, match=f"method is 'mine', of another package; the run was made with {NAME} 1.0, not"):
+        TrainConfig.from_json(made)
+    assert "packages" not in json.loads(TrainConfig().to_json())

@@ -14,8 +14,9 @@ from types import SimpleNamespace
 import pytest
 
 from paper_repro import queue as repro_queue
+from paper_repro import results
 from paper_repro.cli import COMMANDS, main
-from paper_repro.jobs import ROWS, job_named, jobs_of, load_row, trainable
+from paper_repro.jobs import ROWS, WORK, job_named, jobs_of, load_row, trainable
 from paper_repro.paper import paper
 from paper_repro.results import read_all
 from tests.app.conftest import wait_until
@@ -77,6 +78,12 @@ def test_a_mistake_is_one_line_that_names_the_fix(words, says, capsys, tmp_path,
     text = call(*words, status=2, capsys=capsys)
     assert says in text
     assert "Traceback" not in text
+
+
+def test_an_installed_package_keeps_nothing_between_its_own_files(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert results.home(tmp_path / "site-packages" / "paper_repro") == tmp_path / "paper_repro"
+    assert results.home(ROOT / "paper_repro") == ROOT / "paper_repro" == results.RESULTS.parent == WORK.parent
 
 
 def test_a_row_that_this_version_lacks_has_its_own_status(capsys, tmp_path, monkeypatch):

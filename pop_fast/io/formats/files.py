@@ -28,7 +28,7 @@ class Stored(NamedTuple):
 
 def splat_suffixes() -> tuple[str, ...]:
     """Return the suffixes of all formats that are written, without repetition, the longest first."""
-    found = dict.fromkeys([".ply", *(format.suffix for format in FORMATS.values())])
+    found = dict.fromkeys([".ply", *(format.suffix for _, format in FORMATS.usable())])
     return tuple(sorted(found, key=len, reverse=True))
 
 
@@ -62,7 +62,7 @@ def named_format(path: Path, to: str | None = None) -> str:
     if path.suffix.lower() in READ_ONLY or name == sog.META:
         raise PopError(f"{path}: is of a format that is read and not written; choose .sog or another")
     suffix = next((s for s in splat_suffixes() if name.endswith(s)), None)
-    by_suffix = [PLY] if suffix == ".ply" else [key for key, format in FORMATS.items() if format.suffix == suffix]
+    by_suffix = [PLY] if suffix == ".ply" else [key for key, format in FORMATS.usable() if format.suffix == suffix]
     if to is None:
         if not by_suffix:
             raise PopError(f"{path}: the name must end in one of {', '.join(sorted(splat_suffixes()))}, or give --to")
