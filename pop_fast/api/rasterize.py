@@ -102,9 +102,9 @@ def rasterization(
         viewmats: world -> camera, OpenCV. [..., C, 4, 4]
         Ks: intrinsics, px. [..., C, 3, 3]
         width, height: px.
-        near_plane, far_plane: world units; at gsplat's default the profile's own value is used.
+        near_plane, far_plane: world units; gsplat's default value selects the profile's own.
         radius_clip: px; splats with both extents at most this are culled.
-        eps2d: low-pass, px^2; at gsplat's default the profile's own value is used.
+        eps2d: low-pass, px^2; gsplat's default value selects the profile's own.
         sh_degree: bands to evaluate, or None when `colors` are colours.
         packed: whether meta holds rows of visible (camera, Gaussian) pairs only.
         tile_size: px, up to 4096, None for 16; the image does not depend on it, except in profile "inria".
@@ -113,18 +113,17 @@ def rasterization(
         sparse_grad, distributed, segmented, with_ut, with_eval3d: only False.
         absgrad: also sum |dL/dmeans2d| over pixels into `meta["means2d"].absgrad`.
         rasterize_mode: "antialiased" scales opacities by the factor that keeps a blurred splat's energy.
-        channel_chunk: accepted; all channels are blended in one go, whatever their number.
+        channel_chunk: accepted and ignored; all channels are blended at once.
         camera_model: only "pinhole".
         covars: covariances instead of quats and scales. [..., N, 3, 3]
         radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs, viewmats_rs: only None.
         rolling_shutter: only None, or gsplat's `RollingShutterType.GLOBAL`.
         profile: constants and strictness: "paper", "gsplat_1_5", "gsplat_1_6", "inria", or a `Profile`.
-        dominance: compute the dominance keys of meta in the same pass; else they cost one more when first read.
+        dominance: compute the dominance keys of meta in the same pass; otherwise reading them costs a second pass.
         counts: the same for n_contrib and n_traversed.
-        backend: a name that `pop_fast.api.backend` knows, or a backend. "fast" renders on the CPU, "compiled" too with
-            kernels in C++ (`pop_fast.compiled`), "cuda" on the GPU that holds the tensors (`cuda_ext`), "ref" with the
-            oracle, slowly. "auto" takes the fastest that is there: "cuda" for tensors on a GPU, else "compiled" where
-            it is built, else "fast".
+        backend: a backend, or the name of one. "fast" renders on the CPU with torch, "compiled" on the CPU with kernels
+            in C++ (`pop_fast.compiled`), "cuda" on the GPU that holds the tensors (`cuda_ext`), "ref" with the
+            oracle, slowly. "auto" takes "cuda" for tensors on a GPU, else "compiled" if it is built, else "fast".
 
     Returns:
         Images [..., C, H, W, X], not clamped; alphas [..., C, H, W, 1]; meta with gsplat's keys and `dominant_ids`

@@ -120,9 +120,9 @@ def load_capture(
 ) -> Capture:
     """Load photographs, cameras and sparse points of a capture.
 
-    `source="auto"` takes the first that is there: a block of a larger capture (`block.json`), a COLMAP model (the
-    largest in `sparse` and its subfolders, else in `colmap/sparse`, else the folder itself), `transforms.json` or
-    Blender's `transforms_train.json`, the export of Polycam, Metashape (XML) or RealityCapture (CSV), a bare folder of
+    `source="auto"` takes the first that exists: a block of a larger capture (`block.json`); a COLMAP model (the
+    largest in `sparse` and its subfolders, else in `colmap/sparse`, else the folder itself); `transforms.json` or
+    Blender's `transforms_train.json`; the export of Polycam, Metashape (XML) or RealityCapture (CSV); a folder of
     photographs.
 
     Args:
@@ -130,23 +130,21 @@ def load_capture(
         factor: shrink photographs by this whole number; `images_<factor>` is read instead where it exists.
         normalize: move the world into gsplat's training frame; the way back is `Capture.world_transform`.
         masks: read `masks/<name>.png`, `masks/<name>.<ext>.png` or the list's `mask_path`; white means keep.
-        missing: what to do about photographs that are listed but absent.
-        background: colour in [0, 1] that photographs with alpha are composited over; alpha says what is transparent and
-            is no mask.
+        missing: "error" or "skip" for photographs that are listed but absent.
+        background: colour in [0, 1] behind photographs with alpha; alpha is transparency and not a mask.
         progress: called with (stage, done, total).
-        source: take this one, or fail.
-        images: read photographs from this folder in place of the listed one, shrunk by `factor` unless its name ends in
+        source: the kind of capture to read; an error is raised if it does not exist.
+        images: read photographs from this folder instead of the listed one, shrunk by `factor` unless its name ends in
             `_<factor>`.
-        resize: how they are shrunk: "area" averages, "bicubic" does as Pillow does, and so
-            gsplat's example trainer (A32).
-        sfm: for a bare folder of photographs: find the cameras first, by these options, and write them to
+        resize: "area" averages, "bicubic" equals Pillow's, which gsplat's example trainer uses (A32).
+        sfm: find the cameras of a bare folder of photographs first, with these options, and write them to
             `<path>/sparse/0`.
-        points: how many random points to make where the capture brings none.
+        points: how many random points to make if the capture has none.
         seed: of the random points.
-        photographs: which are read: of the other views only the cameras are, and they take no memory. What is not
-            "all" has no points where the capture brings none.
-        test_every: which are held out; see `Capture.test_views`.
-        listing: what `list_capture` has read of it, where that was done before.
+        photographs: which photographs are read. Of the other views only the cameras are read, which take no memory.
+            With other values than "all" no random points are made.
+        test_every: which views are held out; see `Capture.test_views`.
+        listing: the result of an earlier `list_capture` of this capture, if there is one.
 
     Raises:
         CaptureError: one line that names the file, the field and the fix.

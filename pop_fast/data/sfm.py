@@ -97,21 +97,22 @@ def run_sfm(
     """Find cameras and sparse points, and write them as a COLMAP capture, whole or not at all.
 
     Args:
-        photo_dir: the photographs, in subfolders too; of a capture that has a folder `images`, those in there.
-        out_dir: the capture to make, with copies of the photographs in `images`. Without it, `sparse/0` is written
-            next to the photographs: in the parent of a folder named `images`, else in `photo_dir` itself; and there too
-            where `photo_dir` is given as `out_dir`.
+        photo_dir: folder of the photographs and their subfolders; if it has a folder `images`, that one.
+        out_dir: the capture to make, with copies of the photographs in `images`. Without it, or if it is `photo_dir`,
+            `sparse/0` is written next to the photographs: in the parent of a folder named `images`, else in `photo_dir`
+            itself.
         progress: called with (stage, done, total) while features, matches and cameras are found.
-        max_size: as `SfmOptions`, and so the four below.
+        max_size: as in `SfmOptions`; the next four too.
         camera_model: COLMAP's name.
-        single_camera: all photographs share one camera; by default when they are of one size and, by EXIF, of one lens.
-        matcher: which photographs are compared.
+        single_camera: whether all photographs share one camera; by default if they have one size and, by EXIF, one
+            lens.
+        matcher: which pairs of photographs are compared.
         seed: of every random choice.
-        overwrite: replace an existing result, where it is nothing but that.
+        overwrite: replace an existing result, if the folder contains nothing else.
 
     Raises:
-        CaptureError: fewer than two photographs, a damaged one, no model that holds two of them, or a result that would
-            take the place of photographs or of files that are not its own.
+        CaptureError: fewer than two photographs, a damaged one, no model with two of them, or a result that would
+            replace photographs or files of others.
     """
     photos = Path(photo_dir)
     options = SfmOptions(

@@ -32,8 +32,8 @@ class GsplatStrategy(DensityControl):
 
 @dataclass(frozen=True, kw_only=True)
 class InriaStrategy(GsplatStrategy):
-    """The same as Inria's code has it: a gradient at the threshold grows, and a step that edits the Gaussians moves
-    nothing."""
+    """The same rules as in Inria's code: a gradient exactly at the threshold grows, and a step that edits the Gaussians
+    has no update."""
 
     inclusive: bool = RECIPES["3DGS"].density.inclusive
     edits_replace_update: bool = RECIPES["3DGS"].updates.edits_replace_update
@@ -41,7 +41,7 @@ class InriaStrategy(GsplatStrategy):
 
 @dataclass(frozen=True, kw_only=True)
 class Inria2023Strategy(InriaStrategy):
-    """The same as before October 2024, with opacities that move twice as fast, which is up to a learning rate."""
+    """Inria's code before October 2024. Its opacities had twice the rate, which is a learning rate and not set here."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +51,7 @@ class POPStrategy(DensityControl):
     A Gaussian grows when its screen gradient is large (as in gsplat) or, from `blur_start_iter` to `blur_stop_iter`,
     when it is the dominant Gaussian of more than `theta_blur * H * W` pixels of a view. Opacities are never reset.
     Instead `regularizer` adds `lambda_pop * L_pop` to the loss, which pushes the opacities of Gaussians that dominate a
-    pixel to 1 and the others to 0. A trainer other than ours adds that term itself, where there is one:
+    pixel to 1 and the others to 0. Another trainer adds this term itself if `regularizer` returns one:
 
         state = strategy.initialize_state(scene_scale)
         for step, (viewmat, K, photograph) in enumerate(views):
@@ -94,7 +94,7 @@ class MiniSplattingStrategy(InriaStrategy):
 
     Attributes:
         reinit_iters: steps after which all Gaussians are replaced by points of the training views' depth.
-        reinit_points: how many points at most, shared out evenly to the views.
+        reinit_points: how many points at most, divided evenly among the views.
         reinit_opacity: of Gaussians that begin anew.
         sample_iter: step after which Gaussians are drawn by importance.
         sampling_factor: share of those with any importance that is drawn; 0.5 on Mip-NeRF 360, 0.3 on Tanks & Temples

@@ -66,73 +66,75 @@ _OF_OTHERS: Final = "; one from another package is known only where that is inst
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """Settings of a training run, as they are run; the defaults are the paper's.
+    """Settings of a training run as the run uses them; the defaults are the paper's.
 
     Attributes:
         data: the capture: a COLMAP folder, a folder with transforms.json, or a folder of photographs.
-        result_dir: where the run writes.
+        result_dir: the folder that the run writes to.
         max_steps: training steps, of `batch_size` views each.
-        batch_size: views of a step; the loss is the mean over them of the loss that a step of each alone would have.
-            Rates and step numbers stay as they are.
+        batch_size: views of a step; its loss is the mean of the losses that steps of each view alone would have. Rates
+            and step numbers do not change with it.
         seed: of the view order, the initial rotations and the split noise.
-        backend: what renders and trains: "fast" (CPU), "compiled" (CPU, with kernels in C++), "cuda", "ref" (the
-            oracle, slow), one that another package registers, or "auto": "cuda" where a GPU and the build are there,
-            else "compiled" where that was compiled, else "fast".
+        backend: renders and trains: "fast" (CPU), "compiled" (CPU, with kernels in C++), "cuda", "ref" (the oracle,
+            slow), one that another package registers, or "auto", which takes the first of "cuda", "compiled" and "fast"
+            that can run here.
         profile: the rasterizer's constants: "paper", "gsplat_1_5", "gsplat_1_6", "inria" (that of method "3dgs" and of
             those built on it), "speedy_splat", or one that another package registers.
-        near_plane: depth up to which a camera shows nothing, in units of the world that is trained in; None takes the
-            profile's, which Inria's family counts in the capture's own units: a run writes down what that comes to.
+        near_plane: depth up to which a camera shows nothing, in units of the training frame; None takes the profile's.
+            Profiles of Inria's family state it in the capture's own units, and the run records the converted value.
         eps2d: low-pass, px^2; None takes the profile's.
         antialiased: render with opacity compensation (Mip-Splatting) instead of classically.
-        factor: photographs are shrunk by it.
-        resize: how, where the capture does not bring them shrunk: "area" averages, "bicubic" does as Pillow does, and
-            so gsplat's example trainer, which also takes the full photographs (--images images) instead of those that
-            Mip-NeRF 360 brings (A32).
-        coarse_stop_iters: coarse to fine: the steps before each of these see the photographs shrunk by 2 once more, so
-            that (300, 600) shrinks by 4 until step 300 and by 2 until step 600; none in preset "paper".
-        test_every: every n-th view by file name is held out, 0 for none; of a capture that lists those views itself,
-            the listed ones.
+        factor: whole number by which photographs are shrunk.
+        resize: how they are shrunk if the capture has no photographs of that size: "area" averages, "bicubic" equals
+            Pillow's. gsplat's example trainer uses the latter, on the full photographs (--images images) instead of the
+            shrunk ones of Mip-NeRF 360 (A32).
+        coarse_stop_iters: coarse to fine: before each of these steps photographs are shrunk by a further factor of 2.
+            (300, 600) shrinks by 4 until step 300 and by 2 until step 600. Empty in preset "paper".
+        test_every: every n-th view by file name is held out, 0 holds none out; if a capture lists its held-out views,
+            these are.
         background: colour behind everything, and behind photographs with alpha. [0, 1]
         normalize: move the capture into gsplat's normalised world.
         sh_degree: highest band of the colours.
         sh_interval: steps between bands, from band 0 at step 0.
         init_opacity: opacity of the first Gaussians.
         init_scale: multiplies their size, which is the distance to their three nearest neighbours.
-        photometric: the loss between pixels, "l2" as in paper eq. 9, POP's, or "l1" as in eq. 2, that of the other
-            methods; or one that another package registers.
+        photometric: loss between pixels: "l2" (paper eq. 9, POP), "l1" (eq. 2, the other methods), or one that another
+            package registers.
         photometric_divisor: divides that term, as in the paper's figure of L1/n against L2.
-        lambda_ssim: weight of 1 - SSIM; the rest is that of the loss between pixels. POP's is 0.01, that of the other
-            methods 0.2.
-        l2_stop_iter: step from which eq. 2 (L1, 0.2) takes over; None never, as the paper says of POP alone that it
-            ends (A20).
+        lambda_ssim: weight of 1 - SSIM; the loss between pixels has the rest. It is 0.01 for POP and 0.2 for the other
+            methods.
+        l2_stop_iter: step from which eq. 2 (L1, 0.2) replaces the loss; None is never. The paper says only of the POP
+            term that it ends (A20).
         ssim_padding: "valid" as gsplat, or "same" as Inria (and method "3dgs").
         d_ssim_halved: (1 - SSIM) / 2 instead of 1 - SSIM.
         lr: learning rates.
-        depth_lambda: weight of the depth at the sparse points that a photograph sees (COLMAP's tracks), for captures of
-            few photographs: mean difference of disparities, times the scene's scale; gsplat's trainer has 0.01. 0: off.
-        opacity_reg: weight of the mean opacity, as gsplat's trainer has it; 0: off.
-        scale_reg: weight of the mean scale, per world unit, as gsplat's trainer has it; 0: off.
+        depth_lambda: weight of the depth term, for captures of few photographs: mean difference of disparities at the
+            sparse points that a photograph sees (COLMAP's tracks), times the scene's scale. gsplat's trainer has 0.01;
+            0 is off.
+        opacity_reg: weight of the mean opacity, as in gsplat's trainer; 0 is off.
+        scale_reg: weight of the mean scale, per world unit, as in gsplat's trainer; 0 is off.
         exposure: learn an affine map of colours for every photograph, for captures whose exposure or white balance
-            changes; held-out views are then also measured after fitting their colours (cc_psnr), as gsplat's trainer.
-        random_background: lay another colour behind everything at every step, drawn from seed and step: what nothing
-            covers costs then. A photograph with alpha is laid over the same one.
+            changes. Held-out views are then also measured after fitting their colours (cc_psnr), as in gsplat's
+            trainer.
+        random_background: draw another background colour at every step, from seed and step, so that uncovered pixels
+            cost something. A photograph with alpha is laid over the same colour.
         refine_cameras: learn a small rotation and translation of every training camera.
         appearance_lr: learning rates of exposures and cameras.
-        strategy: density control and the POP term; its type says which method this is.
-        threads: threads of one operation; results are the same bits for the same number, those of the native step
-            (backend "compiled") for any. 0 takes all cores.
-        eval_steps: after so many steps the held-out views are measured; the last step always counts.
-        save_steps: after so many steps a PLY and a checkpoint are kept; the last step always counts.
-        checkpoint_every: steps between the checkpoints a run resumes from; 0 writes none of these.
-        keep_checkpoints: how many of those are kept.
-        log_every: steps between records of metrics.jsonl; such a step also counts what is blended and traversed, which
-            doubles its cost.
+        strategy: density control and the POP term; its type is the method.
+        threads: threads of one operation; 0 takes all cores. Equal numbers give equal bits; the native step (backend
+            "compiled") gives the same bits for every number.
+        eval_steps: numbers of steps after which the held-out views are measured; the last step is always one.
+        save_steps: numbers of steps after which a PLY and a checkpoint are kept; the last step is always one.
+        checkpoint_every: steps between the checkpoints that a run resumes from; 0 writes none of them.
+        keep_checkpoints: how many of them are kept.
+        log_every: steps between records of metrics.jsonl; such a step also counts the blended and traversed Gaussians,
+            which doubles its cost.
         max_renders: held-out views saved as pictures at the end.
         lpips_vgg: weights of LPIPS on VGG16: one merged file, or backbone and linear layers; empty for none.
         lpips_alex: weights of LPIPS on AlexNet, in the same form.
-        target_cache_mb: memory for what SSIM needs of the photographs, kept between steps.
-        progress: show a progress bar when standard error is a terminal.
-        given: what these values come from; None where they were written down one by one.
+        target_cache_mb: memory for SSIM's moments of the photographs, which are kept between steps.
+        progress: show a progress bar if standard error is a terminal.
+        given: preset and explicit settings behind these values; None if each value was set by itself.
     """
 
     data: str = ""

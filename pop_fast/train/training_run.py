@@ -58,13 +58,13 @@ class TrainingRun:
     """A run of one capture.
 
     Attributes:
-        config: the settings, step numbers as they are run.
-        params: raw parameters.
-        optimizers: one Adam a parameter.
-        appearance: exposures and cameras that are learned.
-        strategy: the one of density control.
+        config: the settings as the run uses them.
+        params: raw parameters by name.
+        optimizers: one Adam for each parameter.
+        appearance: learned exposures and cameras.
+        strategy: density control.
         state: the strategy's state.
-        step: steps taken.
+        step: number of steps taken.
         updates: which parameters Adam moves at which step.
     """
 
@@ -90,15 +90,16 @@ class TrainingRun:
             config: the settings.
             capture: the photographs and cameras.
             resume: continue from the latest checkpoint of `config.result_dir`, or start where there is none.
-            overwrite: replace the results of an earlier run in `config.result_dir`, once the first step has been taken.
-            loading_seconds, sfm_seconds: how long reading and the search for cameras took, for the statistics.
+            overwrite: replace the results of an earlier run in `config.result_dir` after the first step.
+            loading_seconds, sfm_seconds: durations of reading and of the search for cameras, for the statistics.
             beside: texts to write next to cfg.json, by file name.
-            strategy: decides over the Gaussians in the place of the config's, by gsplat's protocol; on the CPU.
-            initial: raw parameters to start from, which are copied; None makes them from the capture's points. Their
-                precision is that of the training; a GPU trains in float32 only.
+            strategy: replaces the strategy of the config, with gsplat's protocol; on the CPU.
+            initial: raw parameters to start from, which are copied; None makes them from the capture's points. The
+                training has their precision; a GPU trains in float32 only.
             engine: takes the steps; None takes the one for `config.backend`.
             ranks: the processes that train together, of which this is one; the first one writes.
-            watch: is shown the run between steps, and changes nothing of it; with one, fewer steps are taken at a time.
+            watch: called with the run between steps; it must not change the run. With it, fewer steps are taken at a
+                time.
 
         Raises:
             PopError: the capture cannot be trained on, weights are missing, or the backend is not available or does
@@ -151,16 +152,16 @@ class TrainingRun:
     def run(self) -> dict[str, Any]:
         """Train to the end.
 
-        A run that is not resumed writes nothing, and replaces nothing, before it has taken a step: one that cannot take
-        any leaves the folder as it was.
+        A new run writes and replaces nothing before it has taken a step. If it cannot take one, the folder stays as it
+        was.
 
         Returns:
             The statistics of the last step, as in stats/val_step{step}.json; none from a process that does not write.
 
         Raises:
             PopError: the folder is in use, a checkpoint does not fit, or a number is no longer finite.
-            KeyboardInterrupt: after Ctrl-C or SIGTERM, when a checkpoint has been written; or at once after the second.
-                A step that was being taken is left, and changes nothing; a measurement is made when the run is resumed.
+            KeyboardInterrupt: after Ctrl-C or SIGTERM, when a checkpoint has been written; at once after the second
+                one. The current step is abandoned and changes nothing; a resumed run makes the pending measurement.
         """
         if self._ranks.writes and not isinstance(self.strategy, ForeignStrategy):
             for warning in find_warnings(self.config, self._train):
