@@ -411,6 +411,7 @@ EXEMPT = {
     "cuda_ext.gpu_check.stages": "shows what its own trainings and benchmarks have written",
     "cuda_ext.gpu_check.__main__:commit_of": "takes one text of a file that read_json has judged",
     "cuda_ext.host": OWN,
+    "cuda_ext.machine_code": OWN,
     "paper_repro.train_row:begin_from_base": "takes what load_checkpoint has judged",
     "paper_repro.train_row:_begin": "takes one text of its own note",
     "paper_repro.methods": OWN,
