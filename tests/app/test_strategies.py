@@ -230,7 +230,7 @@ def test_a_trainer_that_leaves_out_the_prior_is_warned() -> None:
 
 def documented_loop(steps: int, strategy: POPStrategy, learning_rate: float = 0.01) -> dict[str, torch.Tensor]:
     """Run the loop that the docstring shows another trainer, with `rasterization`; return the parameters."""
-    block = (POPStrategy.__doc__ or "").split("where there is one:")[1].split("The defaults are")[0]
+    block = (POPStrategy.__doc__ or "").split("if `regularizer` returns one:")[1].split("The defaults are")[0]
     params, _ = make(12, scale=0.3)
     params["means"].data[:, 2] += 4.0
     optimizers = {key: torch.optim.SGD([value], lr=learning_rate) for key, value in params.items()}

@@ -482,7 +482,7 @@ WRONG = {
     "a weight of D-SSIM": {"lambda_ssim": 1.001 * SHORT.lambda_ssim},
     "a share that is blur": {"density": replace(SHORT.density, theta_blur=0.5)},
     "a threshold of growth": {"density": replace(SHORT.density, grow_grad2d=10.0 * SHORT.density.grow_grad2d)},
-    "a step of the harmonics": {"sh_interval": 5},  # with 4 each step that it changes is near a threshold
+    "a step of the harmonics": {"sh_interval": 1},  # with 4 or more each step that it changes may be near a threshold
 }
 
 
