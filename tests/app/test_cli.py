@@ -98,6 +98,7 @@ def test_every_subcommand_explains_itself(pop: Pop, name: str) -> None:
     outcome = pop.done(*name.split(), "--help")
     assert outcome.out.startswith(f"usage: pop {name}")
     assert "Attributes:" not in outcome.out
+    assert pop.done("help", *name.split()).out == outcome.out
 
 
 @pytest.mark.parametrize("name", ["train", "eval", "render", "view", "explain", "export", "compare", "convert", "sfm"])
@@ -110,6 +111,7 @@ def test_no_line_of_help_breaks_off_where_the_window_has_room(pop, monkeypatch, 
 
 def test_help_shows_what_matters_first_and_help_all_all(pop: Pop) -> None:
     assert pop().out.startswith("usage: pop COMMAND")
+    assert pop("help").out == pop().out
     assert pop("--version").out.startswith("pop 0.")
     shown = pop("train", "--help").out
     assert "--pop.theta-blur" not in shown
