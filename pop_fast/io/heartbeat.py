@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
@@ -81,12 +82,36 @@ def duration(seconds: float) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
-def so_far(step: int, of: int, n_gaussians: int, seconds: float, latest: str) -> str:
-    """Tell how far a training is; `latest` is what was measured last, in words that begin with a comma, or nothing."""
+class Pace:
+    """How fast the latest steps were, over half a minute: the first steps have fewer Gaussians or smaller pictures.
+
+    Args:
+        step: that the count begins at, and `seconds` of the training until then.
+    """
+
+    def __init__(self, step: int, seconds: float) -> None:
+        self._points = deque([(step, seconds)])
+
+    def steps_a_second(self, step: int, seconds: float) -> float:
+        """Add where the training is, and give the mean since the point half a minute before."""
+        self._points.append((step, seconds))
+        while self._points[1][1] <= seconds - PERIOD:
+            self._points.popleft()
+        first, begun = self._points[0]
+        return (step - first) / max(seconds - begun, 1e-9)
+
+
+def so_far(step: int, of: int, n_gaussians: int, rate: float, latest: str) -> str:
+    """Tell how far a training is.
+
+    Args:
+        rate: steps a second.
+        latest: what was measured last, in words that begin with a comma, or nothing.
+    """
     line = f"step {step:,} of {of:,}, {n_gaussians:,} Gaussians{latest}"
     if step == of:
         return f"{line}, measuring and writing"
-    return f"{line}, {step / max(seconds, 1e-9):.1f} steps a second, {duration(seconds * (of - step) / step)} left"
+    return f"{line}, {rate:.1f} steps a second, {duration((of - step) / max(rate, 1e-9))} left"
 
 
 # s, before which the first ones say little of the rest

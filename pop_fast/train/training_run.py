@@ -27,7 +27,7 @@ from pop_fast.data.gaussians import initialize_params
 from pop_fast.density.passes import Passes
 from pop_fast.density.protocol import DensificationStep, Draws, ForeignStrategy, Strategy
 from pop_fast.errors import PopError
-from pop_fast.io.heartbeat import Heartbeat, so_far
+from pop_fast.io.heartbeat import Heartbeat, Pace, so_far
 from pop_fast.io.ply import Frame, save_ply
 from pop_fast.stages.covariance import opacities_from_logits
 from pop_fast.train import checkpoint as ckpt
@@ -205,6 +205,7 @@ class TrainingRun:
         bars = tqdm(total=config.max_steps, initial=self.step, disable=None if shown else True)
         # also where another process shows the run: all take the same steps at a time
         self._watched = self._ranks.any(self._watch is not None)
+        pace = Pace(self.step, self._times.train)
         with bars as bar, Heartbeat(shown, draw=bar.refresh) as beat:
             beat.say(f"step {self.step:,} of {config.max_steps:,}, {len(self.params['means']):,} Gaussians")
             while self.step < config.max_steps and not self._ranks.any(self._stop.asked):
@@ -212,8 +213,8 @@ class TrainingRun:
                 segment = self.take_steps(segment_end(config, self.strategy, self.step, longest))
                 if segment.stats:
                     self._log(segment, bar)
-                    n = len(self.params["means"])
-                    beat.say(so_far(self.step, config.max_steps, n, self._times.train, self._latest))
+                    n, rate = len(self.params["means"]), pace.steps_a_second(self.step, self._times.train)
+                    beat.say(so_far(self.step, config.max_steps, n, rate, self._latest))
                     if self._unwritten is not None:
                         # a rate can be so high that the first step is the last; that is no reason to replace anything
                         self._require_finite()

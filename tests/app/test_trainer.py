@@ -365,9 +365,17 @@ def test_stages_that_report_are_told_with_the_time_that_is_left(capsys, monkeypa
 
 def test_a_training_whose_steps_are_all_taken_says_what_it_does_then() -> None:
     left = "step 100 of 400, 50 Gaussians, 5.0 steps a second, 1 min 0 s left"
-    assert heartbeat.so_far(100, 400, 50, 20.0, "") == left
+    assert heartbeat.so_far(100, 400, 50, 5.0, "") == left
     done = "step 400 of 400, 50 Gaussians, PSNR 21.00, measuring and writing"
-    assert heartbeat.so_far(400, 400, 50, 80.0, ", PSNR 21.00") == done
+    assert heartbeat.so_far(400, 400, 50, 5.0, ", PSNR 21.00") == done
+
+
+def test_the_time_that_is_left_follows_from_the_latest_steps() -> None:
+    # continued at step 1,000, 100 s into the training; fast at first, then four steps a second
+    pace = heartbeat.Pace(1000, 100.0)
+    found = [pace.steps_a_second(step, seconds) for step, seconds in ((1010, 101.0), (1200, 120.0), (1320, 150.0))]
+    assert found == [10.0, 10.0, 4.0]
+    assert [pace.steps_a_second(1320 + 4 * k, 150.0 + k) for k in range(1, 31)] == [4.0] * 30
 
 
 @pytest.mark.parametrize("quiet", [True, False])
