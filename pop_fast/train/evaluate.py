@@ -192,6 +192,7 @@ def _keep_pictures(
 _MOST_VIEWS: Final = 4
 
 
+@torch.no_grad()
 def measure_encodings(
     backend: Any,
     params: Mapping[str, Tensor],
@@ -221,6 +222,7 @@ def measure_encodings(
         except PopError:
             continue
         back = apply_similarity(decoded(name, data)[0], world_transform)
-        psnr = evaluate(backend, back, some, config, sh_degree)["psnr"] if some else None
+        rendered = [render_view(backend, back, view, config, sh_degree).image for view in some]
+        mean = _mean([psnr(image, view.target(), view.mask) for image, view in zip(rendered, some, strict=True)])
         entry = {"format": name, "bytes": len(data), "num_gaussians": len(own["means"])}
-        yield {**entry, "psnr": psnr, "views": len(some)}
+        yield {**entry, "psnr": mean, "views": len(some)}

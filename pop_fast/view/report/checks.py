@@ -217,17 +217,16 @@ def are_floaters(means: Tensor, capture: Capture, test_every: int) -> Tensor:
     """
     if _RANDOM in capture.source:
         raise PopError(f"{capture.name}: has no sparse points of its own, which are needed to find floaters")
-    found = torch.zeros(len(means), dtype=torch.bool)
+    centers, found = means.detach().cpu().double(), torch.zeros(len(means), dtype=torch.bool)
     for view in (*capture.views, *orbit_views(capture.train_views(test_every))):
         limit = near_limit(view, capture.points)
         if limit is None:
             continue
+        near = torch.nonzero(_are_nearer(centers, view, limit)).flatten()
         viewmat, K = (torch.from_numpy(matrix).double() for matrix in (view.viewmat, view.K))
-        seen = means.detach().cpu().double() @ viewmat[:3, :3].T + viewmat[:3, 3]
-        near = (seen[:, 2] > 0.0) & (seen[:, 2] < limit)
-        pixels = seen @ K[:2].T / seen[:, 2:]
-        size = torch.tensor([view.width, view.height])
-        found |= near & ((pixels >= 0.0) & (pixels < size)).all(1)
+        pixels = (centers[near] @ viewmat[:3, :3].T + viewmat[:3, 3]) @ K.T
+        inside = (pixels[:, :2] >= 0.0) & (pixels[:, :2] < torch.tensor([view.width, view.height]) * pixels[:, 2:])
+        found[near[inside.all(1)]] = True
     return found
 
 
