@@ -210,6 +210,15 @@ def test_a_crop_is_said_exactly_in_any_unit_and_far_from_the_origin(box: Box) ->
     assert panel.crop == pytest.approx(crop, rel=1e-11)
 
 
+@pytest.mark.parametrize(("typed", "meant"), [(5, 1.0), (-1, 0.0), (0.25, 0.25)])
+def test_an_opacity_that_is_being_typed_is_brought_into_its_range(typed: float, meant: float) -> None:
+    client = MagicMock()
+    client.gui.add_multi_slider = lambda axis, low, high, step, ends: MagicMock(value=ends, min=low, max=high)
+    client.gui.add_slider.return_value.value = typed
+    panel = Panel(client, ["a"], "x", (0.0,) * 3 + (1.0,) * 3, np.eye(4), {}, lambda call: lambda event: call())
+    assert panel.min_opacity == meant
+
+
 def test_a_recorded_path_is_rendered(pop: Pop, shared_result: Path, shown: Shown, tmp_path: Path) -> None:
     scene, state, capture = shown
     cameras = [KeyCamera(view.viewmat, state.fov_y) for view in capture.train_views(8)[:3]]

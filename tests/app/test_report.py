@@ -576,6 +576,15 @@ def test_depth_maps_share_a_range_that_outliers_do_not_set() -> None:
     assert depth_range([]) == (0.1, 1.0)
 
 
+# the charts whose values under the pointer, at a share of the chart's width, stick out of the window
+TIPS_FIT = """share => [...document.querySelectorAll('[data-chart]')].filter(chart => {
+  const box = chart.querySelector('svg').getBoundingClientRect(), clientX = box.left + share * box.width;
+  chart.querySelector('svg').dispatchEvent(new PointerEvent('pointermove', {clientX}));
+  const tip = chart.querySelector('.tip'), {left, right} = tip.getBoundingClientRect();
+  return tip.hidden || left < 0 || right > innerWidth;
+}).map(chart => chart.textContent)"""
+
+
 def test_the_slider_uncovers_the_photograph_and_the_orbit_plays(shared_result: Path, tmp_path: Path) -> None:
     with browser(tmp_path / "browser") as tab:
         tab.open(shared_result / "report.html", 1000, 800)
@@ -588,6 +597,11 @@ def test_the_slider_uncovers_the_photograph_and_the_orbit_plays(shared_result: P
         assert tab.value(clip) == "inset(0px 0px 0px 20%)"
         tab.wait_for("document.querySelector('video').readyState >= 2")
         assert tab.value("document.querySelector('video').duration") == pytest.approx(4.0, abs=0.2)
+        # no picture comes late and moves what is being read
+        assert tab.value("[...document.images].every(each => each.naturalWidth > 0)")
+        tab.call("Emulation.setDeviceMetricsOverride", width=320, height=800, deviceScaleFactor=1, mobile=True)
+        for share in (0.15, 0.45, 0.55, 0.95):
+            assert tab.value(f"({TIPS_FIT})({share})") == []
         assert tab.errors == []
         assert all(url.startswith(("file:", "blob:", "about:", "data:")) for url in tab.requests)
 

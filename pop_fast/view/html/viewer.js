@@ -165,7 +165,8 @@
 
   let camera, chosen = 0;
   function choose(index) {
-    chosen = (index + scene.cameras.length) % scene.cameras.length;
+    const n = scene.cameras.length;
+    chosen = ((index % n) + n) % n;
     const given = scene.cameras[chosen];
     // the file's frame is half a turn about x from that of the cameras
     const axes = given.rotation.map(([x, y, z]) => [x, -y, -z]);
@@ -326,7 +327,9 @@
     n: () => choose(chosen + 1), p: () => choose(chosen - 1), r: () => choose(chosen),
   };
   window.addEventListener("keydown", (event) => {
-    const act = !event.ctrlKey && !event.metaKey && !event.altKey && keys[event.key];
+    // Caps Lock makes letters capital
+    const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+    const act = !event.ctrlKey && !event.metaKey && !event.altKey && keys[key];
     if (act) {
       event.preventDefault();
       act();
@@ -340,7 +343,8 @@
 
   document.body.classList.toggle("bare", hash.has("bare"));
   say("Sorting ...");
-  choose(hash.has("camera") ? Number(hash.get("camera")) || 0 : scene.first);
+  const first = hash.has("camera") ? Number(hash.get("camera")) : NaN;
+  choose(Number.isInteger(first) ? first : scene.first);
 })().catch((error) => {
   const message = document.getElementById("message");
   message.textContent = `The splat cannot be shown: ${error.message}`;

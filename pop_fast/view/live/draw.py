@@ -329,7 +329,7 @@ class Panel:
         self._add_cameras(gui)
         self._add_files(gui)
         self._use(self._mode, one_of(MODES), self._update)
-        self._use(self._opacity, number(0.0, 1.0), self._update)
+        self._use(self._opacity, number, self._update)
         self._use(self._side, one_of(tuple(map(str, _LONGEST))), self._update)
         self._use(self._cropped, flag, self._update)
         for control in self._ranges:
@@ -346,8 +346,8 @@ class Panel:
 
     @property
     def min_opacity(self) -> float:
-        """Gaussians of less are left out."""
-        return float(self._opacity.value)
+        """Gaussians of less are left out; in [0, 1], whatever is being typed."""
+        return min(max(float(self._opacity.value), 0.0), 1.0)
 
     @property
     def longest(self) -> int:

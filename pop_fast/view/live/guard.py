@@ -66,14 +66,10 @@ def one_of(options: Sequence[str]) -> Rule:
     return check
 
 
-def number(low: float, high: float) -> Rule:
-    """Make the rule of a slider."""
-
-    def check(value: Any) -> None:
-        if not _is_number(value) or not low - _SLACK <= value <= high + _SLACK:
-            raise PopError(f"a browser set a slider to {shortened(value)}; it goes from {low:g} to {high:g}")
-
-    return check
+def number(value: Any) -> None:
+    """Check what a slider with a box for its number is set to: the page sends any number while it is typed."""
+    if not _is_number(value):
+        raise PopError(f"a browser set a slider to {shortened(value)}; it takes a number")
 
 
 def interval(low: float, high: float) -> Rule:

@@ -39,7 +39,9 @@ for (const figure of document.querySelectorAll("[data-chart]")) {
     const outer = figure.getBoundingClientRect();
     const x = box.left - outer.left + (at / width) * box.width;
     tip.style.top = box.top - outer.top + 0.4 * box.height + "px";
-    tip.style.left = (x < outer.width / 2 ? x + 12 : x - tip.offsetWidth - 12) + "px";
+    const wished = x < outer.width / 2 ? x + 12 : x - tip.offsetWidth - 12;
+    // on a phone it is wider than either half
+    tip.style.left = Math.max(0, Math.min(wished, outer.width - tip.offsetWidth)) + "px";
   };
   svg.addEventListener("pointermove", show);
   svg.addEventListener("pointerdown", show);

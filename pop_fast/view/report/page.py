@@ -327,10 +327,7 @@ def _view(view: ReportView, error: np.ndarray, top: float, near: float, far: flo
 
 def _figure(what: str, name: str, picture: np.ndarray) -> str:
     uri = images.data_uri(images.fit(picture))
-    return (
-        f'<figure><img loading="lazy" alt="{what} of {name}" src="{uri}">'
-        f'<figcaption class="caption">{what}</figcaption></figure>'
-    )
+    return f'<figure><img alt="{what} of {name}" src="{uri}"><figcaption class="caption">{what}</figcaption></figure>'
 
 
 def _bar(what: str, colors: str, low: str, high: str) -> str:
