@@ -125,8 +125,10 @@ REPRODUCTION = [ROOT / "paper_repro" / name for name in ("README.md", "protocol.
 
 
 @pytest.mark.parametrize("page", [*PAGES, *REPRODUCTION], ids=lambda page: f"{page.parent.name}/{page.name}")
-def test_every_link_leads_somewhere(page):
-    targets = re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8"))
+def test_every_link_leads_somewhere_and_no_conflict_of_a_merge_is_left(page):
+    text = page.read_text(encoding="utf-8")
+    assert not re.search(r"^(<<<<<<<|>>>>>>>) ", text, re.MULTILINE)
+    targets = re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text)
     assert [target for target in targets if "://" in target or not (page.parent / target).exists()] == []
 
 
