@@ -73,7 +73,10 @@ class Fading(DensityControl):
     fade_every: int = 7
 
     def changes_after(self, step):
-        return step > 0 and step % self.fade_every == 0
+        return self.fade_every > 0 and step > 0 and step % self.fade_every == 0
+
+    def at_rest(self):
+        return replace(super().at_rest(), fade_every=0)
 
     def edit(self, context):
         from pop_fast.density import DensificationStep
