@@ -158,7 +158,7 @@ class MiniSplattingStrategy(InriaStrategy):
         """Replace all Gaussians by points of the training views, with their pixels' colours."""
         import torch
 
-        from pop_fast.data.gaussians import SH_C0
+        from pop_fast.io.formats.cloud import SH_C0
 
         found = [self._points_of_view(context, index) for index in range(context.views.n_views)]
         points, colors = zip(*found, strict=True)
