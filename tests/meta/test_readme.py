@@ -124,12 +124,21 @@ def test_the_rooms_share_most_of_their_functions_and_documented_differences_are_
 REPRODUCTION = [ROOT / "paper_repro" / name for name in ("README.md", "protocol.md", "claims.md")]
 
 
-@pytest.mark.parametrize("page", [*PAGES, *REPRODUCTION], ids=lambda page: f"{page.parent.name}/{page.name}")
+@pytest.mark.parametrize(
+    "page", [*PAGES, ROOT / "CONTRIBUTING.md", *REPRODUCTION], ids=lambda page: f"{page.parent.name}/{page.name}"
+)
 def test_every_link_leads_somewhere_and_no_conflict_of_a_merge_is_left(page):
     text = page.read_text(encoding="utf-8")
     assert not re.search(r"^(<<<<<<<|>>>>>>>) ", text, re.MULTILINE)
     targets = re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text)
     assert [target for target in targets if "://" in target or not (page.parent / target).exists()] == []
+
+
+def test_what_contributors_are_led_to_is_there() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    named = re.findall(r"`((?:pop_ref|pop_fast|cuda_ext|paper_repro|benchmarks|tests|docs)/[\w./-]*)`", text)
+    assert len(named) > 25
+    assert [name for name in named if not (ROOT / name).exists()] == []
 
 
 def shell_lines() -> list[str]:
