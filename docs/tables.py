@@ -1,7 +1,7 @@
 """The tables of README.md and of the pages in docs/, which are made from the sources and from runs.
 
 python docs/tables.py            print them
-python docs/tables.py --write    put them into their pages, between their marks, and write docs/MUTANTS.md
+python docs/tables.py --write    put them into their pages, between their marks, and write MUTANTS.md and LAWS.md
 python docs/tables.py --check    exit with 1 when a page holds something else
 """
 
@@ -31,6 +31,8 @@ from paper_repro.status import outcome as outcome_of
 from paper_repro.status import settled as settled_of
 from pop_fast.train.presets import METHODS, options_for
 from pop_ref.conformance.capabilities import STAGES as KIT_STAGES
+from pop_ref.conformance.catalogue import FILE as LAW_LIST
+from pop_ref.conformance.catalogue import catalogue
 from pop_ref.conformance.law_coverage import LIMITS, digest_of, reason
 from pop_ref.conformance.laws import STANDS_IN
 from pop_ref.conformance.mutants import BLACK_BOXES, FAMILIES, MUTANTS, PROGRAM
@@ -490,9 +492,11 @@ def mutants() -> str:
     boxes = [[b.name.replace("_", " "), b.story, b.law.partition(":")[2].replace("_", " ")] for b in BLACK_BOXES]
     of_mutants = table(["mutant", "what happened", "file", "stage", "killed by"], rows)
     of_boxes = table(["black box", "what it does", "killed by"], boxes)
-    return f"{head}{of_mutants}{BOX_HEAD.format(n=len(BLACK_BOXES))}{of_boxes}"
+    return f"{head}{of_mutants}{BOX_HEAD.format(n=len(BLACK_BOXES))}{of_boxes}\n"
 
 
+# pages that are made as a whole
+LISTS: dict[Path, Callable[[], str]] = {MUTANT_LIST: mutants, LAW_LIST: catalogue}
 TABLES: dict[str, Callable[[], str]] = {
     "rosetta": rosetta,
     "conventions": conventions,
@@ -554,13 +558,14 @@ def main(words: list[str]) -> int:
     if "--write" in words:
         for page in PAGES:
             page.write_text(with_tables(page), encoding="utf-8")
-        MUTANT_LIST.write_text(f"{mutants()}\n", encoding="utf-8")
+        for file, made in LISTS.items():
+            file.write_text(made(), encoding="utf-8")
         return 0
     if "--check" not in words:
         print("\n\n".join(make() for make in TABLES.values()))
         return 0
     stale = [page for page in PAGES if with_tables(page) != page.read_text(encoding="utf-8")]
-    stale += [MUTANT_LIST] if MUTANT_LIST.read_text(encoding="utf-8") != f"{mutants()}\n" else []
+    stale += [file for file, made in LISTS.items() if made() != file.read_text(encoding="utf-8")]
     for page in stale:
         print(f"{page.name}: a table is not what sources and runs say; run 'python docs/tables.py --write'")
     return 1 if stale else 0

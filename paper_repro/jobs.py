@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 CONFIGS: Final = Path(__file__).resolve().parent / "configs"
 # in the order of the tables; what they hold is in the files
-_OWN: Final = (
+_ORDER: Final = (
     *("3dgs", "3dgs_2023", "gsplat", "pup", "pup_star", "mini_splatting", "mini_splatting_star"),
     *("taming", "speedy_splat", "pop"),
     *("l2", "l2_blur", "l2_pop", "reset", "blur_3k_4k", "blur_3k_11k", "blur_3k_15k"),
@@ -35,9 +35,17 @@ _OWN: Final = (
     *("final_prune", "opacity_entropy"),
     *("pop_visible", "pop_any_view", "l2_blur_any_view", "pop_sum", "pop_size_prune", "pop_prune_002"),
 )
+
+
+def own_rows(folder: Path) -> dict[str, Path]:
+    """List the files of rows: those of the paper and its readings in the order of the tables, then any others."""
+    names = dict.fromkeys((*_ORDER, *sorted(path.stem for path in folder.glob("*.toml"))))
+    return {name: folder / f"{name}.toml" for name in names}
+
+
 # another package adds a row as the path of its file, under the entry point group or with `ROWS.register`
 ROWS: Final[Registry[Path]] = Registry(
-    "row", "pop_splatting.rows", {name: CONFIGS / f"{name}.toml" for name in _OWN}, needs=("read_text",), error=PopError
+    "row", "pop_splatting.rows", own_rows(CONFIGS), needs=("read_text",), error=PopError
 )
 # floats of one Gaussian in the files whose size the tables give: gsplat's checkpoint, and Inria's PLY with its normals
 _BYTES: Final = (236, 248)
@@ -106,12 +114,12 @@ def load_row(name: str, folder: Path = CONFIGS) -> Row:
 
 
 def added_rows() -> list[Row]:
-    """Read the rows of other packages."""
-    return [load_row(name) for name in ROWS if name not in _OWN]
+    """Read the rows that have no place in the order of the tables: new ones, and those of other packages."""
+    return [load_row(name) for name in ROWS if name not in _ORDER]
 
 
 def _file_of(name: str, folder: Path) -> Path:
-    return ROWS[name] if name not in _OWN and name in ROWS else folder / f"{name}.toml"
+    return ROWS[name] if name not in _ORDER and name in ROWS else folder / f"{name}.toml"
 
 
 def load_rows() -> list[Row]:

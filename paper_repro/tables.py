@@ -155,7 +155,7 @@ def table(number: int, scale: str, results: Iterable[Result], absent: Iterable[s
 
 
 def beyond_rows() -> dict[str, str]:
-    """Return what goes beyond the paper, by row: ours, and the rows of other packages."""
+    """Return what goes beyond the paper, by row: ours, new rows, and those of other packages."""
     return BEYOND | {row.name: row.title for row in added_rows()}
 
 

@@ -10,10 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from pop_fast.data.capture import Capture
 from pop_fast.errors import CaptureError, PopError
+from pop_fast.io.formats.cloud import SH_C0
 from pop_fast.stages.density import mean_squared_distances
 from pop_fast.stages.harmonics import sh_basis
-
-SH_C0 = 0.28209479177387814
 
 
 def initialize_params(

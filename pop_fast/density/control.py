@@ -107,6 +107,15 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         floor = min(SHORTEST_REFINE_EVERY, self.refine_every)
         return replace(self, **changed, refine_every=max(round(self.refine_every * factor), floor))
 
+    def at_rest(self) -> Self:
+        """Return the same settings with no change of the Gaussians and no turn of a schedule, for steps after the last.
+
+        A method that has settings of its own for when the Gaussians change leaves those changes out here too.
+        """
+        never = dict.fromkeys(("refine_stop_iter", "reset_every", "refine_scale2d_stop_iter", "blur_start_iter"), 0)
+        never |= dict.fromkeys(("means_rewind_iter", "rounds_start_iter"), 0)
+        return replace(self, **never, blur_stop_iter=-1, final_prune_iter=-1, reset_at_zero=False)
+
     @property
     def adam_restarts(self) -> tuple[int, ...]:
         """Return the steps after which Adam begins anew."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, Final, Literal
+from typing import TYPE_CHECKING, ClassVar, Final, Literal, Self
 
 from pop_fast.density.control import DensityControl
 from pop_fast.density.protocol import DensificationContext, DensificationStep, Params
@@ -133,6 +133,10 @@ class MiniSplattingStrategy(InriaStrategy):
         """Return the steps after which Gaussians are replaced or pruned by importance."""
         return (*self.reinit_iters, self.sample_iter, self.prune_iter)
 
+    def at_rest(self) -> Self:
+        """Return the same settings without changes of the Gaussians."""
+        return replace(super().at_rest(), reinit_iters=(), sample_iter=-1, prune_iter=-1)
+
     def is_refine_step(self, step: int) -> bool:
         """Tell whether Gaussians are cloned and split after this step: not where they are replaced."""
         return super().is_refine_step(step) and step not in self.reinit_iters
@@ -154,7 +158,7 @@ class MiniSplattingStrategy(InriaStrategy):
         """Replace all Gaussians by points of the training views, with their pixels' colours."""
         import torch
 
-        from pop_fast.data.gaussians import SH_C0
+        from pop_fast.io.formats.cloud import SH_C0
 
         found = [self._points_of_view(context, index) for index in range(context.views.n_views)]
         points, colors = zip(*found, strict=True)
@@ -311,6 +315,10 @@ class SpeedySplatStrategy(InriaStrategy):
     hard_prune_iters: tuple[int, ...] = (15_000, 18_000, 21_000, 24_000, 27_000)
     hard_prune_share: float = 0.3
     scaled_steps = (*InriaStrategy.scaled_steps, "soft_prune_iters", "hard_prune_iters")
+
+    def at_rest(self) -> Self:
+        """Return the same settings without changes of the Gaussians."""
+        return replace(super().at_rest(), soft_prune_iters=(), hard_prune_iters=())
 
     def prune_share_at(self, step: int) -> float:
         """Return the share of the Gaussians that is removed by sensitivity after this step."""

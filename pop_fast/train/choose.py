@@ -24,10 +24,11 @@ def choose_backend(config: TrainConfig, resume: bool = False) -> tuple[TrainConf
     """
     chosen, why = _choose(config, resume)
     step = get_backend(chosen.backend).whole_step()
-    name = None if step is None else step.unknown_setting(chosen)
-    if name is None or get_backend(chosen.backend).device != "cpu":
+    unknown = None if step is None else next(step.unknown(chosen), None)
+    if unknown is None or get_backend(chosen.backend).device != "cpu":
         return chosen, why
-    return chosen, f"{why}; its fused step has no {name}, so autograd is used"
+    setting, value, _ = unknown
+    return chosen, f"{why}; its fused step does not take {setting} = {value}, so autograd is used"
 
 
 def _choose(config: TrainConfig, resume: bool) -> tuple[TrainConfig, str]:

@@ -26,9 +26,10 @@ from pop_fast.train.lpips import LPIPS, VARIANTS
 from pop_fast.train.results import ResultFolder
 from pop_fast.train.signals import heard
 from pop_fast.train.views import Rendered, ViewTensors, evenly, render_view
+from pop_ref.constants import PAPER
 
 NO_LPIPS = "no weights were given (lpips_vgg, lpips_alex)"
-ALPHA_FLOOR = 1.0 / 255.0
+ALPHA_FLOOR: Final = PAPER.alpha_floor
 
 
 @dataclass(frozen=True)

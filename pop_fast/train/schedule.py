@@ -9,7 +9,7 @@ the Gaussians are trained among has changed.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, Final
 
 import torch
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from pop_fast.density.control import DensityControl
 from pop_fast.density.protocol import ForeignStrategy
+from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.steps import Phase, Updates
 from pop_ref.settings import BETAS, PARAMETERS, LearningRates, UpdateRules
@@ -182,25 +183,22 @@ class ViewOrder:
 
 # what the positions' rate begins at, over its last value
 _MEANS_AGAIN: Final = 10.0
-# settings of every method that time a change of the Gaussians or of the schedule, and what each is when there is none
-_NEVER: Final[dict[str, Any]] = {
-    **dict.fromkeys(("refine_stop_iter", "reset_every", "blur_start_iter", "refine_scale2d_stop_iter"), 0),
-    **dict.fromkeys(("means_rewind_iter", "rounds_start_iter"), 0),
-    **dict.fromkeys(("final_prune_iter", "blur_stop_iter", "sample_iter", "prune_iter"), -1),
-    **dict.fromkeys(("prune_shares", "reinit_iters", "soft_prune_iters", "hard_prune_iters"), ()),
-    "reset_at_zero": False,
-}
-
-
-def at_rest(strategy: DensityControl) -> DensityControl:
-    """Return the strategy of a method with every change of the Gaussians left out."""
-    own = {field.name for field in fields(strategy)}
-    return replace(strategy, **{name: value for name, value in _NEVER.items() if name in own})
 
 
 def refining(config: TrainConfig, steps: int) -> TrainConfig:
-    """Return the settings of a training that continues after the last step of another one."""
+    """Return the settings of a training that continues after the last step of another one.
+
+    Raises:
+        PopError: the method, of another package, edits the Gaussians even at rest; names its class.
+    """
     last, plan, lr = config.max_steps - 1, config.strategy, config.lr
+    resting = plan.at_rest()
+    edits = next((step for step in range(steps) if resting.changes_after(step)), None)
+    if edits is not None:
+        name = type(plan).__name__
+        raise PopError(
+            f"{name} would edit the Gaussians {edits + 1} steps after its training; give it a method at_rest"
+        )
     degree = active_sh_degree(last, config.sh_interval, config.sh_degree, plan.sh_start_iter)
     # a curve ends one step after the last, but a round of pruning and refining at its last
     end = torch.tensor([last if plan.rounds_start_iter > 0 else config.max_steps], dtype=torch.float64)
@@ -212,7 +210,7 @@ def refining(config: TrainConfig, steps: int) -> TrainConfig:
     }
     ended["opacities"] = factor * lr.opacities
     strategy = replace(
-        at_rest(plan),
+        resting,
         # bands open at regular steps, which are counted from a past in which those in use have opened
         sh_start_iter=-degree * steps,
         pop_start_iter=0,

@@ -6,7 +6,7 @@ import importlib
 import os
 import sys
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import Any
 
 import numpy as np
@@ -47,7 +47,8 @@ def function_named(path: str) -> Callable[..., Any]:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         raise Unavailable(f"{path} needs {error.name}, which is not installed and not in {os.getcwd()}") from error
-    function = getattr(module, attribute, None)
+    # also of a backend or renderer that is a value of the module, as my.module:renderer.rasterization
+    function: Any = reduce(lambda found, name: getattr(found, name, None), attribute.split("."), module)
     if not callable(function):
         raise ValueError(f"module {module_name} has no function {attribute}")
     return function

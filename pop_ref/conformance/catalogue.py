@@ -1,4 +1,4 @@
-"""The written list of laws: `python -m pop_ref.conformance.catalogue > pop_ref/conformance/LAWS.md`."""
+"""The written list of laws, LAWS.md, which `docs/tables.py` writes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pop_ref.conformance.mutants.trial import every_law
 FILE = Path(__file__).with_name("LAWS.md")
 HEAD = """# What the kit asks of a rasterizer
 
-Made by `python -m pop_ref.conformance.catalogue`; a test holds it to the code.
+Made by `python docs/tables.py --write`; a test holds it to the code.
 
 ```sh
 pip install 'pop-ref[conformance]'
@@ -131,7 +131,3 @@ def catalogue() -> str:
         names = sorted(law.name for law in laws if law.stage == stage)
         parts.append(f"### {stage}\n\n" + "\n".join(f"- {name.replace('_', ' ')}" for name in names) + "\n")
     return "\n".join(parts)
-
-
-if __name__ == "__main__":
-    print(catalogue(), end="")

@@ -28,7 +28,7 @@ from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.engines import engine_of, torch_engine
 from pop_fast.train.model import KEYS
 from pop_fast.train.presets import METHODS
-from pop_fast.train.schedule import at_rest, phase_at, refining, segment_end, updates_of, updates_of_strategy
+from pop_fast.train.schedule import phase_at, refining, segment_end, updates_of, updates_of_strategy
 from pop_fast.train.stepper import Engine, FusedStepper, step_settings
 from pop_fast.train.steps import Collected, Phase, StepSettings, StepStats, why_not_trained
 from pop_fast.train.torch_stepper import BatchStepper
@@ -368,12 +368,21 @@ def test_what_is_shown_is_found_in_pieces_as_at_once(monkeypatch):
 @pytest.mark.parametrize("method", METHODS)
 def test_density_control_of_every_method_can_rest(method):
     config = TrainConfig.of(method=method, preset="quick")
-    resting = at_rest(config.strategy)
+    resting = config.strategy.at_rest()
     steps = range(config.max_steps)
     assert any(config.strategy.changes_after(step) for step in steps)
     assert not any(resting.changes_after(step) or resting.needs_passes(step) for step in steps)
     assert not set(resting.adam_restarts) & set(steps)
     assert type(resting) is type(config.strategy)
+
+
+def test_a_method_that_does_not_rest_is_refused_before_it_edits_a_finished_splat():
+    class Restless(POPStrategy):
+        def changes_after(self, step):
+            return step % 7 == 6
+
+    with pytest.raises(PopError, match=r"Restless would edit the Gaussians 7 steps after .* give it a method at_rest"):
+        refining(replace(tiny_config("nowhere"), strategy=Restless()), STEPS)
 
 
 @pytest.mark.parametrize("method", METHODS)

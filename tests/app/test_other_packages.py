@@ -73,7 +73,10 @@ class Fading(DensityControl):
     fade_every: int = 7
 
     def changes_after(self, step):
-        return step > 0 and step % self.fade_every == 0
+        return self.fade_every > 0 and step > 0 and step % self.fade_every == 0
+
+    def at_rest(self):
+        return replace(super().at_rest(), fade_every=0)
 
     def edit(self, context):
         from pop_fast.density import DensificationStep
@@ -317,7 +320,9 @@ def installed() -> Iterator[pytest.MonkeyPatch]:
 
 @pytest.mark.usefixtures("installed")
 def test_a_registered_backend_is_known_by_its_name_and_draws_and_one_that_cannot_be_loaded_is_named() -> None:
-    assert api_backend.backend_names() == ("fast", "compiled", "cuda", "ref", "mine", "broken")
+    *own, added, unloadable = api_backend.backend_names()
+    assert (added, unloadable) == ("mine", "broken")
+    assert {"fast", "compiled", "cuda", "ref"} <= set(own)
     expected = rasterization(**scene(), **cameras(), backend="fast")[0]
     for mine in ("mine", api_backend.get_backend("mine")):
         assert torch.equal(rasterization(**scene(), **cameras(), backend=mine)[0], expected)
@@ -329,7 +334,7 @@ def test_a_name_that_nobody_registers_is_refused_before_anything_is_written(inst
     made = TrainConfig.of(backend="mine").to_json()
     installed.undo()
     BACKENDS.look_again()
-    names = r"backend is 'mine'; it must be one of auto, fast, compiled, cuda, ref; one"
+    names = f"backend is 'mine'; it must be one of auto, {', '.join(api_backend.backend_names())}; one"
     for make in (TrainConfig, TrainConfig.of):
         with pytest.raises(PopError, match=names):
             make(backend="mine")

@@ -88,16 +88,18 @@ def test_the_walk_through_adds_pictures_and_its_last_chapters_the_program(path: 
     allowed = {"numpy", "pop_ref", "matplotlib"}
     if not path.name.startswith("chapter_"):
         allowed |= {"markdown_it", "mdit_py_plugins", "latex2mathml", "pygments"}
-    last = path.name.startswith(("chapter_10", "chapter_11", "chapter_12"))
+    trains, last = (path.name.startswith(("chapter_10", "chapter_11", *more)) for more in ((), ("chapter_12",)))
     # the photographs that chapters begin with are made and read without torch
     capture = path.name.startswith(("chapter_00", "chapter_09b"))
-    if last or capture:
+    if trains or capture:
         allowed |= {"pop_fast"}
+    if trains:
+        allowed |= {"torch"}
     if last:
-        allowed |= {"torch", "hypothesis"}
+        allowed |= {"hypothesis"}
     assert not _foreign(path, allowed), f"{_name(path)} imports {_foreign(path, allowed)}"
     program = {m for m in _imports(path) if m.startswith("pop_fast")}
-    assert last or program <= {"pop_fast.data", "pop_fast.demo"}, f"{_name(path)} imports {program}"
+    assert trains or program <= {"pop_fast.data", "pop_fast.demo"}, f"{_name(path)} imports {program}"
     # the kit judges the mistakes that readers look for, and is explained at the end
     kit = [m for m in _imports(path) if m.startswith("pop_ref.conformance")]
     assert last or path.name == "bugs.py" or not kit, f"{_name(path)} imports {kit}"

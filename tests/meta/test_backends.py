@@ -10,6 +10,7 @@ import re
 import sys
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -27,6 +28,7 @@ from pop_ref.conformance.backends import (
     ELSEWHERE,
     Absent,
     Unavailable,
+    function_named,
     made_by,
     require_a_picture,
     shipped,
@@ -457,6 +459,9 @@ def test_an_adapter_is_found_by_its_path_and_must_be_one() -> None:
         made_by("tests.meta.test_backends:Nobody")
     with pytest.raises(Unavailable, match=r"no_such\.module:Mine needs no_such, which is not installed"):
         made_by("no_such.module:Mine")
+    assert function_named("pathlib:Path.home") == Path.home
+    with pytest.raises(ValueError, match=r"module pathlib has no function Nobody\.home"):
+        function_named("pathlib:Nobody.home")
 
 
 @pytest.mark.parametrize("name", ["compiled64", "compiled32"])

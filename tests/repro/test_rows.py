@@ -45,6 +45,7 @@ from paper_repro.scenes import (
     scene_named,
     source_of,
 )
+from paper_repro.tables import beyond_rows
 from pop_fast.cli.train import arguments
 from pop_fast.data import load_capture
 from pop_fast.demo import make_demo
@@ -93,6 +94,17 @@ READINGS = {
     "pop_sum": ("blur_window", "sum"),
     "pop_size_prune": ("prune_too_big", True),
 }
+
+
+def test_a_new_file_is_a_row_after_those_of_the_tables_and_stands_in_the_table_of_what_goes_beyond(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "zoned.toml").write_text((CONFIGS / "pop_prune_002.toml").read_text().replace("0.02", "0.03"))
+    rows = jobs.own_rows(tmp_path)
+    assert list(rows) == [*ROWS, "zoned"]
+    monkeypatch.setitem(ROWS._given, "zoned", rows["zoned"])
+    assert job_named("zoned", "demo", "toy").config().strategy.prune_opa == 0.03
+    assert list(beyond_rows().items())[-1] == ("zoned", load_row("zoned").title)
 
 
 def test_every_file_is_a_row_and_every_row_has_a_file():

@@ -19,6 +19,7 @@ from pop_fast.data.capture import Capture
 from pop_fast.data.gaussians import initialize_params
 from pop_fast.errors import PopError
 from pop_fast.stages import appearance as stages
+from pop_fast.stages.losses import Loss, l1
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train import views as train_views
@@ -27,6 +28,7 @@ from pop_fast.train.choose import choose_backend
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.engines import engine_of, torch_engine
 from pop_fast.train.evaluate import psnr, psnr_after_correction
+from pop_fast.train.presets import LOSSES
 from pop_fast.train.schedule import phase_at
 from pop_fast.train.steps import why_not_trained
 from pop_fast.train.views import SMALLEST_SIDE, ViewTensors, render_view, shrunk, with_shrunk
@@ -288,11 +290,16 @@ def test_what_no_run_can_have_learned_is_refused_and_named(case: str, finished: 
     assert str(forged) in str(refused.value)
 
 
-def test_the_line_about_the_backend_says_that_autograd_takes_the_steps(tmp_path: Path) -> None:
+def test_the_line_about_the_backend_says_that_autograd_takes_the_steps(tmp_path: Path, monkeypatch: Any) -> None:
     asked = replace(tiny_config(tmp_path), backend="compiled")
     assert choose_backend(asked)[1] == "backend compiled, as requested"
-    said = choose_backend(replace(asked, refine_cameras=True))[1]
-    assert said == "backend compiled, as requested; its fused step has no refine_cameras, so autograd is used"
+    # "has no photometric" told nobody that the fused step knows two losses, and not this one
+    monkeypatch.setitem(LOSSES._given, "mine", Loss("mine", l1))
+    for name, value in (("refine_cameras", True), ("photometric", "mine")):
+        said = choose_backend(replace(asked, **{name: value}))[1]
+        end = f"its fused step does not take {name} = {value}, so autograd is used"
+        assert said == f"backend compiled, as requested; {end}"
+    LOSSES.look_again()
     assert choose_backend(replace(asked, backend="fast", refine_cameras=True))[1] == "backend fast, as requested"
     assert choose_backend(replace(asked, exposure=True))[1] == "backend compiled, as requested"
 
