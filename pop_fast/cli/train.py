@@ -39,6 +39,7 @@ from pop_fast.cli.train_options import (
     with_size,
 )
 from pop_fast.cli.view import LiveView, check_viewer
+from pop_fast.data import Source
 from pop_fast.data.capture import SfmOptions
 from pop_fast.errors import PopError
 from pop_fast.io.formats import FORMATS
@@ -134,7 +135,7 @@ class _Run(BlocksOptions, FinishOptions):
     missing: Literal["error", "skip"] = "error"
     images: str | None = None
     ignore_masks: bool = False
-    source: Literal["auto", "colmap", "transforms", "polycam", "metashape", "realitycapture", "photos"] = "auto"
+    source: Source = "auto"
     sfm: SfmOptions = dataclasses.field(default_factory=SfmOptions)
     quiet: bool = False
     view: bool = False

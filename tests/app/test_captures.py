@@ -451,6 +451,15 @@ def test_a_missing_folder_a_file_an_empty_folder_and_an_absent_source_are_told_a
     assert_one_line(lambda: load_capture(tmp_path / "photos"), "1 photographs", "pop sfm")
 
 
+def test_a_folder_of_captures_names_them_and_the_command_unless_all_photographs_are_asked_for(tmp_path: Path) -> None:
+    for name in ("a walk", "b"):
+        colmap_capture(tmp_path / name)
+    write_photograph(tmp_path / "more" / "0.png", photograph(0))
+    found = assert_one_line(lambda: load_capture(tmp_path), "captures in it have theirs (a walk, b)", "--source photos")
+    assert f"pop train '{tmp_path / 'a walk'}'" in found
+    assert_one_line(lambda: load_capture(tmp_path, source="photos"), "has 9 photographs but no cameras")
+
+
 def test_a_model_without_photographs_is_named(root: Path) -> None:
     (root / "images").rename(root / "pictures")
     assert_one_line(lambda: load_capture(root), str(root / "images"), "--images")
