@@ -348,6 +348,13 @@ def test_a_rolling_shutter_is_told_to_be_ignored(root: Path) -> None:
     assert "rolling_shutter of transforms.json is ignored" in note
 
 
+def test_a_photograph_that_is_listed_with_its_ending_and_without_is_refused(root: Path) -> None:
+    edit_transforms(root, lambda listing: listing["frames"].append({**listing["frames"][0], "file_path": "images/00"}))
+    assert_one_line(
+        lambda: raw(root), "transforms.json", "images/00 and images/00.png are one photograph", "remove one"
+    )
+
+
 def test_rotations_rounded_by_the_file_are_made_rotations_again(root: Path) -> None:
     def rounded(listing: dict[str, Any]) -> None:
         for frame in listing["frames"]:
