@@ -291,7 +291,13 @@ def _trained(training: TrainingRun, folder: Path, capture: Capture, options: Any
     if not _writes(ranks):
         return 0
     print(summary(stats), flush=True)
-    return finish(folder, capture, options) or report(folder)
+    return finish_and_report(folder, capture, options)
+
+
+def finish_and_report(folder: Path, capture: Capture, options: Any) -> int:
+    """Write what surrounds a run whose results are complete; a file that cannot be written costs no report."""
+    status = finish(folder, capture, options)
+    return status if status == EXIT_INTERRUPTED else report(folder) or status
 
 
 def report(folder: Path) -> int:

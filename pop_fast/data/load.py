@@ -35,6 +35,7 @@ from pop_fast.data.capture import (
     SfmOptions,
     SparsePoints,
     View,
+    camera_centers,
     held_out,
     normalizing_transform,
     transform_points,
@@ -54,6 +55,8 @@ from pop_fast.io.read_back import read_arrays, read_json
 _SAME_WAY = 0.9
 # photographs that a line names
 _NAMED = 12
+# of the distances between cameras: beyond it, a thousandth of a pixel is all that a point moves between photographs
+_OUTLIER: Final = 1e6
 MODEL: Final = "COLMAP model"  # what a list is made from, as a line says it
 # what a transforms.json may say besides cameras
 _MORE_THAN_CAMERAS: Final = ("mask_path", "train_filenames", "val_filenames", "test_filenames")
@@ -197,7 +200,7 @@ def list_capture(
     root = Path(path)
     listing = find_listing(root, source, images)
     if listing is None:
-        listing = _from_photos(root, images, sfm, progress)
+        listing = _without_outliers(_from_photos(root, images, sfm, progress))
     if len(listing.shots) < 2:
         count = "1 view" if listing.shots else "no views"
         raise CaptureError(f"{listing.path}: has {count} with a known camera; a scene needs two or more")
@@ -216,7 +219,7 @@ def find_listing(root: Path, source: Source = "auto", images: str | None = None)
     listing = _read_listing(root, source, images)
     if listing is not None:
         others = _about_passed_over(root, listing) if source == "auto" else []
-        return replace(listing, notes=others + listing.notes)
+        return _without_outliers(replace(listing, notes=others + listing.notes))
     if source == "colmap":
         raise CaptureError(
             f"{root}: has no COLMAP model in sparse, sparse/0 or colmap/sparse/0; run pop sfm, or COLMAP"
@@ -281,6 +284,28 @@ def _refuse_several(root: Path, photos: Path) -> None:
             f"{root}: has no cameras, but {what}; give one of these: pop train {quote(str(found[0]))}, or search all "
             "photographs as those of one scene with --source photos"
         )
+
+
+def _without_outliers(listing: Listing) -> Listing:
+    """Leave out points that no camera can have measured, which would turn the training frame and stretch the scene."""
+    if listing.cloud is None or len(listing.shots) < 2:
+        return listing
+    centers = camera_centers(np.stack([shot.viewmat for shot in listing.shots]))
+    middle = np.median(centers, axis=0)
+    spread = float(np.median(np.linalg.norm(centers - middle, axis=1)))
+    kept = np.linalg.norm(listing.cloud.xyz - middle, axis=1) <= _OUTLIER * spread
+    left = len(kept) - int(kept.sum())
+    if left == 0 or left == len(kept):
+        return listing
+    rows = np.cumsum(kept, dtype=np.int32) - 1
+    seen = [None if shot.seen is None else rows[shot.seen[kept[shot.seen]]] for shot in listing.shots]
+    shots = [replace(shot, seen=own) for shot, own in zip(listing.shots, seen, strict=True)]
+    note = (
+        f"{left:,} of {len(kept):,} sparse points left out: more than {_OUTLIER:,.0f} times as far away as the cameras "
+        "are from each other"
+    )
+    cloud = SparsePoints(listing.cloud.xyz[kept], listing.cloud.rgb[kept])
+    return replace(listing, shots=shots, cloud=cloud, notes=[*listing.notes, note])
 
 
 def _check_root(root: Path) -> None:
