@@ -45,7 +45,7 @@ from pop_fast.errors import PopError
 from pop_fast.io.formats import FORMATS
 from pop_fast.io.heartbeat import bars, duration
 from pop_fast.train.automatic import TERMS, begun, check_minutes
-from pop_fast.train.choose import check_gpus, choose_backend
+from pop_fast.train.choose import check_gpus, choose_backend, is_launched
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import RECORD, read_record, record_text
 from pop_fast.train.presets import ALIASES, AUTOMATIC, LOSSES, METHODS, Given
@@ -206,7 +206,7 @@ def _in_a_folder(config: TrainConfig) -> TrainConfig:
 
 def _ranks() -> Ranks | None:
     """Meet the processes that torchrun started with this one; without any this is None, and torch stays out."""
-    if "WORLD_SIZE" not in os.environ:
+    if not is_launched():
         return None
     from pop_fast.train.ranks import join
 

@@ -6,7 +6,7 @@ import json
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from pop_fast.api.backend import Backend, by_speed, get_backend
 from pop_fast.errors import PopError
@@ -64,6 +64,15 @@ def _why_not(backend: Backend, config: TrainConfig) -> str | None:
 def on_gpu(config: TrainConfig) -> bool:
     """Tell whether a run's backend, once it is settled, trains on a GPU."""
     return config.backend != "auto" and get_backend(config.backend).device != "cpu"
+
+
+# what torchrun tells every process that it starts
+LAUNCHED: Final = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
+
+
+def is_launched() -> bool:
+    """Tell whether a launcher started this process together with others; one variable left in a shell does not."""
+    return all(os.environ.get(name) for name in LAUNCHED) and os.environ["WORLD_SIZE"] != "1"
 
 
 def check_gpus(config: TrainConfig, processes: int = 1) -> str | None:

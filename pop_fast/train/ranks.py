@@ -19,12 +19,12 @@ import torch
 from torch import Tensor
 
 from pop_fast.errors import PopError
+from pop_fast.train.choose import LAUNCHED, is_launched
 from pop_fast.train.signals import heard
 
 T = TypeVar("T")
 
 # what torchrun, and other launchers after it, tell a process of itself
-_VARIABLES: Final = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 # launchers start processes together; one that does not come in this time will not
 _MEETING: Final = timedelta(minutes=10)
 # rank 0 may load photographs, find cameras or measure held-out views for hours while the others wait
@@ -201,7 +201,7 @@ def join() -> Ranks:
     Raises:
         PopError: what the launcher says is damaged, or the others cannot be reached.
     """
-    if not all(os.environ.get(name) for name in _VARIABLES) or os.environ["WORLD_SIZE"] == "1":
+    if not is_launched():
         return ALONE
     import torch.distributed as group
 
@@ -216,5 +216,5 @@ def join() -> Ranks:
         heard(lambda: group.init_process_group(how, timeout=_MEETING))
         return TorchRanks()
     except (RuntimeError, ValueError) as error:
-        given, why = ", ".join(f"{name}={os.environ[name]}" for name in _VARIABLES), str(error).partition("\n")[0]
+        given, why = ", ".join(f"{name}={os.environ[name]}" for name in LAUNCHED), str(error).partition("\n")[0]
         raise PopError(f"cannot connect to the other processes ({given}): {why}; start them with torchrun") from error
