@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import tyro
 
 from pop_fast.cli import parse, printable
-from pop_fast.data import Source
+from pop_fast.data.capture import Source
 from pop_fast.errors import CaptureError
 from pop_fast.io.heartbeat import bars
 from pop_fast.machine import memory_bytes

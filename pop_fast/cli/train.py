@@ -39,8 +39,7 @@ from pop_fast.cli.train_options import (
     with_size,
 )
 from pop_fast.cli.view import LiveView, check_viewer
-from pop_fast.data import Source
-from pop_fast.data.capture import SfmOptions
+from pop_fast.data.capture import SfmOptions, Source
 from pop_fast.errors import PopError
 from pop_fast.io.formats import FORMATS
 from pop_fast.io.heartbeat import bars, duration

@@ -24,7 +24,8 @@ from pop_fast.train.presets import ALIASES, METHODS, PRESETS
 from pop_fast.train.results import ResultFolder
 
 if TYPE_CHECKING:
-    from pop_fast.data import Capture, Source
+    from pop_fast.data import Capture
+    from pop_fast.data.capture import Source
     from pop_fast.train.ranks import Ranks
 
 

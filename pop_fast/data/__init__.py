@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from pop_fast.errors import CaptureError
 from pop_fast.lazy import given_by
@@ -13,13 +13,9 @@ if TYPE_CHECKING:
     from pop_fast.data.load import load_capture
     from pop_fast.data.sfm import run_sfm
 
-# what lists the cameras of a capture
-Source = Literal["auto", "colmap", "transforms", "polycam", "metashape", "realitycapture", "photos"]
-
 __all__ = [
     "Capture",
     "CaptureError",
-    "Source",
     "View",
     "apply_similarity",
     "initialize_params",

@@ -25,7 +25,6 @@ from zipfile import is_zipfile
 
 import numpy as np
 
-from pop_fast.data import Source
 from pop_fast.data.cameras import PINHOLES, Numbers, check_size, make_camera
 from pop_fast.data.capture import (
     Capture,
@@ -33,6 +32,7 @@ from pop_fast.data.capture import (
     PosedImage,
     Progress,
     SfmOptions,
+    Source,
     SparsePoints,
     View,
     camera_centers,

@@ -75,6 +75,15 @@ def is_launched() -> bool:
     return all(os.environ.get(name) for name in LAUNCHED) and os.environ["WORLD_SIZE"] != "1"
 
 
+def local_rank() -> int:
+    """Return which process of this machine this is, from 0: LOCAL_RANK, else RANK; PopError where that is no number."""
+    name = next((name for name in ("LOCAL_RANK", "RANK") if os.environ.get(name)), None)
+    said = "0" if name is None else os.environ[name]
+    if not (said.isascii() and said.isdigit()):
+        raise PopError(f"{name} is {said!r}; it must be the number of this process, from 0: start them with torchrun")
+    return int(said)
+
+
 def check_gpus(config: TrainConfig, processes: int = 1) -> str | None:
     """Settle which GPUs of this machine a run uses.
 
@@ -89,8 +98,6 @@ def check_gpus(config: TrainConfig, processes: int = 1) -> str | None:
     """
     if get_backend(config.backend).device != "cuda":
         return None
-    from pop_fast.train.ranks import local_rank
-
     count, rank = count_gpus(), local_rank() if processes > 1 else 0
     if rank >= count > 0:
         raise PopError(

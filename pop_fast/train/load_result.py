@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from pop_fast.data import Source
+from pop_fast.data.capture import Source
 from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
 from pop_ref.constants import NEAR_IN_CAPTURE_UNITS

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from pop_fast.errors import PopError
-from pop_fast.train.choose import LAUNCHED, is_launched
+from pop_fast.train.choose import LAUNCHED, is_launched, local_rank
 from pop_fast.train.signals import heard
 
 T = TypeVar("T")
@@ -184,15 +184,6 @@ class TorchRanks(Ranks):
 
 
 ALONE: Final = Ranks()
-
-
-def local_rank() -> int:
-    """Return which process of this machine this is, from 0: LOCAL_RANK, else RANK; PopError where that is no number."""
-    name = next((name for name in ("LOCAL_RANK", "RANK") if os.environ.get(name)), None)
-    said = "0" if name is None else os.environ[name]
-    if not (said.isascii() and said.isdigit()):
-        raise PopError(f"{name} is {said!r}; it must be the number of this process, from 0: start them with torchrun")
-    return int(said)
 
 
 def join() -> Ranks:
