@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -170,7 +170,7 @@ def about_photos(photos: Sequence[Photo], root: Path, images: str | None = None)
     twice = listed_twice([photo.shot for photo in photos], [photo.path for photo in photos])
     if twice is not None:
         yield bad("photographs", twice)
-    yield from _about_small({photo.shot.name: photo.size for photo in photos if photo.size != (0, 0)})
+    yield from _about_small(photos)
     yield from _about_sizes(photos)
     turned = sum(photo.shot.turns > 0 for photo in photos)
     if turned:
@@ -195,11 +195,11 @@ def _listed(sizes: Iterable[tuple[int, int]]) -> CaptureFinding:
     return CaptureFinding("ok" if found else "bad", "photographs", ", ".join(found) or "none could be read")
 
 
-def _about_small(sizes: Mapping[str, tuple[int, int]]) -> Iterator[CaptureFinding]:
+def _about_small(photos: Sequence[Photo]) -> Iterator[CaptureFinding]:
     """Tell which photographs SSIM finds no whole window in, by which a training is measured."""
-    small = [name for name, size in sizes.items() if min(size) < _WINDOW]
+    small = [photo.shot.name for photo in photos if 0 < min(photo.size) < _WINDOW]
     if small:
-        what = f"{len(small)} of {len(sizes)} are smaller than SSIM's window of {_WINDOW}x{_WINDOW} px"
+        what = f"{len(small)} of {len(photos)} are smaller than SSIM's window of {_WINDOW}x{_WINDOW} px"
         yield bad("sizes", f"{what}, first {small[0]}: use larger ones, or leave these out of the list")
 
 
@@ -350,7 +350,6 @@ def about_bare(root: Path, shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
     count = f"{len(sound)} {number(len(sound), 'photograph', 'photographs')}"
     yield CaptureFinding("ok" if enough else "bad", "poses", f"none yet, {count}: {fix}")
     yield _listed(one.size for one in sound)
-    yield from _about_small({one.name: one.size for one in sound})
     for one in shown:
         if one.problem:
             yield bad("photographs", one.problem)
