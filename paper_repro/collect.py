@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -73,7 +74,7 @@ def state_of_data(job: Job, config: TrainConfig, capture: Capture) -> dict[str, 
     """
     from pop_fast.train.checkpoint import capture_fingerprint
 
-    prints = capture_fingerprint(capture, 0)
+    prints = capture_fingerprint(capture, replace(config, test_every=0))
     first, published = capture.views[0], job.scene.images
     folder = "the photographs that the capture lists" if published is None else f"{published}, as published"
     return {

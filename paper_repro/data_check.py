@@ -144,7 +144,7 @@ def _listing(folder: Path) -> tuple[list[str], bool, list[tuple[int, int]]]:
         found = find_transforms(folder)
         if not found:
             raise CaptureError(f"{folder}: has no camera model in sparse/0 and no transforms.json")
-        shots, _ = read_transforms(found)
+        shots = read_transforms(found)[0]
     shots = sorted(shots, key=lambda shot: shot.name)
     cameras = [(int(shot.camera.width), int(shot.camera.height)) for shot in shots if shot.camera is not None]
     return [f"{shot.folder}/{shot.file}" for shot in shots], any(shot.split for shot in shots), cameras

@@ -71,7 +71,7 @@ class Result:
         run: twelve hex digits of the hash of configuration, data and seed.
         commit: the git commit that ran, to the end; None outside a clone.
         config_hash: of the configuration.
-        data_hash: of the capture as it was loaded: names, photographs, masks, cameras, points.
+        data_hash: of the capture as it was loaded: names, photographs, masks, cameras, points, and what else is used.
         machine: the processor, and after ", " the GPU where one was used.
         cpu: family, model, stepping and instructions of the processor, by which two machines are of one kind; None
             where nothing tells them.

@@ -362,7 +362,7 @@ def begin_from_base(job: Job, folder: Path, work: Path, config: TrainConfig, cap
     if (
         _shared(content["config"], config.binding()) != steps
         or content["threads"] != (config.threads or torch.get_num_threads())
-        or content["capture"] != capture_fingerprint(capture, config.test_every)
+        or content["capture"] != capture_fingerprint(capture, config)
         # the time of the shared steps is in the row's own; where a GPU trains, the processor matters little
         or (", " not in result.machine and result.cpu != processor_kind())
     ):

@@ -6,10 +6,15 @@ Gradients to `viewmat` treat its twelve upper entries as independent numbers; th
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from pop_ref._shapes import Bool, Float64
 from pop_ref.constants import PAPER, Profile
+
+# world units: the square of a smaller depth is 0 in float64
+NEAREST: Final = 1e-150
 
 
 def camera_center(viewmat: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "3"]:
@@ -227,7 +232,8 @@ def in_front(depths: Float64[np.ndarray, " N"], profile: Profile = PAPER) -> Boo
     """Tell which Gaussians lie between the near and the far plane (D1).
 
     `near <= z <= far`, or `near < z <= far` where the profile's near plane is inclusive of the cull. The whole
-    Gaussian is kept or culled by its centre, even if it straddles the plane.
+    Gaussian is kept or culled by its centre, even if it straddles the plane. Where near is 0, a centre in the
+    camera's own plane is culled too: it has no Jacobian.
 
     Source: Kerbl et al. 2023 (3DGS), section 6 (guard band), the value from the code bases.
     Departs: the paper names no distance (D1); gsplat culls z < 0.01, Inria z <= 0.2 and has no far plane.
@@ -244,4 +250,4 @@ def in_front(depths: Float64[np.ndarray, " N"], profile: Profile = PAPER) -> Boo
         [False, True, True]
     """
     beyond_near = depths > profile.near_plane if profile.near_inclusive else depths >= profile.near_plane
-    return beyond_near & (depths <= profile.far_plane)
+    return beyond_near & (depths > NEAREST) & (depths <= profile.far_plane)

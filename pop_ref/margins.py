@@ -26,6 +26,7 @@ import numpy as np
 
 from pop_ref._shapes import Bool, Float64
 from pop_ref.alpha import falloff, sigma_at_pixel
+from pop_ref.camera import NEAREST
 from pop_ref.constants import DECISIONS, PAPER, Profile
 from pop_ref.magnitudes import (
     Magnitudes,
@@ -129,7 +130,7 @@ def margins(
     depths = depths_magnitudes(gaussians, camera)
     magnitudes: list[Magnitudes | None] = [None] * len(gaussians)
     for i, depth in enumerate(depths):
-        if depth.value >= 0.5 * profile.near_plane:
+        if depth.value >= 0.5 * profile.near_plane and depth.value > NEAREST:
             magnitudes[i] = splat_magnitudes(gaussians, i, camera, profile, antialiased)
         _note_gaussian(book, i, depth, magnitudes[i], camera, profile)
     _note_kinks(book, gaussians, camera, image, magnitudes, sh_degree, profile)
@@ -171,8 +172,8 @@ def _note_gaussian(book: _Book, i: int, depth: Rounded, m: Magnitudes | None, ca
     near, far = constant(profile.near_plane), constant(profile.far_plane)
     beyond_near = depth.value > near.value if profile.near_inclusive else depth.value >= near.value
     before_far = depth.value <= far.value
-    in_order = [(beyond_near, distance(depth, near)), (before_far, distance(depth, far))]
-    kept = beyond_near and before_far
+    in_order = [(beyond_near and depth.value > NEAREST, distance(depth, near)), (before_far, distance(depth, far))]
+    kept = all(holds for holds, _ in in_order)
     margin = min(d for _, d in in_order) if kept else max(d for holds, d in in_order if not holds)
     book.note("D1", (i,), margin)
     if m is None:

@@ -194,8 +194,8 @@ def _train_round(folder: Path, config: TrainConfig, record: CaptureRecord, job: 
 
 def _merge(folder: Path, config: TrainConfig, record: CaptureRecord, job: Job, part: Part) -> int:
     from pop_fast.blocks.run import merge_capture
-    from pop_fast.cli.export import FinishOptions, finish
-    from pop_fast.cli.train import report, summary
+    from pop_fast.cli.export import FinishOptions
+    from pop_fast.cli.train import finish_and_report, summary
 
     try:
         options = replace(FinishOptions(**job.finish), skip_checks=True)
@@ -211,7 +211,7 @@ def _merge(folder: Path, config: TrainConfig, record: CaptureRecord, job: Job, p
     for line in merged_lines(stats):
         print(line)
     print(summary(stats), flush=True)
-    status = finish(folder, capture, options) or report(folder)
+    status = finish_and_report(folder, capture, options)
     if status == 0:
         write_file(part.marker(folder), b"")
         print(f"pop report {quote(str(folder))} --check adds the parts that need all photographs", file=sys.stderr)

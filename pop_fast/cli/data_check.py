@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import tyro
 
 from pop_fast.cli import parse, printable
+from pop_fast.data.capture import Source
 from pop_fast.errors import CaptureError
 from pop_fast.io.heartbeat import bars
 from pop_fast.machine import memory_bytes
@@ -34,6 +35,8 @@ class Args:
     """The capture; photographs of a video or a ZIP archive are extracted next to it, as pop train does."""
     images: str | None = None
     """The photographs are in this folder of the capture."""
+    source: Source = "auto"
+    """Which list of cameras to check, where there are several; as of pop train."""
     all: bool = False
     """Print every finding, not only the first five of a kind."""
 
@@ -45,7 +48,7 @@ def run(argv: Sequence[str]) -> int:
     folder, made = capture_folder(args.capture)
     if made is not None:
         print(f"note: {printable(made)}")
-    findings = look_over(folder, args.images)
+    findings = look_over(folder, args.images, args.source)
     marks = {"ok": "ok", "warn": "LOOK", "bad": "BAD"}
     width = max(len(finding.about) for finding in findings) + 2
     shown: dict[tuple[str, str], int] = {}
@@ -63,15 +66,15 @@ def run(argv: Sequence[str]) -> int:
     return 1 if bad else 0
 
 
-def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
+def look_over(root: Path, images: str | None = None, source: Source = "auto") -> list[CaptureFinding]:
     """Examine a capture, or photographs alone; all findings in reading order."""
     from pop_fast.data import check_dataset
-    from pop_fast.data.load import find_listing
+    from pop_fast.data.load import MODEL, find_listing
     from pop_fast.data.photo_quality import CaptureFinding, about_quality, bad, measure_file, number, warn
     from pop_fast.data.read_images import find_photographs
     from pop_fast.data.sfm import photo_folder, photographs
 
-    listing = find_listing(root, images=images)
+    listing = find_listing(root, source, images)
     if listing is None:
         folder = photo_folder(root)
         files = photographs(folder)
@@ -103,7 +106,8 @@ def look_over(root: Path, images: str | None = None) -> list[CaptureFinding]:
     findings += check_dataset.about_points(photos, cloud)
     if not cloud and all(finding.state != "bad" for finding in findings):
         findings += _about_start(root, listing, images)
-    findings += check_dataset.about_reprojection(root)
+    if listing.made_from == MODEL:
+        findings += check_dataset.about_reprojection(root)
     findings += check_dataset.about_memory(photos, cloud, memory_bytes()[1])
     return findings
 

@@ -39,12 +39,12 @@ from pop_fast.cli.train_options import (
     with_size,
 )
 from pop_fast.cli.view import LiveView, check_viewer
-from pop_fast.data.capture import SfmOptions
+from pop_fast.data.capture import SfmOptions, Source
 from pop_fast.errors import PopError
 from pop_fast.io.formats import FORMATS
 from pop_fast.io.heartbeat import bars, duration
 from pop_fast.train.automatic import TERMS, begun, check_minutes
-from pop_fast.train.choose import check_gpus, choose_backend
+from pop_fast.train.choose import check_gpus, choose_backend, is_launched
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import RECORD, read_record, record_text
 from pop_fast.train.presets import ALIASES, AUTOMATIC, LOSSES, METHODS, Given
@@ -134,7 +134,7 @@ class _Run(BlocksOptions, FinishOptions):
     missing: Literal["error", "skip"] = "error"
     images: str | None = None
     ignore_masks: bool = False
-    source: Literal["auto", "colmap", "transforms", "polycam", "metashape", "realitycapture", "photos"] = "auto"
+    source: Source = "auto"
     sfm: SfmOptions = dataclasses.field(default_factory=SfmOptions)
     quiet: bool = False
     view: bool = False
@@ -205,7 +205,7 @@ def _in_a_folder(config: TrainConfig) -> TrainConfig:
 
 def _ranks() -> Ranks | None:
     """Meet the processes that torchrun started with this one; without any this is None, and torch stays out."""
-    if "WORLD_SIZE" not in os.environ:
+    if not is_launched():
         return None
     from pop_fast.train.ranks import join
 
@@ -290,7 +290,13 @@ def _trained(training: TrainingRun, folder: Path, capture: Capture, options: Any
     if not _writes(ranks):
         return 0
     print(summary(stats), flush=True)
-    return finish(folder, capture, options) or report(folder)
+    return finish_and_report(folder, capture, options)
+
+
+def finish_and_report(folder: Path, capture: Capture, options: Any) -> int:
+    """Write what surrounds a run whose results are complete; a file that cannot be written costs no report."""
+    status = finish(folder, capture, options)
+    return status if status == EXIT_INTERRUPTED else report(folder) or status
 
 
 def report(folder: Path) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, fields, replace
@@ -15,6 +14,7 @@ from pop_fast.cli.train_options import BlocksOptions
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import FolderLock, write_file
 from pop_fast.io.heartbeat import bars
+from pop_fast.train.choose import is_launched
 from pop_fast.train.config import TrainConfig, first_difference
 from pop_fast.train.load_result import RECORD, CaptureRecord, record_text
 from pop_fast.train.results import COMMANDS_FILE, ResultFolder, commands_text, read_config
@@ -35,7 +35,7 @@ def check_blocks(config: TrainConfig, options: Any) -> None:
     from pop_fast.blocks.jobs import has_snakemake, profile_folder
 
     _job(config, options)
-    if "WORLD_SIZE" in os.environ:
+    if is_launched():
         raise PopError("--blocks starts its own processes, one for each block; start it without torchrun")
     if options.view:
         raise PopError(

@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import dataclasses
 import math
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from pop_fast.errors import PopError
 from pop_fast.io.heartbeat import Heartbeat
 from pop_fast.io.image_header import read_exif, read_size
 from pop_fast.train import automatic
-from pop_fast.train.choose import on_gpu
+from pop_fast.train.choose import is_launched, on_gpu
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import CaptureRecord, read_record
 from pop_fast.train.presets import ALIASES, METHODS, PRESETS
@@ -26,7 +25,7 @@ from pop_fast.train.results import ResultFolder
 
 if TYPE_CHECKING:
     from pop_fast.data import Capture
-    from pop_fast.data.load import Source
+    from pop_fast.data.capture import Source
     from pop_fast.train.ranks import Ranks
 
 
@@ -278,7 +277,7 @@ def chooses_for_itself(words: Sequence[str]) -> bool:
     Blocks and processes that train together take the paper's schedule, as before.
     """
     said = [word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")]
-    return not set(said) & {*_SCHEDULE, "--blocks"} and "WORLD_SIZE" not in os.environ
+    return not set(said) & {*_SCHEDULE, "--blocks"} and not is_launched()
 
 
 def with_size(config: TrainConfig, options: Any) -> TrainConfig:

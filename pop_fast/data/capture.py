@@ -28,6 +28,8 @@ from pop_fast.data.cameras import affine
 from pop_fast.errors import CaptureError
 
 Split = Literal["train", "val", "test"]
+# what lists the cameras; "auto" takes the first that is there
+Source = Literal["auto", "colmap", "transforms", "polycam", "metashape", "realitycapture", "photos"]
 # called from the main thread with (what is being done, how many are done, of how many)
 Progress = Callable[[str, int, int], None]
 

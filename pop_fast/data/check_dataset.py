@@ -35,7 +35,14 @@ from pop_fast.data.photo_quality import (
     ok,
     warn,
 )
-from pop_fast.data.read_images import camera_of, find_masks, fix_of_absent, read_fitting_mask, undistortion
+from pop_fast.data.read_images import (
+    camera_of,
+    find_masks,
+    fix_of_absent,
+    listed_twice,
+    read_fitting_mask,
+    undistortion,
+)
 from pop_fast.data.sfm import photo_folder
 from pop_fast.errors import CaptureError
 from pop_fast.io.images import list_images, read_image, read_mask, unreadable_photographs
@@ -46,6 +53,8 @@ BYTES_IN_TRAINING = 59 * 4 * 4
 _GAPS = 3
 # px of a picture that a lens is tried on
 _SIDE = 64
+# px, of SSIM: that of `pop_fast.stages.losses`, which needs torch
+_WINDOW = 11
 
 
 @dataclass(frozen=True)
@@ -158,6 +167,10 @@ def about_photos(photos: Sequence[Photo], root: Path, images: str | None = None)
     for photo in photos:
         if photo.path is not None and photo.problem:
             yield bad("photographs", photo.problem)
+    twice = listed_twice([photo.shot for photo in photos], [photo.path for photo in photos])
+    if twice is not None:
+        yield bad("photographs", twice)
+    yield from _about_small(photos)
     yield from _about_sizes(photos)
     turned = sum(photo.shot.turns > 0 for photo in photos)
     if turned:
@@ -180,6 +193,14 @@ def _listed(sizes: Iterable[tuple[int, int]]) -> CaptureFinding:
     if len(counts) > 4:
         found.append(f"and {sum(counts.values()) - sum(n for _, n in counts.most_common(4))} of other sizes")
     return CaptureFinding("ok" if found else "bad", "photographs", ", ".join(found) or "none could be read")
+
+
+def _about_small(photos: Sequence[Photo]) -> Iterator[CaptureFinding]:
+    """Tell which photographs SSIM finds no whole window in, by which a training is measured."""
+    small = [photo.shot.name for photo in photos if 0 < min(photo.size) < _WINDOW]
+    if small:
+        what = f"{len(small)} of {len(photos)} are smaller than SSIM's window of {_WINDOW}x{_WINDOW} px"
+        yield bad("sizes", f"{what}, first {small[0]}: use larger ones, or leave these out of the list")
 
 
 def _about_sizes(photos: Sequence[Photo]) -> Iterator[CaptureFinding]:

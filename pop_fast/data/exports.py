@@ -104,17 +104,14 @@ def _json(path: Path, fix: str) -> Any:
         return json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise CaptureError(f"{path}: could not be read: {error.strerror}") from error
-    # besides what JSON and UTF-8 do not allow, whole numbers of thousands of digits
-    except ValueError as error:
+    # besides what JSON and UTF-8 do not allow, whole numbers of thousands of digits, and lists in lists in lists
+    except (ValueError, RecursionError) as error:
         raise CaptureError(f"{path}: is not valid JSON ({error}); {fix}") from error
 
 
 def _load(path: Path) -> dict[str, Any]:
     fix = "export the capture again"
-    try:
-        given = _json(path, fix)
-    except RecursionError as error:
-        raise CaptureError(f"{path}: is not valid JSON ({error}); {fix}") from error
+    given = _json(path, fix)
     if not isinstance(given, dict):
         raise CaptureError(f"{path}: is no object of a camera's fields (fx, t_00, ...); {fix}")
     return given
@@ -386,6 +383,7 @@ def read_export(root: Path, program: str = "auto", images: str | None = None) ->
     return None
 
 
+_ROLLING: Final = "rolling_shutter"
 _POINTS = ("sparse_pc.ply", "points3D.ply", "points3d.ply")
 # what is measured in pixels of the size w x h; without it, only a field of view can be used
 _IN_PIXELS = ("fl_x", "fl_y", "cx", "cy")
@@ -401,20 +399,23 @@ def find_transforms(folder: Path) -> list[Path]:
     return [path for path in (train, held_out) if path.is_file()]
 
 
-def read_transforms(paths: list[Path]) -> tuple[list[PosedImage], SparsePoints | None]:
+def read_transforms(paths: list[Path]) -> tuple[list[PosedImage], SparsePoints | None, list[str]]:
     """Read cameras and poses of what `find_transforms` found, and the points next to them.
 
     Returns:
-        One shot for every listed frame, sorted by name, and the points of `ply_file_path`, of `sparse_pc.ply` or of
-        `points3D.ply`; None where there is none.
+        One shot for every listed frame, sorted by name; the points of `ply_file_path`, of `sparse_pc.ply` or of
+        `points3D.ply`, None where there is none; and notes.
     """
     shots: list[PosedImage] = []
+    notes: list[str] = []
     named: Path | None = None
     for path in paths:
         listing = _load_transforms(path)
         # a list for training alone says nothing of what to hold out
         split = cast("Split | None", path.stem.partition("_")[2] or None) if len(paths) > 1 else None
         shots += _read_listing(path, listing, split)
+        if any(fields.get(_ROLLING) not in (None, [0] * 4) for fields in (listing, *listing["frames"])):
+            notes.append(f"{_ROLLING} of {path.name} is ignored: every photograph counts as taken at one moment")
         points = listing.get("ply_file_path")
         if points is not None and not isinstance(points, str):
             raise CaptureError(
@@ -428,7 +429,7 @@ def read_transforms(paths: list[Path]) -> tuple[list[PosedImage], SparsePoints |
     if twice:
         lists = " and ".join(map(str, paths))
         raise CaptureError(f"{lists}: frames lists {twice[0]} twice; remove one of them")
-    return sorted(shots, key=lambda shot: shot.name), points_beside(paths[0].parent, named)
+    return sorted(shots, key=lambda shot: shot.name), points_beside(paths[0].parent, named), notes
 
 
 def points_beside(folder: Path, named: Path | None = None) -> SparsePoints | None:
@@ -441,10 +442,7 @@ def points_beside(folder: Path, named: Path | None = None) -> SparsePoints | Non
 
 
 def _load_transforms(path: Path) -> dict[str, Any]:
-    try:
-        listing = _json(path, "write it again or repair it there")
-    except RecursionError:
-        raise CaptureError(f"{path}: is nested too deeply to be a list of frames; write it again") from None
+    listing = _json(path, "write it again or repair it there")
     if not isinstance(listing, dict) or not isinstance(listing.get("frames"), list):
         raise CaptureError(f"{path}: has no list 'frames'; it must be an object as nerfstudio or instant-ngp writes it")
     return listing

@@ -19,6 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from os.path import splitext
 from pathlib import Path
+from shlex import quote
 from typing import Any, Final, Literal, TypeVar
 from zipfile import is_zipfile
 
@@ -31,8 +32,10 @@ from pop_fast.data.capture import (
     PosedImage,
     Progress,
     SfmOptions,
+    Source,
     SparsePoints,
     View,
+    camera_centers,
     held_out,
     normalizing_transform,
     transform_points,
@@ -45,13 +48,18 @@ from pop_fast.data.sfm import photo_folder, photographs, read_upright, run_sfm
 from pop_fast.errors import CaptureError, PopError
 from pop_fast.io.atomic import write_atomically, write_json
 from pop_fast.io.image_header import read_size
-from pop_fast.io.images import VIDEO_SUFFIXES, composed, find_image, unreadable_photographs
+from pop_fast.io.images import VIDEO_SUFFIXES, composed, find_image, list_images, unreadable_photographs
 from pop_fast.io.read_back import read_arrays, read_json
 
 # the mean of the cameras' viewing directions, as unit vectors, is this long where they all look about the same way
 _SAME_WAY = 0.9
 # photographs that a line names
 _NAMED = 12
+# of the distances between cameras: beyond it, a thousandth of a pixel is all that a point moves between photographs
+_OUTLIER: Final = 1e6
+MODEL: Final = "COLMAP model"  # what a list is made from, as a line says it
+# what a transforms.json may say besides cameras
+_MORE_THAN_CAMERAS: Final = ("mask_path", "train_filenames", "val_filenames", "test_filenames")
 # made where a capture brings none
 RANDOM_POINTS: Final = 30_000
 _ADD_POINTS: Final = "add points: run pop sfm on the photographs, or name a PLY file as ply_file_path"
@@ -96,7 +104,6 @@ def about_random_points(views: Sequence[View], made: int, wanted: int) -> list[s
 
 
 Photographs = Literal["all", "held out", "none"]
-Source = Literal["auto", "colmap", "transforms", "polycam", "metashape", "realitycapture", "photos"]
 
 
 def load_capture(
@@ -193,7 +200,7 @@ def list_capture(
     root = Path(path)
     listing = find_listing(root, source, images)
     if listing is None:
-        listing = _from_photos(root, images, sfm, progress)
+        listing = _without_outliers(_from_photos(root, images, sfm, progress))
     if len(listing.shots) < 2:
         count = "1 view" if listing.shots else "no views"
         raise CaptureError(f"{listing.path}: has {count} with a known camera; a scene needs two or more")
@@ -209,15 +216,10 @@ def find_listing(root: Path, source: Source = "auto", images: str | None = None)
     _check_root(root)
     if source == "auto" and find_block(root):
         return read_block(root)
-    models = find_models(root) if source in ("auto", "colmap") else []
-    if models:
-        return _of_model(root, models, images)
-    found = find_transforms(root) if source in ("auto", "transforms") else []
-    if found:
-        return Listing(root, found[0], *read_transforms(found), found[0].name, [])
-    export = read_export(root, source, images)
-    if export is not None:
-        return export
+    listing = _read_listing(root, source, images)
+    if listing is not None:
+        others = _about_passed_over(root, listing) if source == "auto" else []
+        return _without_outliers(replace(listing, notes=others + listing.notes))
     if source == "colmap":
         raise CaptureError(
             f"{root}: has no COLMAP model in sparse, sparse/0 or colmap/sparse/0; run pop sfm, or COLMAP"
@@ -227,10 +229,83 @@ def find_listing(root: Path, source: Source = "auto", images: str | None = None)
     if source in EXPORTS:
         raise CaptureError(f"{root}: has no {EXPORTS[source][1]}; export it there, or choose another --source")
     folder = photo_folder(root)
+    if source == "auto":
+        _refuse_several(root, folder)
     if not photographs(folder):
         hint = unreadable_photographs(folder) or "give the folder of a capture"
         raise CaptureError(f"{root}: has no photographs, no COLMAP model and no transforms.json; {hint}")
     return None
+
+
+def _read_listing(root: Path, source: Source, images: str | None) -> Listing | None:
+    models = find_models(root) if source in ("auto", "colmap") else []
+    if models:
+        return _of_model(root, models, images)
+    found = find_transforms(root) if source in ("auto", "transforms") else []
+    if found:
+        shots, cloud, notes = read_transforms(found)
+        return Listing(root, found[0], shots, cloud, found[0].name, notes)
+    return read_export(root, source, images)
+
+
+def _lists(root: Path) -> dict[str, list[Path]]:
+    """Find the lists of a capture's cameras, by their `source`, in the order in which "auto" takes the first."""
+    found: dict[str, Sequence[Path | None]] = {
+        "colmap": [path for path, _ in find_models(root)[:1]],
+        "transforms": find_transforms(root),
+        **{program: [find(root)] for program, (_, _, find, _) in EXPORTS.items()},
+    }
+    return {source: there for source, paths in found.items() if (there := [path for path in paths if path])}
+
+
+def _about_passed_over(root: Path, used: Listing) -> list[str]:
+    """Tell which lists of cameras "auto" has passed over, and what of theirs is left unused."""
+    notes: list[str] = []
+    for source, paths in list(_lists(root).items())[1:]:
+        text = paths[0].read_text("utf-8", "replace") if source == "transforms" else ""
+        fields = [name for name in _MORE_THAN_CAMERAS if f'"{name}"' in text]
+        names = " and ".join(path.relative_to(root).as_posix() for path in paths)
+        own = f" with the {', '.join(fields)} in it" if fields else ""
+        notes.append(
+            f"cameras are read from {used.path.relative_to(root).as_posix()}; {names} is left unused{own}: "
+            f"--source {source} reads it instead"
+        )
+    return notes
+
+
+def _refuse_several(root: Path, photos: Path) -> None:
+    """Refuse a folder of captures, whose photographs would all be searched for the cameras of one."""
+    inside = [path for path in sorted(root.iterdir()) if path.is_dir() and path.name[0] != "."]
+    found = [path for path in inside if photos in (root, path) and _lists(path) and list_images(path)]
+    if found:
+        names = ", ".join(path.name for path in found[:_NAMED])
+        what = f"captures in it have theirs ({names})" if len(found) > 1 else f"a capture in it has its own ({names})"
+        raise CaptureError(
+            f"{root}: has no cameras, but {what}; give one of these: pop train {quote(str(found[0]))}, or search all "
+            "photographs as those of one scene with --source photos"
+        )
+
+
+def _without_outliers(listing: Listing) -> Listing:
+    """Leave out points that no camera can have measured, which would turn the training frame and stretch the scene."""
+    if listing.cloud is None or len(listing.shots) < 2:
+        return listing
+    centers = camera_centers(np.stack([shot.viewmat for shot in listing.shots]))
+    middle = np.median(centers, axis=0)
+    spread = float(np.median(np.linalg.norm(centers - middle, axis=1)))
+    kept = np.linalg.norm(listing.cloud.xyz - middle, axis=1) <= _OUTLIER * spread
+    left = len(kept) - int(kept.sum())
+    if left == 0 or left == len(kept):
+        return listing
+    rows = np.cumsum(kept, dtype=np.int32) - 1
+    seen = [None if shot.seen is None else rows[shot.seen[kept[shot.seen]]] for shot in listing.shots]
+    shots = [replace(shot, seen=own) for shot, own in zip(listing.shots, seen, strict=True)]
+    note = (
+        f"{left:,} of {len(kept):,} sparse points left out: more than {_OUTLIER:,.0f} times as far away as the cameras "
+        "are from each other"
+    )
+    cloud = SparsePoints(listing.cloud.xyz[kept], listing.cloud.rgb[kept])
+    return replace(listing, shots=shots, cloud=cloud, notes=[*listing.notes, note])
 
 
 def _check_root(root: Path) -> None:
@@ -250,11 +325,11 @@ def _of_model(root: Path, models: Sequence[tuple[Path, int]], images: str | None
     model = models[0][0]
     listed, cloud = read_model(model)
     if len(listed) < 2:
-        return Listing(root, model, listed, cloud, "COLMAP model")
+        return Listing(root, model, listed, cloud, MODEL)
     shots = turned_upright(root, beside_the_model(root, listed, images), model)
     unplaced, which = about_unplaced(root / (images or shots[0].folder), shots)
     notes = about_other_models(root, models) + which
-    return Listing(root, model, shots, cloud, "COLMAP model", notes, unplaced=unplaced)
+    return Listing(root, model, shots, cloud, MODEL, notes, unplaced=unplaced)
 
 
 def beside_the_model(root: Path, shots: list[PosedImage], images: str | None) -> list[PosedImage]:

@@ -115,6 +115,9 @@ def _locate(
             absent.append((shot, root / chosen / names[-1]))
             continue
         photos.append(_Photo(shot, path, mask, shrink))
+    twice = listed_twice([photo.shot for photo in photos], [photo.path for photo in photos])
+    if twice is not None:
+        raise CaptureError(f"{listing}: {twice}")
     if absent and (options.missing == "error" or not photos):
         raise CaptureError(
             f"{listing}: lists {len(shots)} images, {len(absent)} of them absent, first {absent[0][1]}; "
@@ -169,6 +172,15 @@ def find_photographs(root: Path, shots: Sequence[PosedImage], images: str | None
         return [find(root / shot.folder, shot.file) for shot in shots]
     elsewhere = names_elsewhere(shots)
     return [_find_first(find, root / images, elsewhere(shot)) for shot in shots]
+
+
+def listed_twice(shots: Sequence[PosedImage], paths: Sequence[Path | None]) -> str | None:
+    """Tell which photograph is listed under two names, as with its ending and without; None where there is none."""
+    names: dict[Path, str] = {}
+    for shot, path in zip(shots, paths, strict=True):
+        if path is not None and names.setdefault(path, shot.name) != shot.name:
+            return f"{names[path]} and {shot.name} are one photograph, {path}; remove one of them from the list"
+    return None
 
 
 def find_masks(folder: Path | None, shots: Sequence[PosedImage]) -> list[Path | None]:

@@ -246,18 +246,22 @@ def _open(path: Path, *settings: int) -> Any:
 
 
 def _frame_count(path: Path) -> int:
-    """Count the frames that are there: the header of a file that was cut short still states them all."""
+    """Count the frames that are there: the header of a file that was cut short or trimmed still states them all."""
     # undecoded, which takes no time, where OpenCV can hand them over so
-    return _count(path, cv2.CAP_PROP_FORMAT, -1) or _count(path)
+    packets, stated = _count(path, cv2.CAP_PROP_FORMAT, -1)
+    # of a video that a telephone has trimmed, decoding starts and ends with frames that are not shown
+    return packets if packets >= stated and packets else _count(path, tries=packets)[0]
 
 
-def _count(path: Path, *settings: int) -> int:
+def _count(path: Path, *settings: int, tries: int = 0) -> tuple[int, int]:
+    """Count frames, and return how many the header states; after one that fails others follow, in so many tries."""
     video = _open(path, *settings)
     try:
         counted = 0
         while video.grab():
             counted += 1
-        return counted
+        counted += sum(video.grab() for _ in range(tries - counted))
+        return counted, int(video.get(cv2.CAP_PROP_FRAME_COUNT))
     finally:
         video.release()
 

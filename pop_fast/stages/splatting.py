@@ -151,7 +151,9 @@ class _Projection(torch.autograd.Function):
         ctx.view = view
         ctx.save_for_backward(means, covars, opacities, viewmat, safe, covars_cam, jacobians, covars2d, blurred, shown)
         ctx.mark_non_differentiable(radii)
-        return means2d, depths.clone(), conics_from_covars2d(blurred), effective_opacities, radii, factors
+        # what has overflowed of a row that is culled is no number, which times nothing is none either
+        conics = torch.where(shown, conics_from_covars2d(blurred).T, 0.0).T
+        return means2d, depths.clone(), conics, effective_opacities, radii, factors
 
     @staticmethod
     @full_precision_backward
@@ -180,6 +182,8 @@ class _Projection(torch.autograd.Function):
         v_means_cam = torch.where(shown, v_means_cam.T, 0.0).T
         v_covars_cam = torch.where(shown, v_covars_cam.permute(1, 2, 0), 0.0).permute(2, 0, 1)
         needs_viewmat = ctx.needs_input_grad[3]
+        if needs_viewmat:  # likewise
+            covars = torch.where(shown, covars.permute(1, 2, 0), 0.0).permute(2, 0, 1)
         v_covars, v_viewmat = covars_cam_from_covars_vjp(covars, viewmat, v_covars_cam, needs_viewmat)
         v_means, v_viewmat_of_means = means_cam_from_means_vjp(means, viewmat, v_means_cam)
         v_viewmat = v_viewmat + v_viewmat_of_means if needs_viewmat else None

@@ -35,7 +35,7 @@ from pop_fast.density.protocol import State
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.read_back import read_torch_file
-from pop_fast.train.config import TrainConfig, first_difference
+from pop_fast.train.config import TrainConfig, first_difference, is_of_another_version
 from pop_fast.train.model import KEYS, first_non_finite, first_unusable, make_optimizers
 
 FORMAT = 1
@@ -166,13 +166,17 @@ def check_fits(
     ours = {**config.binding(), "threads": content["threads"] if threads is None else threads}
     found = first_difference(ours, theirs)
     if found:
-        name, ours, theirs = found
-        raise PopError(
-            f"{path}: was written with {name} = {theirs}, but this run has {name} = {ours}; "
-            f"use the same settings, or another result folder"
-        )
+        name, mine, other = found
+        fix = "use the same settings, or another result folder"
+        wrote = f"was written with {name} = {other}, but this run has {name} = {mine}"
+        if is_of_another_version(name, ours, theirs):
+            wrote, fix = (
+                f"is of a version with other settings than this one ({name})",
+                "resume with that, or train anew",
+            )
+        raise PopError(f"{path}: {wrote}; {fix}")
     for name, ours in fingerprint.items():
-        theirs = content["capture"].get(name)
+        theirs = content["capture"].get(name, ours)  # earlier versions wrote no alpha and no tracks
         if theirs != ours:
             raise PopError(
                 f"{path}: was written for another capture: the {name} differ ({str(theirs)[:12]}, here {ours[:12]}); "
@@ -194,9 +198,9 @@ def check_fits(
         raise PopError(f"{path}: strategy.{odd[0]} is {what}; it must hold {', '.join(known)}: {_DAMAGED}")
 
 
-def capture_fingerprint(capture: Capture, test_every: int) -> dict[str, str]:
+def capture_fingerprint(capture: Capture, config: TrainConfig) -> dict[str, str]:
     """Hash what of a capture reaches the training, part by part, so that a difference can be named."""
-    views = capture.train_views(test_every)
+    views = capture.train_views(config.test_every)
     parts: dict[str, list[Any]] = {"view names": [], "photographs": [], "masks": [], "cameras": [], "sparse points": []}
     for view in views:
         parts["view names"].append(os.fsencode(view.name))
@@ -204,6 +208,10 @@ def capture_fingerprint(capture: Capture, test_every: int) -> dict[str, str]:
         parts["masks"].append(b"none" if view.mask is None else view.mask)
         parts["cameras"] += [view.viewmat, view.K]
     parts["sparse points"] = [capture.points, capture.points_rgb]
+    if config.random_background:
+        parts["alpha channels"] = [b"none" if view.alpha is None else view.alpha for view in views]
+    if config.depth_lambda != 0.0:
+        parts["tracks"] = [b"none" if view.seen is None else view.seen for view in views]
     return {name: _digest(items) for name, items in parts.items()}
 
 

@@ -6,7 +6,7 @@ import json
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from pop_fast.api.backend import Backend, by_speed, get_backend
 from pop_fast.errors import PopError
@@ -67,6 +67,24 @@ def on_gpu(config: TrainConfig) -> bool:
     return config.backend != "auto" and get_backend(config.backend).device != "cpu"
 
 
+# what torchrun tells every process that it starts
+LAUNCHED: Final = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
+
+
+def is_launched() -> bool:
+    """Tell whether a launcher started this process together with others; one variable left in a shell does not."""
+    return all(os.environ.get(name) for name in LAUNCHED) and os.environ["WORLD_SIZE"] != "1"
+
+
+def local_rank() -> int:
+    """Return which process of this machine this is, from 0: LOCAL_RANK, else RANK; PopError where that is no number."""
+    name = next((name for name in ("LOCAL_RANK", "RANK") if os.environ.get(name)), None)
+    said = "0" if name is None else os.environ[name]
+    if not (said.isascii() and said.isdigit()):
+        raise PopError(f"{name} is {said!r}; it must be the number of this process, from 0: start them with torchrun")
+    return int(said)
+
+
 def check_gpus(config: TrainConfig, processes: int = 1) -> str | None:
     """Settle which GPUs of this machine a run uses.
 
@@ -81,8 +99,6 @@ def check_gpus(config: TrainConfig, processes: int = 1) -> str | None:
     """
     if get_backend(config.backend).device != "cuda":
         return None
-    from pop_fast.train.ranks import local_rank
-
     count, rank = count_gpus(), local_rank() if processes > 1 else 0
     if rank >= count > 0:
         raise PopError(

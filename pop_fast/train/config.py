@@ -405,6 +405,11 @@ def first_difference(ours: dict[str, Any], theirs: dict[str, Any]) -> tuple[str,
     return None
 
 
+def is_of_another_version(name: str, ours: dict[str, Any], theirs: dict[str, Any]) -> bool:
+    """Tell whether only one of two `binding()`s can have a setting: another version of the package wrote the other."""
+    return name not in _USUAL and (name not in ours or name not in theirs)
+
+
 _AT_LEAST: Final = {
     **dict.fromkeys(("max_steps", "batch_size", "factor", "sh_interval", "keep_checkpoints", "log_every"), 1),
     **dict.fromkeys(("seed", "sh_degree", "test_every", "threads", "checkpoint_every", "max_renders"), 0),

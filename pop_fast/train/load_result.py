@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from pop_fast.data.capture import Source
 from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
 from pop_ref.constants import NEAR_IN_CAPTURE_UNITS
@@ -76,7 +77,7 @@ class CaptureRecord:
     images: str | None = None
     missing: Literal["error", "skip"] = "error"
     masks: bool = True
-    source: Literal["auto", "colmap", "transforms", "polycam", "metashape", "realitycapture", "photos"] = "auto"
+    source: Source = "auto"
     world_transform: list[list[float]] = field(default_factory=lambda: np.eye(4).tolist())
     chosen: list[str] = field(default_factory=list)
 

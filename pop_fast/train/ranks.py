@@ -19,12 +19,12 @@ import torch
 from torch import Tensor
 
 from pop_fast.errors import PopError
+from pop_fast.train.choose import LAUNCHED, is_launched, local_rank
 from pop_fast.train.signals import heard
 
 T = TypeVar("T")
 
 # what torchrun, and other launchers after it, tell a process of itself
-_VARIABLES: Final = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 # launchers start processes together; one that does not come in this time will not
 _MEETING: Final = timedelta(minutes=10)
 # rank 0 may load photographs, find cameras or measure held-out views for hours while the others wait
@@ -186,22 +186,13 @@ class TorchRanks(Ranks):
 ALONE: Final = Ranks()
 
 
-def local_rank() -> int:
-    """Return which process of this machine this is, from 0: LOCAL_RANK, else RANK; PopError where that is no number."""
-    name = next((name for name in ("LOCAL_RANK", "RANK") if os.environ.get(name)), None)
-    said = "0" if name is None else os.environ[name]
-    if not (said.isascii() and said.isdigit()):
-        raise PopError(f"{name} is {said!r}; it must be the number of this process, from 0: start them with torchrun")
-    return int(said)
-
-
 def join() -> Ranks:
     """Meet the other processes that were launched with this one, or return `ALONE` where there are none.
 
     Raises:
         PopError: what the launcher says is damaged, or the others cannot be reached.
     """
-    if not all(os.environ.get(name) for name in _VARIABLES) or os.environ["WORLD_SIZE"] == "1":
+    if not is_launched():
         return ALONE
     import torch.distributed as group
 
@@ -216,5 +207,5 @@ def join() -> Ranks:
         heard(lambda: group.init_process_group(how, timeout=_MEETING))
         return TorchRanks()
     except (RuntimeError, ValueError) as error:
-        given, why = ", ".join(f"{name}={os.environ[name]}" for name in _VARIABLES), str(error).partition("\n")[0]
+        given, why = ", ".join(f"{name}={os.environ[name]}" for name in LAUNCHED), str(error).partition("\n")[0]
         raise PopError(f"cannot connect to the other processes ({given}): {why}; start them with torchrun") from error

@@ -441,7 +441,7 @@ class TrainingRun:
 
     @cached_property
     def _fingerprint(self) -> dict[str, str]:
-        return ckpt.capture_fingerprint(self._capture, self.config.test_every)
+        return ckpt.capture_fingerprint(self._capture, self.config)
 
     def _detached(self) -> dict[str, Tensor]:
         return {key: value.detach().cpu() for key, value in self.params.items()}

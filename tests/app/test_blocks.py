@@ -36,6 +36,7 @@ from pop_fast.data.capture import Capture, View
 from pop_fast.data.load import in_picture, list_capture, load_capture, write_block
 from pop_fast.errors import PopError
 from pop_fast.train.checkpoint import load_splats, save_checkpoint
+from pop_fast.train.choose import LAUNCHED
 from pop_fast.train.evaluate import evaluate
 from pop_fast.train.load_result import CaptureRecord, load_splat, read_record
 from pop_fast.train.model import KEYS
@@ -265,7 +266,8 @@ def test_what_cannot_be_is_said_in_a_line_and_nothing_is_written(train: Train, t
 def test_processes_that_train_together_and_the_viewer_are_refused(train: Train, monkeypatch):
     monkeypatch.setattr("pop_fast.cli.train.check_viewer", lambda options: None)
     assert "--view shows one training" in train(*BLOCKS, "--view").err
-    monkeypatch.setenv("WORLD_SIZE", "2")
+    for name in LAUNCHED:
+        monkeypatch.setenv(name, "2")
     assert "without torchrun" in train(*BLOCKS, "--batch-size", "2").err
 
 

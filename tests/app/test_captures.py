@@ -451,6 +451,31 @@ def test_a_missing_folder_a_file_an_empty_folder_and_an_absent_source_are_told_a
     assert_one_line(lambda: load_capture(tmp_path / "photos"), "1 photographs", "pop sfm")
 
 
+def test_a_folder_of_captures_names_them_and_the_command_unless_all_photographs_are_asked_for(tmp_path: Path) -> None:
+    for name in ("a walk", "b"):
+        colmap_capture(tmp_path / name)
+    write_photograph(tmp_path / "more" / "0.png", photograph(0))
+    found = assert_one_line(lambda: load_capture(tmp_path), "captures in it have theirs (a walk, b)", "--source photos")
+    assert f"pop train '{tmp_path / 'a walk'}'" in found
+    assert_one_line(lambda: load_capture(tmp_path, source="photos"), "has 9 photographs but no cameras")
+
+
+def test_points_that_no_camera_can_have_measured_are_left_out_and_told(tmp_path: Path) -> None:
+    xyz, rgb = cloud()
+    usual = load_capture(colmap_capture(tmp_path / "usual"))
+    astray = (np.insert(xyz, 3, [1e13, 0.0, 0.0], axis=0), np.insert(rgb, 3, 255, axis=0))
+    root = colmap_capture(tmp_path / "astray", points=astray, binary=False)
+    path = root / "sparse" / "0" / "points3D.txt"
+    seen = ("4 ", "6 ")  # the fourth is the one astray
+    lines = [f"{line} 1 0" if line.startswith(seen) else line for line in path.read_text().splitlines()]
+    path.write_text("\n".join(lines))
+    found = load_capture(root)
+    assert "1 of 21 sparse points left out" in found.notes[-1]
+    assert np.array_equal(found.points, usual.points)
+    assert np.array_equal(found.views[0].viewmat, usual.views[0].viewmat)
+    assert [list(view.seen) for view in found.views[:2] if view.seen is not None] == [[4], []]
+
+
 def test_a_model_without_photographs_is_named(root: Path) -> None:
     (root / "images").rename(root / "pictures")
     assert_one_line(lambda: load_capture(root), str(root / "images"), "--images")

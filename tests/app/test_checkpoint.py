@@ -20,7 +20,7 @@ import torch
 from pop_fast.data.capture import Capture
 from pop_fast.errors import PopError
 from pop_fast.io.ply import load_ply, read_points, save_ply
-from pop_fast.train import TrainingRun
+from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from tests.app.conftest import Pop, in_a_child, pop_in_a_child
 from tests.app.damage import FORGED, INF, Content, contents, forge, latest, says, to
@@ -52,6 +52,21 @@ def test_other_settings_are_refused_by_name(stopped, changes, message):
     assert contents(stopped) == before
 
 
+@pytest.mark.parametrize("name", ["exposure", "gone"])
+def test_a_checkpoint_of_a_version_with_other_settings_says_so(stopped, tmp_path, name):
+    folder = shutil.copytree(stopped, tmp_path / "old")
+    path = ckpt.list_checkpoints(folder)[-1][1]
+    content = ckpt.load_checkpoint(path)
+    config = dict(content["config"])
+    if config.pop(name, None) is None:
+        config[name] = 1
+    ckpt.save_checkpoint(path, {**content, "config": config})
+    with pytest.raises(
+        PopError, match=rf"is of a version with other settings than this one \({name}\); resume with that"
+    ):
+        resume(folder)
+
+
 def _changed(what: str) -> Capture:
     capture = tiny_capture()
     view = capture.views[1]
@@ -79,8 +94,23 @@ def test_held_out_views_are_not_part_of_the_fingerprint():
     views = list(capture.views)
     views[0] = replace(views[0], image=255 - views[0].image)
     other = replace(capture, views=tuple(views))
-    assert ckpt.capture_fingerprint(capture, 5) == ckpt.capture_fingerprint(other, 5)
-    assert ckpt.capture_fingerprint(capture, 0) != ckpt.capture_fingerprint(other, 0)
+    some, all_of_them = (replace(TrainConfig(), test_every=every) for every in (5, 0))
+    assert ckpt.capture_fingerprint(capture, some) == ckpt.capture_fingerprint(other, some)
+    assert ckpt.capture_fingerprint(capture, all_of_them) != ckpt.capture_fingerprint(other, all_of_them)
+
+
+def test_alpha_and_tracks_are_part_of_the_fingerprint_where_they_are_used():
+    capture = tiny_capture()
+    plain = TrainConfig()
+    view, settings = capture.views[1], {"alpha channels": {"random_background": True}, "tracks": {"depth_lambda": 0.1}}
+    for what, changed in (
+        ("alpha channels", replace(view, alpha=np.full(view.image.shape[:2], 254, np.uint8))),
+        ("tracks", replace(view, seen=np.arange(3))),
+    ):
+        other = replace(capture, views=(capture.views[0], changed, *capture.views[2:]))
+        assert ckpt.capture_fingerprint(capture, plain) == ckpt.capture_fingerprint(other, plain)
+        ours, theirs = (ckpt.capture_fingerprint(of, replace(plain, **settings[what])) for of in (capture, other))
+        assert [name for name in ours if ours[name] != theirs[name]] == [what]
 
 
 CUT_OFF = r"x\.pt: cannot be read as a checkpoint; remove it"

@@ -44,6 +44,7 @@ from pop_fast.train.automatic import (
     expected_gaussians,
     factor_for,
 )
+from pop_fast.train.choose import LAUNCHED
 from pop_fast.train.config import first_difference
 from pop_fast.train.load_result import Splat
 from pop_fast.train.presets import (
@@ -584,11 +585,16 @@ def test_gaussians_are_foretold_as_runs_had_them() -> None:
         assert expected_gaussians(method, *run)[0] == pytest.approx(ended, rel=within), (method, run)
 
 
-def test_a_run_chooses_where_no_schedule_is_said() -> None:
+def test_a_run_chooses_where_no_schedule_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    # of torchrun's variables: one alone starts no other process
+    monkeypatch.setenv("WORLD_SIZE", "2")
     for words in ("photos", "photos --minutes 3 --method gsplat"):
         assert chooses_for_itself(words.split())
     for words in ("--preset=paper", "--steps_scaler 0.1", "--max-steps 10", "--blocks 2x1"):
         assert not chooses_for_itself(["photos", *words.split()])
+    for name in LAUNCHED:
+        monkeypatch.setenv(name, "2")
+    assert not chooses_for_itself(["photos"])
 
 
 def test_a_run_without_options_says_what_it_chose_keeps_it_and_resumes_to_the_same_bits(

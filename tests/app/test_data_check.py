@@ -213,6 +213,21 @@ def test_what_training_refuses_stands_against_it_in_the_same_words(check: Check,
         assert message.endswith(problem.removeprefix("00.png: ")), (message, problem)
 
 
+def test_what_of_a_list_is_unused_and_photographs_that_cannot_be_measured_are_told(check: Check, pop: Pop, root: Path):
+    transforms_capture(root)
+    assert "transforms.json is left unused: --source transforms" in finding(check(root), "LOOK", "poses")
+    outcome = pop("data", "check", root, "--source", "transforms")
+    assert "4 views from the transforms.json" in outcome.out
+    assert "unused" not in outcome.out
+    edit_transforms(root, lambda listing: listing["frames"].append({**listing["frames"][0], "file_path": "images/00"}))
+    outcome = pop("data", "check", root, "--source", "transforms")
+    assert outcome.status == 1
+    assert "images/00 and images/00.png are one photograph" in outcome.out
+    for name in ("00.png", "01.png"):
+        write_photograph(root / "images" / name, photograph(0, 15, 10 + int(name == "01.png")))
+    assert "1 of 4 are smaller than SSIM's window of 11x11 px, first 00.png" in finding(check(root, 1), "BAD", "sizes")
+
+
 def test_points_are_held_against_cameras_of_which_only_the_field_of_view_is_known(check: Check, tmp_path: Path) -> None:
     root = transforms_capture(tmp_path, camera_angle_x=1.0, **dict.fromkeys(("w", "h", "fl_x", "fl_y", "cx", "cy")))
     head = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(f"property float {axis}\n" for axis in "xyz")

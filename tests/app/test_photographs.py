@@ -6,6 +6,7 @@ import errno
 import hashlib
 import os
 import shutil
+import struct
 import tracemalloc
 import unicodedata
 import zipfile
@@ -532,6 +533,22 @@ def test_frames_after_a_damaged_one_are_not_taken_which_is_said(clip: Path, tmp_
     # a decoder that works ahead may tell a frame early
     assert "; from frame 4" in done.out
     assert " on the video is damaged, and was not read: convert it" in done.out
+
+
+def test_a_video_that_was_trimmed_on_a_telephone_is_not_called_damaged(tmp_path: Path) -> None:
+    path = tmp_path / "walk.mp4"
+    video = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*"mp4v"), 30.0, (128, 96))
+    for number in range(60):
+        video.write(frame(number))
+    video.release()
+    data = bytearray(path.read_bytes())
+    # the edit list shows one second of the two, 20 frames of 512 ticks after the beginning
+    at = data.index(b"elst") + 12
+    data[at : at + 8] = struct.pack(">II", 1000, 20 * 512)
+    path.write_bytes(data)
+    taken = take_frames(path, tmp_path / "out", count=6)
+    assert (taken.of, taken.decoded, taken.lost) == (30, 30, "")
+    assert len(taken.frames) + taken.alike == 6
 
 
 def test_sharpness_is_that_of_the_picture_shrunk_and_falls_with_blur() -> None:

@@ -126,7 +126,7 @@ def test_fields_of_a_frame_count_before_those_of_the_file(root: Path, own: dict[
 )
 def test_lenses_become_colmap_models(tmp_path: Path, fields: dict[str, Any], model: str, terms: list[float]) -> None:
     root = transforms_capture(tmp_path, **fields)
-    (shot, *_), _ = read_transforms([root / "transforms.json"])
+    (shot, *_), *_ = read_transforms([root / "transforms.json"])
     assert shot.camera.model_name == model
     assert shot.camera.params.tolist() == [*PINHOLE, *terms]
 
@@ -323,6 +323,36 @@ def test_colmap_is_preferred_unless_the_other_is_asked_for(root: Path) -> None:
     for options, source in (({}, "COLMAP model"), ({"source": "colmap"}, "COLMAP model")):
         assert raw(root, **options).source.startswith(source)
     assert raw(root, source="transforms").source.startswith("transforms.json")
+
+
+def test_lists_of_cameras_that_are_passed_over_are_told_with_what_goes_unused(root: Path, original: Capture) -> None:
+    assert raw(root).notes == ()
+    edit_transforms(root, lambda listing: listing.update(test_filenames=["images/00.png"]))
+    colmap_capture(root)
+    (note,) = raw(root).notes
+    assert "read from sparse/0; transforms.json is left unused with the test_filenames in it" in note
+    assert "--source transforms" in note
+    assert [view.split for view in raw(root, source="transforms").views] == ["test", "train", "train", "train"]
+    assert raw(root, source="transforms").notes == raw(root, source="colmap").notes == ()
+    shutil.rmtree(root / "sparse")
+    (root / "cameras.csv").write_text("#name,x,y,alt,heading,pitch,roll,f\n")
+    (note,) = raw(root).notes
+    assert "read from transforms.json; cameras.csv is left unused: --source realitycapture" in note
+
+
+def test_a_rolling_shutter_is_told_to_be_ignored(root: Path) -> None:
+    edit_transforms(root, lambda listing: listing.update(rolling_shutter=[0.0, 0.0, 0.0, 0.0]))
+    assert raw(root).notes == ()
+    edit_transforms(root, lambda listing: listing["frames"][1].update(rolling_shutter=[0.0, 0.0, 0.02, 0.0]))
+    (note,) = raw(root).notes
+    assert "rolling_shutter of transforms.json is ignored" in note
+
+
+def test_a_photograph_that_is_listed_with_its_ending_and_without_is_refused(root: Path) -> None:
+    edit_transforms(root, lambda listing: listing["frames"].append({**listing["frames"][0], "file_path": "images/00"}))
+    assert_one_line(
+        lambda: raw(root), "transforms.json", "images/00 and images/00.png are one photograph", "remove one"
+    )
 
 
 def test_rotations_rounded_by_the_file_are_made_rotations_again(root: Path) -> None:

@@ -524,7 +524,7 @@ def test_what_is_read_is_what_was_loaded(capture, tmp_path):
     assert path == prepared.path_of(tmp_path, config)
     assert [file.name for file in tmp_path.iterdir()] == ["prepared_1.npz"]
     found = prepared.read(path, config)
-    assert capture_fingerprint(found, 0) == capture_fingerprint(capture, 0)
+    assert capture_fingerprint(found, config) == capture_fingerprint(capture, config)
     assert (found.name, found.source, found.notes) == (capture.name, capture.source, capture.notes)
     assert np.array_equal(found.world_transform, capture.world_transform)
     for ours, theirs in zip(found.views, capture.views, strict=True):

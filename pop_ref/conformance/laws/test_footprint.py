@@ -254,8 +254,10 @@ def test_a_centre_in_the_plane_of_the_camera_has_no_gradient(backend):
 @law("gradients", GRADIENTS)
 def test_a_centre_behind_the_camera_whose_projection_overflows_has_no_gradient(backend):
     huge = 1e30 if backend.dtype == np.float32 else 1e200
-    scene = _scene([[huge, 0.0, -1.0 / huge], [huge, -huge, -huge], [1.0, 1.0, -1.0 / huge]])
-    _assert_only_the_others_have_gradients(backend, scene, EVERYTHING)
+    # of a usual size, and of one whose square overflows
+    for scale in (1.0, huge):
+        scene = _scene([[huge, 0.0, -1.0 / huge], [huge, -huge, -huge], [1.0, 1.0, -1.0 / huge]], scale=scale)
+        _assert_only_the_others_have_gradients(backend, scene, EVERYTHING)
 
 
 @law("gradients", GRADIENTS)

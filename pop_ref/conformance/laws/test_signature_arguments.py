@@ -109,6 +109,10 @@ def test_a_centre_on_the_far_plane_is_drawn_and_one_on_the_near_plane_as_the_pro
     nearer = {"means": np.array([[0.0, 0.0, 2.0**-10]]), "scales": np.full((1, 3), 2.0**-12)}
     called = backend.call(Call(((Frame(scene.with_overrides(**nearer), None),),), planes={"near_plane": 0.0}))
     assert called.alphas.max() > 0.25, "depth 2^-10 at near_plane=0 is culled"
+    # on the plane of the camera there is no pinhole to look through
+    nearer["means"] = np.zeros((1, 3))
+    called = backend.call(Call(((Frame(scene.with_overrides(**nearer), None),),), planes={"near_plane": 0.0}))
+    assert called.alphas.max() == 0.0, "depth 0 at near_plane=0 is drawn"
 
 
 @law("signature", SIGNATURE, PLANES)

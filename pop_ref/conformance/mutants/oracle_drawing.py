@@ -106,7 +106,7 @@ _LINES: Final[Lines] = {
          "V @ R @ covars[i].T + V.T @ R @ covars[i]", "2.0 * V @ R @ covars[i]",
          "test_agreement:covars_cam_from_covars_vjp_is_the_transpose"),
         ("far_plane_forgotten", "what lies beyond the far plane is drawn",
-         "return beyond_near & (depths <= profile.far_plane)", "return beyond_near",
+         "beyond_near & (depths > NEAREST) & (depths <= profile.far_plane)", "beyond_near & (depths > NEAREST)",
          "test_camera:the_far_plane_is_beyond_every_scene"),
         ("eye_gradient_transposed", "the gradient of the camera's centre by the rotation is transposed",
          "-np.outer(viewmat[:3, 3], v_center)", "-np.outer(v_center, viewmat[:3, 3])",
