@@ -28,7 +28,7 @@ from paper_repro.results import RESULTS
 from paper_repro.scenes import DATASETS, MADE, SCENES, PaperScene
 from paper_repro.status import everything, stale_files
 from paper_repro.train_row import BusyError, git
-from pop_fast.children import module_command
+from pop_fast.children import ends_with_this, module_command
 
 # of one Gaussian in training: parameters, gradients and two moments in float32; a checkpoint has no gradients
 _TRAINING, _CHECKPOINT, _PLY = 4 * 236, 3 * 236, 248
@@ -64,7 +64,7 @@ class _Child:
         self.stop = True
 
     def run(self, command: Sequence[str], threads: int) -> int:
-        environment = dict(os.environ)
+        environment = {**os.environ, **ends_with_this()}
         if threads > 0:
             environment["OMP_NUM_THREADS"] = str(threads)
         # a session of its own: a terminal's Ctrl-C would reach it as well as what is passed on, and two mean "at once"
