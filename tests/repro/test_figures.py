@@ -218,6 +218,9 @@ def test_figure_6b_has_every_run_in_the_panel_of_its_capture_and_no_mean_over_ca
     scenes = ("fox", "bear_512", "garden_512", "bonsai_800")
     four = [replace(r, scene=scene) for r in full() for scene in scenes if r.scene == "fox"]
     assert len(drawn("6b", four).figure.axes) == 4
+    # of L2 alone there is no panel, and the note says what was not run there
+    (lone,) = drawn("6b", [r for r in full() if r.scene == "fox" or r.row == "l2"]).figure.axes
+    assert lone.get_title(loc="left").startswith("fox: ")
 
 
 @given(
