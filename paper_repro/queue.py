@@ -22,7 +22,7 @@ from types import FrameType
 from typing import Final
 
 from paper_repro.data_check import check_scene
-from paper_repro.jobs import ROWS, Job, NotTrainableError, trainable
+from paper_repro.jobs import ROWS, Job, NotTrainableError, load_row, trainable
 from paper_repro.paper import paper
 from paper_repro.results import RESULTS
 from paper_repro.scenes import DATASETS, MADE, SCENES, PaperScene
@@ -227,6 +227,8 @@ def hours_by_row(jobs: Sequence[Job]) -> list[str]:
     lines = [f"{name:<{width}}  {taken:6.1f} h" for name, taken in found.items()]
     gpu = paper().stated["gpu"].value
     source = "by the paper's times, or by a row's cost where it prints none"
+    if shorter := [name for name in found if load_row(name).base is not None]:
+        source += f"; less for {', '.join(shorter)}, where the row that they begin from is finished in --work"
     return [*lines, f"{sum(found.values()):.1f} hours of one {gpu} in all, {source}"]
 
 
