@@ -607,6 +607,7 @@ def test_a_full_disk_leaves_nothing_half_written(pop, shared_capture, shared_res
     [
         ("eval gone", ("gone", "no such file or folder")),
         ("compare", ("name one or more",)),
+        ("build-cuda --jobs 0", ("jobs is 0; it must be at least 1",)),
         ("data check gone", ("gone", "no such folder")),
         ("train gone.mp4", ("gone.mp4", "no such file;")),
         ("compare gone.ply", ("gone.ply", "no such file or folder", "pop train")),

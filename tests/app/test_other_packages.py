@@ -416,8 +416,6 @@ def test_a_result_names_the_packages_that_it_was_made_with(site: Path, tmp_path:
     begun = json.loads(TrainConfig(backend="compiled").to_json()) | {"packages": ["theirs 1.0"]}
     begun["resolved"]["backend"] = "theirs"
     (tmp_path / "cfg.json").write_text(json.dumps(begun))
-    with pytest.raises(
-        PopError, match=r"cfg.json: config.backend is 'theirs', .* was made with theirs 1.0, not"
-    ):
+    with pytest.raises(PopError, match=r"cfg.json: config.backend is 'theirs', .* was made with theirs 1.0, not"):
         choose_backend(TrainConfig(result_dir=str(tmp_path)), resume=True)
     assert "packages" not in json.loads(TrainConfig().to_json())
