@@ -70,6 +70,9 @@ def test_help_is_quick_and_loads_nothing_heavy(command):
         (["queue", "--rows", "pops"], "row is 'pops'; it must be one of"),
         (["queue", "--check", "--seeds", "0"], "argument --seeds: is '0'; it must be a whole number of at least 1"),
         (["status", "--seeds", "-1"], "argument --seeds: is '-1'; it must be a whole number of at least 1"),
+        (["queue", "--threads", "-1"], "argument --threads: is '-1'; it must be a whole number of at least 0"),
+        (["queue", "--log-every", "0"], "argument --log-every: is '0'; it must be a whole number of at least 1"),
+        (["run", "pop", "demo", "--checkpoint-every", "9" * 20], "it must be a whole number of at least 0, under 10^9"),
         (["data", "check", "--scenes", "moon"], "scene is 'moon'; it must be one of bicycle, "),
     ],
 )
