@@ -85,9 +85,10 @@ kit: setup  ## measure the kit (kills, teeth, what laws and vectors reach) and w
 bench: setup  ## check the fast path against the oracle, then time it
 	$(BIN)/python benchmarks/run.py
 
+# without --wheel, so that a wheel is built from the sdist beside it, which is what others build from
 wheel: setup  ## build both distributions into dist/, pop-splatting's with compiled kernels (needs a C++ compiler)
-	$(BIN)/python -m build --wheel --outdir dist pop_ref
-	POP_WHEEL_KERNELS=1 $(BIN)/python -m build --wheel --outdir dist .
+	$(BIN)/python -m build --outdir dist pop_ref
+	POP_WHEEL_KERNELS=1 $(BIN)/python -m build --outdir dist .
 
 cuda: setup  ## compile the CUDA extension (needs nvcc; no GPU)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[cuda-build]'

@@ -44,8 +44,11 @@ def build(
         The module's file.
 
     Raises:
-        BuildError: nvcc, CMake or nanobind is missing, nvcc does not know the architecture, or a step failed.
+        BuildError: nvcc, CMake or nanobind is missing, nvcc does not know the architecture, `jobs` is under 1, or a
+            step failed.
     """
+    if jobs < 1:
+        raise BuildError(f"jobs is {jobs}; it must be at least 1")
     nvcc, cmake = tools()
     archs = _architectures(arch, nvcc)
     work = folder or HERE / "build"

@@ -61,10 +61,15 @@ def _add_scale(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scale", choices=SCALES, default="small", help=f"{about} (default: %(default)s)")
 
 
-def _positive(text: str) -> int:
-    if not text.isdecimal() or int(text) == 0:
-        raise argparse.ArgumentTypeError(f"is '{text}'; it must be a whole number of at least 1")
+def _whole(text: str, least: int = 0) -> int:
+    # more digits than any number of steps, threads or seeds has
+    if not text.isdecimal() or len(text) > 9 or int(text) < least:
+        raise argparse.ArgumentTypeError(f"is '{text}'; it must be a whole number of at least {least}, under 10^9")
     return int(text)
+
+
+def _positive(text: str) -> int:
+    return _whole(text, 1)
 
 
 def _add_jobs(parser: argparse.ArgumentParser) -> None:
@@ -107,12 +112,13 @@ def _add_training(parser: argparse.ArgumentParser) -> None:
     _add_work(parser, "the folder of checkpoints; that of a finished row can be removed (default: %(default)s)")
     note = "the folder of splats and renders of finished rows, to be published (default: published in --work)"
     parser.add_argument("--published", type=Path, metavar="DIR", help=note)
-    parser.add_argument("--threads", type=int, default=1, metavar="N", help="CPU threads, 0 for all cores (default: 1)")
+    note = "CPU threads, 0 for all cores (default: 1)"
+    parser.add_argument("--threads", type=_whole, default=1, metavar="N", help=note)
     _add_backend(parser, "the backend, as for pop train (default: %(default)s)")
     note = "steps between checkpoints, which a kill can cost (default: the scale's, 500 or so)"
-    parser.add_argument("--checkpoint-every", type=int, metavar="STEPS", help=note)
+    parser.add_argument("--checkpoint-every", type=_whole, metavar="STEPS", help=note)
     note = "steps between two points of the curves (default: the scale's, 100 or so)"
-    parser.add_argument("--log-every", type=int, metavar="STEPS", help=note)
+    parser.add_argument("--log-every", type=_positive, metavar="STEPS", help=note)
     for net, name in (("vgg", "VGG16"), ("alex", "AlexNet")):
         note = f"weights of LPIPS on {name}: one merged file, or backbone and linear layers"
         parser.add_argument(f"--lpips-{net}", nargs="+", default=[], metavar="FILE", help=note)

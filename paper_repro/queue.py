@@ -22,13 +22,13 @@ from types import FrameType
 from typing import Final
 
 from paper_repro.data_check import check_scene
-from paper_repro.jobs import ROWS, Job, NotTrainableError, trainable
+from paper_repro.jobs import ROWS, Job, NotTrainableError, load_row, trainable
 from paper_repro.paper import paper
 from paper_repro.results import RESULTS
 from paper_repro.scenes import DATASETS, MADE, SCENES, PaperScene
 from paper_repro.status import everything, stale_files
 from paper_repro.train_row import BusyError, git
-from pop_fast.children import module_command
+from pop_fast.children import ends_with_this, module_command
 
 # of one Gaussian in training: parameters, gradients and two moments in float32; a checkpoint has no gradients
 _TRAINING, _CHECKPOINT, _PLY = 4 * 236, 3 * 236, 248
@@ -64,7 +64,7 @@ class _Child:
         self.stop = True
 
     def run(self, command: Sequence[str], threads: int) -> int:
-        environment = dict(os.environ)
+        environment = {**os.environ, **ends_with_this()}
         if threads > 0:
             environment["OMP_NUM_THREADS"] = str(threads)
         # a session of its own: a terminal's Ctrl-C would reach it as well as what is passed on, and two mean "at once"
@@ -227,6 +227,8 @@ def hours_by_row(jobs: Sequence[Job]) -> list[str]:
     lines = [f"{name:<{width}}  {taken:6.1f} h" for name, taken in found.items()]
     gpu = paper().stated["gpu"].value
     source = "by the paper's times, or by a row's cost where it prints none"
+    if shorter := [name for name in found if load_row(name).base is not None]:
+        source += f"; less for {', '.join(shorter)}, where the row that they begin from is finished in --work"
     return [*lines, f"{sum(found.values()):.1f} hours of one {gpu} in all, {source}"]
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from paper_repro.collect import file_hash
 from paper_repro.figures.data import Asked
 from paper_repro.figures.style import GREY, INK, SMALL, TEXT, Drawn, Sheet, foot_of, show
 from paper_repro.jobs import Job, job_named
@@ -246,7 +247,8 @@ def _base(asked: Asked, job: Job) -> tuple[Result, Path]:
     for result in asked.results:
         if (result.row, result.scene, result.seed) == (job.row.name, job.scene.name, job.seed):
             kept = sorted((job.work(asked.work) / "ply").glob("point_cloud_*.ply"))
-            if kept:
+            # the folder may be that of another run of the row
+            if kept and result.ply_hash in (None, file_hash(kept[-1])):
                 return result, kept[-1]
     work = asked.work / _FOLDER
     print(f"figure 3: the Gaussians of {job} were not kept (--keep-ply), so they are trained for it", flush=True)

@@ -105,6 +105,10 @@ def _view(asked: Asked, runs: dict[tuple[str, str], Result], scene: str) -> Comp
         if not kept:
             return None
         found[row] = read_view(kept[-1])
+        told = runs[row, scene].per_view.get(str(found[row]["name"]), {})
+        if not np.isclose(float(found[row]["psnr"]), told.get("psnr", np.nan), rtol=0.0, atol=1e-6, equal_nan=True):
+            # those of another run of the row
+            return None
     photo, renders = found["pop"]["photo"], {row: found[row]["render"] for row in _ROWS}
     side = max(min(photo.shape[:2]) // 4, 1)
     psnr = {row: float(found[row]["psnr"]) for row in _ROWS}

@@ -102,7 +102,9 @@ def psnr_against_count(asked: Asked) -> Drawn:
     scenes = asked.scenes(paper().datasets["Mip-NeRF 360"])
     rows = (*SWEEP, _STAR)
     found = groups(r for r in asked.results if r.row in rows and r.scene in scenes)
-    shown = [scene for scene in scenes if scene in found]
+    run = [scene for scene in scenes if scene in found]
+    # one row alone is compared with nothing
+    shown = [scene for scene in run if len(found[scene]) > 1] or run
     if not shown:
         # which says what was not run
         _ = choose(asked, rows, scenes)
@@ -111,7 +113,7 @@ def psnr_against_count(asked: Asked) -> Drawn:
     runs = [r for scene in shown for group in found[scene].values() for r in group.runs]
     missing = [
         f"Not run on {scene}: {', '.join(map(name_of, lacking))}."
-        for scene in shown
+        for scene in run
         if (lacking := [row for row in rows if row not in found[scene]])
     ]
     note = " ".join(

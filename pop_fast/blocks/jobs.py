@@ -25,7 +25,7 @@ from typing import Final
 
 from pop_fast.api.backend import get_backend
 from pop_fast.blocks.plan import COARSE, FOLDER, Job
-from pop_fast.children import SAFE_PATH, module_command
+from pop_fast.children import SAFE_PATH, ends_with_this, module_command
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import FolderLock
 from pop_fast.train.choose import count_gpus
@@ -227,7 +227,8 @@ def _run(words: Sequence[str], quiet: bool) -> int:
     """Run a process and wait; the first Ctrl-C, SIGTERM or SIGHUP is passed on once to it and its children."""
     alone = os.name == "posix"
     with stop_requests() as stop:
-        shown, environment = subprocess.DEVNULL if quiet else None, {**os.environ, **SAFE_PATH}
+        shown = subprocess.DEVNULL if quiet else None
+        environment = {**os.environ, **SAFE_PATH, **ends_with_this()}
         process = subprocess.Popen(words, start_new_session=alone, stdout=shown, env=environment)
         try:
             while process.poll() is None:

@@ -26,6 +26,7 @@ _MODEL = {f"{name}.bin" for name in ("cameras", "images", "points3D", "rigs", "f
 _CANDIDATES = 150  # a view
 _PIXEL_NOISE = 0.4  # px, standard deviation
 _SEEN_BY = 3  # views, at least
+_MOST = 10_000  # views, and px of a side
 
 
 def make_demo(
@@ -52,10 +53,11 @@ def make_demo(
         overwrite: replace an existing folder.
 
     Raises:
-        CaptureError: too few views or pixels, or a negative seed.
+        CaptureError: too few or too many views or pixels, or a negative seed.
     """
-    if views < 4 or min(width, height) < 16:
-        raise CaptureError(f"the demo was asked for with {views} views of {width}x{height}; use 4 and 16x16 or more")
+    if not (4 <= views <= _MOST and 16 <= min(width, height) <= max(width, height) <= _MOST):
+        asked = f"the demo was asked for with {views} views of {width}x{height}"
+        raise CaptureError(f"{asked}; use 4 and 16x16 or more, and {_MOST:,} of each at most")
     if seed < 0:
         raise CaptureError(f"seed is {seed}; it must be at least 0")
     # asked for before the minutes of tracing, not after

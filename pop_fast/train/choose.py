@@ -38,9 +38,12 @@ def _choose(config: TrainConfig, resume: bool) -> tuple[TrainConfig, str]:
     if begun is not None:
         try:
             return replace(config, backend=begun), f"backend {begun}, with which the run was begun"
-        except PopError as error:
-            path = Path(config.result_dir) / "cfg.json"
-            raise PopError(f"{path}: {error}; repair the file, copy it again or train again") from error
+        except PopError:
+            from pop_fast.train.results import read_config
+
+            # raises one that names the file, and the package that gave the backend
+            read_config(Path(config.result_dir))
+            raise
     reasons: list[str] = []
     for backend in by_speed():
         reason = _why_not(backend, config)

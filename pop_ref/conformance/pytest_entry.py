@@ -8,6 +8,8 @@ nothing shall pay nothing.
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 import pytest
 
 KIT = "pop_ref.conformance"
@@ -18,4 +20,6 @@ def pytest_load_initial_conftests(early_config: pytest.Config, args: list[str]) 
     """Load the plugin when the laws are named: as a package, or as a folder or file of it."""
     words = (word.replace("/", ".").replace("\\", ".") for word in args)
     if any(KIT in word for word in words):
+        if find_spec("hypothesis") is None:
+            raise pytest.UsageError("the laws need hypothesis: pip install 'pop-ref[conformance]'")
         early_config.pluginmanager.import_plugin(f"{KIT}.plugin")

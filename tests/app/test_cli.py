@@ -14,6 +14,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -39,7 +40,7 @@ from pop_fast.errors import PopError
 from pop_fast.stages.tiles import tile_lists
 from pop_fast.train import TrainConfig, choose
 from tests.app.captures import edit_transforms, photograph, transforms_capture, write_photograph
-from tests.app.conftest import ROOT, TRAIN, Pop, in_a_child
+from tests.app.conftest import ROOT, TRAIN, Outcome, Pop, in_a_child
 from tests.app.damage import says
 from tests.app.tiny import interrupt
 
@@ -311,6 +312,21 @@ def test_a_fault_of_the_program_keeps_its_traceback_and_ctrl_c_anywhere_exits_wi
     monkeypatch.setattr("pop_fast.view.report.source.write_report", raising(KeyboardInterrupt()))
     outcome = pop("report", ".")
     assert (outcome.status, outcome.err.strip()) == (130, "pop: interrupted")
+
+
+@pytest.mark.parametrize("program", ["pop", "pop-repro"])
+def test_ctrl_c_while_a_program_is_loaded_shows_no_traceback(program: str) -> None:
+    at = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"][program].replace(":", " import ")
+    script = f"""
+import sys
+class Interrupt:
+    def find_spec(self, name, *_):
+        if name == "difflib":
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Interrupt())
+from {at} as start
+sys.exit(start())"""
+    assert in_a_child(script) == Outcome(130, "", f"{program}: interrupted\n")
 
 
 @pytest.mark.parametrize(
@@ -591,6 +607,7 @@ def test_a_full_disk_leaves_nothing_half_written(pop, shared_capture, shared_res
     [
         ("eval gone", ("gone", "no such file or folder")),
         ("compare", ("name one or more",)),
+        ("build-cuda --jobs 0", ("jobs is 0; it must be at least 1",)),
         ("data check gone", ("gone", "no such folder")),
         ("train gone.mp4", ("gone.mp4", "no such file;")),
         ("compare gone.ply", ("gone.ply", "no such file or folder", "pop train")),

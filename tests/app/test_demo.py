@@ -114,8 +114,8 @@ def test_the_next_command_names_a_folder_with_a_space_as_a_shell_takes_it(pop: P
     assert shlex.split(last) == ["next:", "pop", "train", str(out), "--minutes", "2"]
 
 
-@pytest.mark.parametrize("size", [{"views": 3}, {"width": 8}, {"height": 0}])
-def test_too_small_a_demo_is_refused(tmp_path: Path, size: dict[str, int]) -> None:
+@pytest.mark.parametrize("size", [{"views": 3}, {"width": 8}, {"height": 0}, {"views": 10**20}, {"width": 10**20}])
+def test_too_small_or_too_large_a_demo_is_refused(tmp_path: Path, size: dict[str, int]) -> None:
     assert_one_line(lambda: make_demo(tmp_path / "d", **(SMALL | size)), "16x16")
     assert list(tmp_path.iterdir()) == []
 

@@ -29,6 +29,7 @@ from pop_fast.errors import PopError
 from pop_fast.io.ply import save_ply
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train import checkpoint as ckpt
+from pop_fast.train.choose import choose_backend
 from pop_fast.train.presets import METHODS, Method
 from pop_ref.recipes import RECIPES
 from tests.app.conftest import ROOT, TRAIN
@@ -417,4 +418,9 @@ def test_a_result_names_the_packages_that_it_was_made_with(site: Path, tmp_path:
     assert json.loads(made)["packages"] == [f"{NAME} 1.0"]
     with pytest.raises(PopError, match=f"method is 'mine', of another package; the run was made with {NAME} 1.0, not"):
         TrainConfig.from_json(made)
+    begun = json.loads(TrainConfig(backend="compiled").to_json()) | {"packages": ["theirs 1.0"]}
+    begun["resolved"]["backend"] = "theirs"
+    (tmp_path / "cfg.json").write_text(json.dumps(begun))
+    with pytest.raises(PopError, match=r"cfg.json: config.backend is 'theirs', .* was made with theirs 1.0, not"):
+        choose_backend(TrainConfig(result_dir=str(tmp_path)), resume=True)
     assert "packages" not in json.loads(TrainConfig().to_json())

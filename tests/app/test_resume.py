@@ -23,6 +23,7 @@ import pytest
 import torch
 
 import pop_fast.compiled
+from pop_fast.children import module_command
 from pop_fast.data.gaussians import initialize_params
 from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun, training_run
@@ -431,6 +432,19 @@ def test_the_search_for_cameras_is_left_at_once_and_leaves_nothing(tmp_path, num
         assert contents(tmp_path / "in") == before
     # the other process notices that this one is gone, whatever ended it
     wait_until(lambda: not any((tmp_path / "scratch").iterdir()))
+
+
+@posix
+@pytest.mark.parametrize(
+    "run", ["pop_fast.blocks.jobs import _run as run", "paper_repro.queue import _Child; run = _Child().run"]
+)
+def test_the_process_of_a_block_or_a_row_ends_when_its_starter_is_killed(tmp_path, run):
+    child = module_command("timeit", "-n1", "-r1", "import time; print('at work', flush=True); time.sleep(99)")
+    starter = start(tmp_path, script=f"from {run}; run({child}, 0)")
+    assert starter.stdout.readline() == "at work\n"
+    starter.kill()
+    # both streams end with the last process that holds them
+    assert starter.communicate(timeout=60)[0] == ""
 
 
 @posix

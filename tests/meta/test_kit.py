@@ -28,7 +28,7 @@ from jaxtyping import TypeCheckError
 
 from pop_fast.api.rasterize import rasterization as fast
 from pop_ref.activations import scales_from_log_scales
-from pop_ref.conformance import laws
+from pop_ref.conformance import laws, pytest_entry
 from pop_ref.conformance.adapter import OracleAdapter, View
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.backends import shipped
@@ -235,6 +235,12 @@ def test_a_session_that_judges_nothing_is_left_alone(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "pytest", "-q", *plugins, "--profile=cpu"]
     done = subprocess.run([*command, str(tmp_path)], capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_a_session_without_hypothesis_is_told_which_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pytest_entry, "find_spec", lambda name: None)
+    with pytest.raises(pytest.UsageError, match=r"the laws need hypothesis: pip install 'pop-ref\[conformance\]'"):
+        pytest_entry.pytest_load_initial_conftests(None, ["--pyargs", "pop_ref.conformance"])
 
 
 # a run of the kit for each, in one process

@@ -389,6 +389,19 @@ def test_authors_place_and_version_are_said_once_and_repeated_rightly() -> None:
     assert (ROOT / "pop_ref" / "LICENSE").read_bytes() == (ROOT / "LICENSE").read_bytes()
 
 
+@pytest.mark.parametrize("folder", ["", "pop_ref"])
+def test_every_requirement_has_the_version_it_was_tested_with_and_every_python_is_tested(folder: str) -> None:
+    project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    some = [project["dependencies"], *project["optional-dependencies"].values()]
+    named = {re.split(r"[^\w-]", line)[0].lower().replace("_", "-") for lines in some for line in lines}
+    pinned = (ROOT / "constraints.txt").read_text(encoding="utf-8").lower().replace("_", "-").splitlines()
+    # triton only brings nvdisasm to `make sass`, which no test runs
+    assert named - {line.partition("==")[0] for line in pinned} - {"pop-ref", "pop-splatting", "triton"} == set()
+    workflow = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text(encoding="utf-8"))
+    tested = workflow["jobs"]["versions"]["strategy"]["matrix"]["python"]
+    assert re.findall(r":: (3\.\d+)", " ".join(project["classifiers"])) == tested
+
+
 @pytest.mark.parametrize("path", sorted((ROOT / ".github").rglob("*.yml")), ids=lambda path: path.stem)
 def test_every_command_of_a_workflow_is_there(path: Path) -> None:
     text = path.read_text(encoding="utf-8")

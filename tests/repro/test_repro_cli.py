@@ -70,6 +70,9 @@ def test_help_is_quick_and_loads_nothing_heavy(command):
         (["queue", "--rows", "pops"], "row is 'pops'; it must be one of"),
         (["queue", "--check", "--seeds", "0"], "argument --seeds: is '0'; it must be a whole number of at least 1"),
         (["status", "--seeds", "-1"], "argument --seeds: is '-1'; it must be a whole number of at least 1"),
+        (["queue", "--threads", "-1"], "argument --threads: is '-1'; it must be a whole number of at least 0"),
+        (["queue", "--log-every", "0"], "argument --log-every: is '0'; it must be a whole number of at least 1"),
+        (["run", "pop", "demo", "--checkpoint-every", "9" * 20], "it must be a whole number of at least 0, under 10^9"),
         (["data", "check", "--scenes", "moon"], "scene is 'moon'; it must be one of bicycle, "),
     ],
 )
@@ -147,6 +150,9 @@ def test_the_papers_scale_begins_with_its_hours_and_what_is_lacking(capsys, tmp_
     seconds["l1_div_2"] = seconds["pop"] * load_row("l1_div_2").cost
     assert taken == {row: pytest.approx(due / 3600, abs=0.05) for row, due in seconds.items()}
     assert told[4].startswith(f"{sum(seconds.values()) / 3600:.1f} hours of one RTX 4090 in all")
+    assert "less for" not in told[4]
+    total = repro_queue.hours_by_row([job_named("pup", "train", "paper")])[-1]
+    assert "; less for pup, where the row that they begin from is finished" in total
     assert told[5] == "lacking:"
     assert {line.split(" is ")[0] for line in told[6:9]} == {f"  data: {s}" for s in ("train", "truck", "playroom")}
     assert "it comes from https://repo-sam.inria.fr/" in told[6]
