@@ -238,6 +238,7 @@ def test_one_command_writes_table_json_page_and_maps(explain: Callable[..., Outc
     drawn = [row for row in plain["rows"] if row["status"] == "blended"]
     assert all(f'data-id="{row["id"]}"' in html for row in drawn)
     assert html.count("<ellipse") == 4 * min(len(drawn), 14)
+    assert all("aria-label=" in drawing for drawing in re.findall('<svg[^>]*role="img"[^>]*>', html))
     names = {path.stem for path in (tmp_path / "maps").iterdir()}
     assert {"dominant_ids", "n_blended", "n_traversed", "termination_depth", "T_final", "error", "pop_pull"} <= names
     assert {"importance", "importance_gaussians", "diff_color", "diff_dominant"} <= names

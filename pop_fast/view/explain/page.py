@@ -89,7 +89,8 @@ def light_bar(e: PixelExplanation) -> str:
     share = {"x": f"{1000 * left:.3f}", "width": f"{1000 * e.T_final:.3f}"}
     pieces.append(element("rect", "", title, fill="url(#hatch)", y=12, height=62, **share))
     body = "".join(pieces)
-    return element("svg", body, kind="light", viewBox="0 0 1000 74", preserveAspectRatio="none", role="img")
+    shape = {"viewBox": "0 0 1000 74", "preserveAspectRatio": "none"}
+    return element("svg", body, kind="light", role="img", aria_label="weights of the splats, front to back", **shape)
 
 
 def css_color(color: Sequence[float]) -> str:
