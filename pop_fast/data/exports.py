@@ -384,6 +384,7 @@ def read_export(root: Path, program: str = "auto", images: str | None = None) ->
 
 
 _ROLLING: Final = "rolling_shutter"
+_NO_PINHOLE: Final = ("latlong", "equirectangular", "orthographic", "ftheta_p0")  # instant-ngp's other lenses
 _POINTS = ("sparse_pc.ply", "points3D.ply", "points3d.ply")
 # what is measured in pixels of the size w x h; without it, only a field of view can be used
 _IN_PIXELS = ("fl_x", "fl_y", "cx", "cy")
@@ -531,6 +532,8 @@ def _transform_viewmat(where: str, frame: dict[str, Any]) -> np.ndarray:
 def _camera(where: str, fields: dict[str, Any], camera_id: int) -> Any:
     """Build the camera of a frame: its own fields before the file's."""
     number = Numbers(where, fields)
+    if other := next((name for name in _NO_PINHOLE if fields.get(name)), None):
+        raise CaptureError(f"{where}: {other} is no lens that is supported; cut the photographs into perspective views")
     width, height = int(number("w")), int(number("h"))
     if not (1 <= width <= WIDEST and 1 <= height <= WIDEST):
         raise CaptureError(f"{where}: w x h is {width} x {height}; both must be at least 1 and at most {WIDEST}")

@@ -438,6 +438,7 @@ BAD_FIELDS: dict[str, tuple[Edit, tuple[str, ...]]] = {
     "no size": (without("w", "h"), ("frames[0]", "w and h are absent")),
     "no height": (without("h"), ("frames[0]", "h is None")),
     "unknown lens": (frame(camera_model="PANINI"), ("frames[1]", "camera_model is 'PANINI'", "OPENCV")),
+    "another lens": (frame(latlong=True), ("frames[1]", "latlong is no lens that is supported", "perspective views")),
     "full sphere": (frame(camera_model="EQUIRECTANGULAR"), ("frames[1]", "full sphere", "perspective views")),
     "fourth radial term": (frame(k4=0.1), ("frames[1]", "k4 is 0.1")),
     "terms of a pinhole": (frame(camera_model="PINHOLE", k1=0.1), ("frames[1]", "k1 is 0.1", "PINHOLE", "OPENCV")),
