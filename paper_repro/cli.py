@@ -189,11 +189,12 @@ def queue(words: Sequence[str]) -> int:
     """Train the rows that are missing."""
     parser = _parser_of("queue", _QUEUE)
     _add_jobs(parser)
-    parser.add_argument("--nice", type=int, default=0, metavar="N", help="nice value, 0 to 19")
+    parser.add_argument("--nice", type=_whole, default=0, metavar="N", help="nice value, 0 to 19")
     parser.add_argument("--commit", action="store_true", help="commit each result in git")
-    parser.add_argument("--list", action="store_true", help="list what is missing, in order, and train nothing")
+    instead = parser.add_mutually_exclusive_group()
+    instead.add_argument("--list", action="store_true", help="list what is missing, in order, and train nothing")
     note = "say the hours and what of data, disk, memory and GPU is lacking, and train nothing; scale paper begins so"
-    parser.add_argument("--check", action="store_true", help=note)
+    instead.add_argument("--check", action="store_true", help=note)
     _add_training(parser)
     args = parser.parse_args(words)
     from paper_repro.queue import run_queue
@@ -435,7 +436,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(words: list[str]) -> int:
-    if not words or words[0] in ("-h", "--help", "help"):
+    if words[:1] == ["help"]:
+        words = [*words[1:], "--help"]
+    if not words or words[0] in ("-h", "--help"):
         width = max(map(len, COMMANDS)) + 2
         commands = "\n".join(f"  {name:<{width}}{about}" for name, (_, about) in COMMANDS.items())
         print(_TEXT.format(commands=commands, snakefile="paper_repro/Snakefile"))

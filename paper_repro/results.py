@@ -565,6 +565,13 @@ def _lines(path: Path) -> dict[tuple[str, int], tuple[int, str]]:
     return lines
 
 
+def check_writable(folder: Path) -> None:
+    """Refuse a folder that no result could be written into, before the days of training."""
+    with _alone(folder):
+        if not os.access(folder, os.W_OK):
+            raise PopError(f"{folder}: cannot be written to; change its mode, or choose another folder")
+
+
 @contextmanager
 def _alone(folder: Path) -> Iterator[None]:
     """Hold the lock of a folder, waiting for another process that writes there."""

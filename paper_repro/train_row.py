@@ -133,6 +133,7 @@ def train_row(job: Job, options: Options) -> Result:
     # a row that cannot be trained is said before anything is made
     job.config()
     config = _config(job, options, work)
+    results.check_writable(job.file(options.results).parent)
     with only_one(work.with_suffix(".lock"), f"{job}: another process trains it"):
         # that process may have finished it meanwhile
         result = None if options.again else job.result(options.results)

@@ -35,7 +35,8 @@ def call(*words: object, status: int = 0, capsys: pytest.CaptureFixture[str]) ->
 def test_help_names_every_command_and_is_the_answer_to_nothing(capsys):
     text = call("--help", capsys=capsys)
     assert all(f"  {command} " in text for command in COMMANDS)
-    assert call(capsys=capsys) == text
+    assert call(capsys=capsys) == call("help", capsys=capsys) == text
+    assert call("help", "run", capsys=capsys).startswith("usage: pop-repro run ")
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, ""])
@@ -73,6 +74,12 @@ def test_help_is_quick_and_loads_nothing_heavy(command):
         (["queue", "--threads", "-1"], "argument --threads: is '-1'; it must be a whole number of at least 0"),
         (["queue", "--log-every", "0"], "argument --log-every: is '0'; it must be a whole number of at least 1"),
         (["run", "pop", "demo", "--checkpoint-every", "9" * 20], "it must be a whole number of at least 0, under 10^9"),
+        (["queue", "--nice", "9" * 20], "argument --nice: is '99999999999999999999'; it must be a whole number"),
+        (["queue", "--list", "--check"], "argument --check: not allowed with argument --list"),
+        (
+            ["run", "pop", "demo", "--scale", "toy", "--results", "/proc/x", "--work", "work"],
+            "/proc/x/toy: cannot be written to (No such file or directory); choose another folder",
+        ),
         (["data", "check", "--scenes", "moon"], "scene is 'moon'; it must be one of bicycle, "),
     ],
 )
@@ -81,6 +88,8 @@ def test_a_mistake_is_one_line_that_names_the_fix(words, says, capsys, tmp_path,
     text = call(*words, status=2, capsys=capsys)
     assert says in text
     assert "Traceback" not in text
+    assert not (tmp_path / "results").exists()
+    assert not (tmp_path / "work" / "toy").exists()
 
 
 def test_an_installed_package_keeps_nothing_between_its_own_files(tmp_path, monkeypatch):
