@@ -128,7 +128,7 @@ def settled(told: Sequence[tuple[str, Claim]]) -> str:
     parts = [outcome(told)]
     if commands:
         lines = "\n".join(["```sh", *commands, "```"])
-        parts += ["These runs would decide what is not decided:", lines]
+        parts += ["These runs would decide what is not decided, if the differences stay what they are now:", lines]
     return "\n\n".join(parts)
 
 
@@ -156,7 +156,11 @@ def _one(claim: Claim) -> str:
 
 def _deciders(told: Told) -> str:
     under = f" under {told.reading}" if told.reading else ""
-    return f"These runs would decide what is open{under}:\n\n```sh\n" + "\n".join(told.deciders) + "\n```"
+    return (
+        f"These runs would decide what is open{under}, if the differences stay what they are now:\n\n```sh\n"
+        + "\n".join(told.deciders)
+        + "\n```"
+    )
 
 
 def _noise(scale: str, noise: Noise) -> str:
