@@ -143,8 +143,9 @@ class Given:
         scaler = self.steps_scaler
         if scaler is not None and not 0.0 < scaler < math.inf:
             raise PopError(f"steps_scaler is {scaler}; it must be > 0 and finite")
-        if scaler is not None and not 1.0 / _LARGEST_SCALER <= scaler <= _LARGEST_SCALER:
-            raise PopError(f"steps_scaler is {scaler}; it must lie in [1e-06, {_LARGEST_SCALER:.0f}]")
+        least = 1.0 / _LARGEST_SCALER
+        if scaler is not None and not least <= scaler <= _LARGEST_SCALER:
+            raise PopError(f"steps_scaler is {scaler}; it must lie in [{least:g}, {_LARGEST_SCALER:.0f}]")
 
     @classmethod
     def of(cls, overrides: Mapping[str, Any], **plan: Any) -> Self:
