@@ -35,7 +35,7 @@ from . import disk, fuzz, runs, sanitizers
 
 RESULTS = Path(__file__).resolve().parents[1] / "results" / "faults.json"
 PARTS = ("fuzz", "kills", "crashes", "writes", "flips", "sanitizers")
-QUICK = ("fuzz", "crashes", "writes", "sanitizers")
+QUICK = ("fuzz", "crashes", "writes", "flips", "sanitizers")
 KINDS = tuple(runs.KINDS)
 # how often at least, and at how many places of a job at most; a run takes a second, two, and five
 KILLS = {"native step": 50, "two ranks": 20, "blocks 2x1": 10}
