@@ -22,6 +22,7 @@ from pop_ref import (
     alpha,
     footprint,
     harmonics,
+    project,
     project_vjp,
     projection,
     render,
