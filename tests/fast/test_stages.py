@@ -120,6 +120,14 @@ def test_a_loss_does_not_depend_on_the_number_of_threads(dtype: torch.dtype) -> 
     assert_alike(lambda: [losses.photometric_3dgs(x, y, padding="same"), losses.l2(x, y)], (2, 3, 4, 5))
 
 
+@pytest.mark.parametrize("padding", ["valid", "same"])
+def test_similarity_maps_are_the_oracles(padding: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    x, y = Case(20, 14, seed=3).images()
+    monkeypatch.setattr(losses, "_BAND_VALUES", 1)
+    ours = losses.ssim_map(torch.tensor(x), torch.tensor(y), padding)
+    np.testing.assert_allclose(ours.numpy(), oracle_ssim.ssim_map(x, y, padding), atol=1e-12)
+
+
 def test_window_and_constants_are_the_oracles() -> None:
     np.testing.assert_allclose(np.outer(losses._TAPS, losses._TAPS), oracle_ssim.gaussian_window(), rtol=1e-15)
     for name in ("WINDOW_SIZE", "WINDOW_SIGMA", "C1", "C2"):
