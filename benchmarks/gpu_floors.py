@@ -110,10 +110,14 @@ def measured_step() -> str:
     found = read_json(MEASURED / "kernels.json")
     case = found["cases"]["270k_1.6MP"]
     by_kernel, whole = case["pixel_parallel_by_kernel"], case["pixel_parallel"]["step_with_pop_ms"]
-    rows = []
-    for name, of in by_kernel["kernels"].items():
-        floor = [f"{of['floor_ms']:.3f}", of["bound"]] if "bound" in of else ["", ""]
-        rows.append([f"`{name}`", f"{of['ms']:.3f}", *floor])
+    rows = [
+        [
+            f"`{name}`",
+            f"{of['ms']:.3f}",
+            *((f"{of['floor_ms']:.3f}", of["bound"]) if "bound" in of else ("", "latency")),
+        ]
+        for name, of in by_kernel["kernels"].items()
+    ]
     rows.append(["whole step", f"{whole:.2f}", f"{by_kernel['floor_ms']:.2f}", ""])
     head = ["step", f"{found['gpu']}, commit {found['commit'][:8]}, ms", "floor there, ms", "of what"]
     return markdown(head, rows)

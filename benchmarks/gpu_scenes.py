@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -41,6 +41,11 @@ class GpuCase:
     size: float
     seen: float = 0.59
     gathered: float = 0.65
+
+    def smaller(self, by: int) -> GpuCase:
+        """Return a case of the same density and sizes in px, on an image smaller by that factor along both sides."""
+        name = f"{self.name}_{by}x_smaller"
+        return replace(self, name=name, n=self.n // by**2, width=self.width // by, height=self.height // by)
 
 
 # a step of the first has 160,000 visible Gaussians, 2 million instances of 16 x 8 px tiles, 120 evaluated and 35

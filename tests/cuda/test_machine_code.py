@@ -169,8 +169,9 @@ def test_the_notes_hold_what_the_counts_give(monkeypatch: pytest.MonkeyPatch) ->
 
     assert gpu_floors.main(["--check"]) == 0
     # twice the issue rate halves what is bound by it
-    pairs, visits = (192_000_000, 56_000_000, 1_600_000, 862), (1_161_000, 156_000, 53_100)
-    case = gpu_floors.Loads(270_000, 160_000, 2_000_000, *pairs, *visits, tried=4_360_000)
+    case = gpu_floors.Loads(
+        270_000, 160_000, 2_000_000, 192_000_000, 56_000_000, 1_600_000, 862, 1_161_000, 156_000, 53_100, 4_360_000
+    )
     card = gpu_floors.Card(4.2e12, 132 * 128 * 1.755e9, 1.755e9)
     slow = gpu_floors.floors(case, card)
     fast = gpu_floors.floors(case, replace(card, instructions_per_s=2.0 * card.instructions_per_s))
