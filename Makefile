@@ -97,7 +97,7 @@ cuda: setup  ## compile the CUDA extension (needs nvcc; no GPU)
 sass: setup  ## count the kernels' machine instructions into benchmarks (needs nvcc; no GPU)
 	$(BIN)/python -m pip install --quiet -e '.[sass]'
 	$(BIN)/python -m cuda_ext.machine_code.count_sass --json benchmarks/results/sass.json
-	$(BIN)/python benchmarks/gpu_floors.py --write
+	$(BIN)/python benchmarks/gpu_predictions.py --write
 
 emulate: setup  ## run the CUDA kernels' own source on the host, warp by warp: every law, training steps (minutes)
 	POP_CUDA_ON=emulated POP_EMULATED_LAWS=1 POP_CUDA_KINDS="pixel_parallel atomics gaussian_parallel" \

@@ -6,7 +6,7 @@ Correctness first: every case begins with the gradients of the two backward fami
 not, `failed` says so. Every part of a case is written when it is there, and one that raises takes
 nothing from the others. Times are medians of CUDA events after warm-up, in milliseconds; with each stands the sum of
 the kernels' own times by the profiler, and with every kernel what it has to do at least and its floor on this card
-(`gpu_floors`). Wall times of a step hold value checks, waits of the host and Python's own time; the profiler's
+(`gpu_predictions`). Wall times of a step hold value checks, waits of the host and Python's own time; the profiler's
 sums compare kernels. `gpu_gsplat.py` adds gsplat's times.
 """
 
@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
-from gpu_floors import Card, Loads, elapsed_ms, floors, measured_card
+from gpu_predictions import Card, Loads, elapsed_ms, floors, measured_card
 from gpu_scenes import CASES, FULL_SIZE, TINY, GpuCase, scenes
 from gpu_visits import count_tried, count_visits
 from torch import Tensor

@@ -48,8 +48,9 @@ class GpuCase:
         return replace(self, name=name, n=self.n // by**2, width=self.width // by, height=self.height // by)
 
 
-# a step of the first has 160,000 visible Gaussians, 2 million instances of 16 x 8 px tiles, 120 evaluated and 35
-# contributing pairs a pixel (`results/gpu/kernels.json`)
+# the first is the one that times were predicted for: 160,000 visible, 2 million instances of 16 x 8 px tiles, 120
+# evaluated and 35 contributing pairs a pixel. Counted by the emulated kernels, the whole of it: 157,934 visible,
+# 2,004,926 instances, 119.2 and 35.7 pairs; tests/cuda/emulated/test_gpu_benchmark.py counts a part of it
 CASES = (
     GpuCase("270k_1.6MP", 270_000, 1552, 1032, 1.05),
     GpuCase("1M_1.6MP", 1_000_000, 1552, 1032, 0.55),
@@ -128,7 +129,7 @@ def packed_scene(path: Path, device: torch.device, pixels: float | None = None) 
 def scenes(
     names: list[str] | None, packed: list[Path], device: torch.device, full_size: float = FULL_SIZE
 ) -> Iterator[tuple[str, MakeScene]]:
-    """Name the scenes asked for, and how each is made: the first case, the packed ones, larger synthetic ones."""
+    """Name the scenes asked for, and how each is made: the predicted case, the packed ones, larger synthetic ones."""
     chosen = [case for case in (*CASES, TINY) if case.name in (names or [case.name for case in CASES])]
 
     def synthetic(case: GpuCase) -> tuple[str, MakeScene]:

@@ -153,33 +153,30 @@ def test_every_kernel_of_the_sources_is_committed_for_both_architectures() -> No
 
 def test_the_notes_say_which_sources_have_changed_since_they_were_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(COUNTS.parents[1]))
-    import gpu_floors
+    import gpu_predictions
 
     told = json.loads(COUNTS.read_text()) | {"sources": count_sass.sources()}
-    assert gpu_floors.machine_code(told).endswith(f"\n\nCounted with nvcc {told['nvcc']}.")
+    assert gpu_predictions.machine_code(told).endswith(f"\n\nCounted with nvcc {told['nvcc']}.")
     was = told["sources"] | {"tiles.cuh": ""}
     del was["step.cu"]
-    assert "Changed since: `step.cu`, `tiles.cuh`." in gpu_floors.machine_code(told | {"sources": was})
+    assert "Changed since: `step.cu`, `tiles.cuh`." in gpu_predictions.machine_code(told | {"sources": was})
     assert json.loads(count_sass.as_json(told)) == told
 
 
 def test_the_notes_hold_what_the_counts_give(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(COUNTS.parents[1]))
-    import gpu_floors
+    import gpu_predictions
 
-    assert gpu_floors.main(["--check"]) == 0
+    assert gpu_predictions.main(["--check"]) == 0
     # twice the issue rate halves what is bound by it
-    case = gpu_floors.Loads(
-        270_000, 160_000, 2_000_000, 192_000_000, 56_000_000, 1_600_000, 862, 1_161_000, 156_000, 53_100, 4_360_000
-    )
-    card = gpu_floors.Card(4.2e12, 132 * 128 * 1.755e9, 1.755e9)
-    slow = gpu_floors.floors(case, card)
-    fast = gpu_floors.floors(case, replace(card, instructions_per_s=2.0 * card.instructions_per_s))
+    slow = gpu_predictions.floors(gpu_predictions.CASE, gpu_predictions.H200)
+    card, case = gpu_predictions.H200, gpu_predictions.CASE
+    fast = gpu_predictions.floors(case, replace(card, instructions_per_s=2.0 * card.instructions_per_s))
     assert fast["blend_backward"]["floor_ms"] == pytest.approx(slow["blend_backward"]["floor_ms"] / 2.0)
     # a list that is long enough bounds the blend whatever the others are
-    long = gpu_floors.floors(replace(case, longest=50_000), card)
+    long = gpu_predictions.floors(replace(case, longest=50_000), card)
     assert (slow["blend_forward"]["bound"], long["blend_forward"]["bound"]) == ("issue", "longest list")
-    again = gpu_floors.floors(replace(case, longest=100_000), card)
+    again = gpu_predictions.floors(replace(case, longest=100_000), card)
     assert again["blend_forward"]["floor_ms"] == pytest.approx(2.0 * long["blend_forward"]["floor_ms"])
     # what goes through the half-rate pipe is a part of what is issued
     for name in ("blend_forward", "blend_backward"):

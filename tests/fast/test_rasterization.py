@@ -204,6 +204,26 @@ def test_colours_may_have_no_channel(backend: str) -> None:
     assert bool((given["opacities"].grad != 0.0).any())
 
 
+def test_packed_rows_cameras_and_batches_have_the_bits_of_each_alone() -> None:
+    first, second, two = scene(1), scene(2), cameras(2)
+    alone, _, meta = rasterization(**first, **two, packed=False)
+    packed, _, of_packed = rasterization(**first, **two, packed=True)
+    assert torch.equal(packed, alone)
+    for key in ("dominant_ids", "dominant_counts"):
+        assert torch.equal(of_packed[key], meta[key])
+    rows = of_packed["camera_ids"], of_packed["gaussian_ids"]
+    assert torch.equal(meta["means2d"][rows], of_packed["means2d"])
+    for i in range(2):
+        one = {**two, "viewmats": two["viewmats"][i : i + 1], "Ks": two["Ks"][:1]}
+        assert torch.equal(rasterization(**first, **one)[0][0], alone[i])
+    batched = {name: torch.stack((first[name], second[name])) for name in first}
+    views = {**two, "viewmats": two["viewmats"].repeat(2, 1, 1, 1), "Ks": two["Ks"].repeat(2, 1, 1, 1)}
+    images, alphas, of_batches = rasterization(**batched, **views, packed=False)
+    assert alphas.shape == (2, 2, HEIGHT, WIDTH, 1)
+    assert of_batches["dominant_counts"].shape == (2, 2, N)
+    assert torch.equal(images, torch.stack((alone, rasterization(**second, **two)[0])))
+
+
 def test_instruments_read_later_equal_instruments_asked_for() -> None:
     given = scene()
     _, _, meta = rasterization(**given, **cameras(2), dominance=True, counts=True)
@@ -214,6 +234,20 @@ def test_instruments_read_later_equal_instruments_asked_for() -> None:
     torch.testing.assert_close(meta["dominant_weights"], other["dominant_weights"], rtol=1e-12, atol=1e-14)
     pixels = meta["dominant_counts"].sum(1) + (meta["dominant_ids"] < 0).sum((1, 2))
     assert pixels.tolist() == [WIDTH * HEIGHT] * 2
+
+
+def test_two_runs_and_a_second_backward_pass_give_the_same_bits() -> None:
+    def gradients(backwards: int = 1) -> list[Tensor]:
+        leaves = {name: value.requires_grad_() for name, value in scene(3).items()}
+        loss = rasterization(**leaves, **cameras())[0].square().sum()
+        for _ in range(backwards):
+            found = torch.autograd.grad(loss, list(leaves.values()), retain_graph=True)
+        return list(found)
+
+    once = gradients()
+    assert all(g.abs().sum() > 0.0 for g in once)
+    for again in (gradients(), gradients(2)):
+        assert all(torch.equal(a, b) for a, b in zip(once, again, strict=True))
 
 
 def test_buffers_are_reused_and_can_be_freed() -> None:

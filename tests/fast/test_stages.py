@@ -27,6 +27,7 @@ from pop_ref import losses as oracle_losses
 from pop_ref import ssim as oracle_ssim
 from pop_ref.constants import INRIA, PAPER, SPEEDY_SPLAT, Profile
 from pop_ref.magnitudes import d_ssim_magnitudes, pixelwise_magnitudes
+from pop_ref.tight_tiles import tight_tile_lists as oracle_lists
 from tests.fast.test_compiled import HEIGHT, WIDTH, assert_alike
 from tests.fast.test_compiled import splats as draw
 
@@ -331,6 +332,17 @@ def arguments(tile_size: int):
     radii = torch.randint(0, 24, (300, 2), generator=generator, dtype=torch.int32)
     depths = 1.0 + torch.rand(300, generator=generator, dtype=torch.float64)
     return drawn.means2d, drawn.conics, drawn.opacities, radii, depths, WIDTH, HEIGHT, tile_size
+
+
+@pytest.mark.parametrize("tile_size", [4, 16])
+@pytest.mark.parametrize("profile", PROFILES, ids=lambda profile: profile.name)
+def test_tight_lists_are_the_oracles(profile: Profile, tile_size: int) -> None:
+    given = arguments(tile_size)
+    arrays = [t.numpy() for t in given[:5]]
+    arrays[3] = arrays[3].astype("int64")
+    expected = oracle_lists(*arrays, *given[5:], profile)
+    assert sum(map(len, expected)) > 400
+    assert by_tile(tight_tile_lists(*given, profile)) == expected
 
 
 @pytest.mark.parametrize("profile", PROFILES, ids=lambda profile: profile.name)

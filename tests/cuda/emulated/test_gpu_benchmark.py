@@ -14,6 +14,7 @@ import torch
 
 import pop_fast.api.rasterize
 from pop_fast.cli import main
+from pop_fast.stages.splatting import ProjectionSettings, covariances, project
 from tests.app.captures import HEIGHT, WIDTH, colmap_capture
 from tests.cuda.emulated.rehearse import stand_in_card
 
@@ -221,3 +222,53 @@ def test_counters_that_are_absent_are_told(bench, monkeypatch, tmp_path, capsys)
     monkeypatch.setattr(sys, "argv", ["gpu_counters", str(tmp_path / "counters.json")])
     assert gpu_counters.main() == 2
     assert "ncu was not found" in capsys.readouterr().err
+
+
+# The benchmark's first case has the loads that times were predicted for, counted by the kernels themselves.
+
+# what the predictions in benchmarks/NOTES.md are for, of the whole image, and of each of its pixels
+VISIBLE, INSTANCES, EVALUATED, CONTRIBUTING, TRIED = 160_000, 2_000_000, 120.0, 35.0, 4_360_000
+BY = 6
+
+
+def _tried(case, device):
+    """Count the tiles that are tried for a case, from its projection alone."""
+    from gpu_scenes import activated_scene
+    from gpu_visits import count_tried
+
+    scene = activated_scene(case, device)
+    view = ProjectionSettings(scene["Ks"][0], case.width, case.height)
+    covars = covariances(scene["quats"], scene["scales"])
+    splats = project(scene["means"], covars, scene["opacities"], scene["viewmats"][0], view)
+    return count_tried(splats.means2d, splats.radii, case.width, case.height)
+
+
+@pytest.mark.slow
+def test_the_predicted_case_is_what_was_predicted(gpu, monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    from gpu_kernels import POP, make_trainer, step_loads
+    from gpu_scenes import CASES, activated_scene
+
+    whole, case = CASES[0], CASES[0].smaller(BY)
+    assert (whole.n, whole.width * whole.height) == (270_000, pytest.approx(1.6e6, rel=0.01))
+    photograph = torch.zeros((case.height, case.width, 3), dtype=torch.uint8)
+    trainer = make_trainer(activated_scene(case, gpu), photograph, 2, replay=False, counts=True)
+    trainer.run(1, POP)
+    loads = step_loads(trainer)
+    assert loads.visible * BY**2 == pytest.approx(VISIBLE, rel=0.05)
+    # a small image cuts long splats off at its border: of the whole image the lists are a tenth longer
+    assert loads.instances * BY**2 == pytest.approx(0.9 * INSTANCES, rel=0.1)
+    assert loads.evaluated / loads.pixels == pytest.approx(EVALUATED, rel=0.1)
+    assert loads.contributing / loads.pixels == pytest.approx(CONTRIBUTING, rel=0.1)
+    # what the predictions take of the entries that are walked
+    entries = loads.evaluated / 128
+    assert loads.visits / entries == pytest.approx(0.774, rel=0.05)
+    assert loads.eights / entries == pytest.approx(0.104, rel=0.05)
+    assert loads.batches / entries == pytest.approx(0.0354, rel=0.05)
+    # rectangles are longer than what they enclose, so that a small image cuts off more of them: of the whole one
+    assert _tried(whole, gpu) == pytest.approx(TRIED, rel=0.05)
+    # lists are as unequal as those of captures
+    ((size, told),) = trainer.render_stats().items()
+    assert size == (case.width, case.height)
+    walked = told["n_traversed"].float()
+    assert float(walked.quantile(0.99)) > 1.5 * float(walked.mean())
