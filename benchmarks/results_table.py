@@ -23,6 +23,7 @@ _CAME = {"ended": "ended", "told": "reported", "continued": "continued"}
 _KINDS = ("read", "refused", "told", "escaped", "crashed", "hung")
 NOTES = Path(__file__).resolve().parent / "NOTES.md"
 NOT_YET = "Not measured yet: run `python benchmarks/run.py`."
+FEWEST_CORES = 16
 BOUNDS = {"operations": "o", "bytes": "b"}
 ENGINES = {"fast": "`fast`", "compiled": "`compiled`, autograd", "native": "`compiled`, native"}
 
@@ -165,6 +166,22 @@ def counts(timed: Mapping[str, Any]) -> str:
     return markdown(["", *map(title, cases)], rows)
 
 
+def cores(timed: Mapping[str, Any]) -> str:
+    """Make the table of simulated steps on machines of more cores."""
+    rows = []
+    for case in timed["cores"]:
+        one = sum(case["machines"]["1"].values())
+        for threads, shares in case["machines"].items():
+            # on fewer cores the step was measured
+            if int(threads) < FEWEST_CORES:
+                continue
+            ms = sum(shares.values())
+            name = f"{case['width']}x{case['height']}, {case['num_gaussians']:,} Gaussians"
+            rows.append([name, threads, f"{ms:.2f}", f"{one / ms:.1f}", *(f"{part:.2f}" for part in shares.values())])
+    head = ["case", "cores", "ms", "times one core", *timed["cores"][0]["machines"]["1"]]
+    return markdown(head, rows)
+
+
 def _shares(did: Mapping[str, int]) -> str:
     return ", ".join(f"{16 * did[name] / did['pairs']:.0%}" for name in ("marked", "reached"))
 
@@ -211,6 +228,7 @@ TABLES: dict[str, tuple[str, Callable[[Mapping[str, Any]], str]]] = {
     "native step": ("steps", native),
     "where a step goes": ("steps", parts),
     "what a step has to do": ("steps", counts),
+    "cores": ("cores", cores),
     "busy machine": ("busy", busy),
     "first step": ("first-step", startup),
     "memory": ("memory", memory),

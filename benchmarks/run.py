@@ -24,7 +24,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from cases import RASTER_CASES, STEP_CASES, capture_of
-from parts import LARGEST, bytes_per_s, floors, vector_ops_per_s
+from parts import LARGEST, bytes_per_s, floors, simulate, vector_ops_per_s
 from processes import measure, time_beside, time_startup
 from record import commit, machine, read_json, write_json
 from steps import (
@@ -92,6 +92,8 @@ PARTS: dict[str, Callable[[argparse.Namespace], Any]] = {
     # renders, and the blend alone
     "raster": lambda given: [time_raster(case, given.repeats) for case in RASTER_CASES],
     "steps": steps,
+    # steps on machines of more cores, simulated
+    "cores": lambda given: [simulate(case) for case in STEP_CASES if case.name in given.cases],
     "memory": memory,
     # `pop` from its command on
     "first-step": lambda given: time_startup(given.capture, given.factor),

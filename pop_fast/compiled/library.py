@@ -161,13 +161,14 @@ class Library:
 
 @dataclass(frozen=True)
 class StepperFunctions:
-    """The functions of a stepper: make one for so many threads, let go, take steps, its bytes, its counts."""
+    """The functions of a stepper: make one for so many threads, let go, take steps, its bytes, its counts, a trace."""
 
     open: Callable[[int], int | None]
     close: Callable[[int], None]
     steps: Callable[..., int]
     bytes: Callable[[int], int]
     counts: Callable[..., None]
+    trace: Callable[[int, int | None, int], int]
 
 
 def stepper_functions(given_bytes: int) -> StepperFunctions:
@@ -188,6 +189,7 @@ def stepper_functions(given_bytes: int) -> StepperFunctions:
         "steps": ((POINTER, POINTER, WHOLE, POINTER), WHOLE),
         "bytes": ((POINTER,), WHOLE),
         "counts": ((POINTER, POINTER), None),
+        "trace": ((POINTER, POINTER, WHOLE), WHOLE),
     }
     found: dict[str, Any] = {name: getattr(loaded, f"pop_stepper_{name}") for name in signatures}
     for name, signature in signatures.items():

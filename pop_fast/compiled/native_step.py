@@ -255,6 +255,23 @@ class NativeTrainer:
         self._functions.counts(self._stepper, found)
         return dict(zip(COUNTS, found, strict=True))
 
+    def traced(self, until: int, phase: Phase) -> Tensor:
+        """Take steps as `run` does, all parts of their works by this thread alone, and return what each took.
+
+        The parts are cut as they are for all threads, so that one machine tells what a larger one has to share out.
+
+        Returns:
+            In order: 0 and the seconds that one thread has for itself before a work, or 1 and those of a part of it.
+            The first 2**20 of them. [n, 2] float64
+        """
+        pairs = torch.zeros((1 << 20, 2), dtype=torch.float64)
+        self._functions.trace(self._stepper, pairs.data_ptr(), len(pairs))
+        try:
+            self.run(until, phase)
+        finally:
+            n = self._functions.trace(self._stepper, None, 0)
+        return pairs[:n].clone()
+
     def run(self, until: int, phase: Phase) -> None:
         """Take steps until the counter stands at `until`, all of one phase, or until a stop was requested.
 

@@ -213,6 +213,15 @@ int64_t pop_stepper_steps(void *stepper, const pop::StepGiven *first, int64_t n,
 
 int64_t pop_stepper_bytes(const void *stepper) { return static_cast<const pop::Stepper *>(stepper)->bytes(); }
 
+// Take the next steps by the caller's thread alone and keep what each part took, in so many pairs; null: no longer. How
+// many pairs there were is returned.
+int64_t pop_stepper_trace(void *stepper, double *pairs, int64_t most) {
+  pop::Trace &trace = static_cast<pop::Stepper *>(stepper)->trace();
+  const int64_t n = trace.n;
+  trace = {pairs, most, 0};
+  return n;
+}
+
 // what `native_step.py` compares
 int64_t pop_step_given_bytes() { return int64_t(sizeof(pop::StepGiven)); }
 }

@@ -157,6 +157,7 @@ public:
   bool next(Work &work) override;
   bool abandoned() const override;
   int64_t bytes() const;
+  Trace &trace() { return pool.trace; }
   // of the last step; none where it was not taken to its end
   StepCounts counted() const;
 

@@ -88,6 +88,13 @@ public:
   virtual bool abandoned() const { return false; }
 };
 
+// Where a caller keeps what the parts of a plan's works took, in pairs: 0 and the seconds between two works, which one
+// thread has for itself, or 1 and the seconds of a part.
+struct Trace {
+  double *pairs = nullptr;
+  int64_t most = 0, n = 0;  // pairs that have room, pairs that there are
+};
+
 class Pool {
 public:
   explicit Pool(int64_t threads) {
@@ -112,6 +119,7 @@ public:
 
   // Do all works of a plan; what is thrown by one ends the call once no thread works on it.
   void run(Plan &given) {
+    if (trace.pairs) return run_alone(given);
     plan = &given;
     failed = ended = false;
     begin_next();
@@ -122,6 +130,9 @@ public:
     if (failed) throw std::bad_alloc();
   }
 
+  // While it has a place, the caller's thread does all parts, cut as they are for all threads.
+  Trace trace;
+
 private:
   std::vector<std::thread> others;
   std::mutex mutex;
@@ -131,6 +142,27 @@ private:
   std::atomic<bool> failed{false}, ended{false}, closed{false};
   Plan *plan = nullptr;
   Work work;
+
+  void run_alone(Plan &given) {
+    using Clock = std::chrono::steady_clock;
+    const auto note = [&](double kind, Clock::time_point since) {
+      if (trace.n == trace.most) return;
+      trace.pairs[2 * trace.n] = kind;
+      trace.pairs[2 * trace.n++ + 1] = std::chrono::duration<double>(Clock::now() - since).count();
+    };
+    for (;;) {
+      Work alone;
+      auto since = Clock::now();
+      const bool more = given.next(alone);
+      note(0.0, since);
+      if (!more) return;
+      for (int64_t k = 0; k < alone.parts(); k++) {
+        since = Clock::now();
+        alone.do_part(0, k);
+        note(1.0, since);
+      }
+    }
+  }
 
   // By one thread at a time: whoever ended the last part, or the caller at the start.
   void begin_next() {

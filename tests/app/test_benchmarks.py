@@ -24,6 +24,7 @@ from benchmarks import conditions, estimates, sizes
 from benchmarks.few_photographs import left_of, table_of
 from benchmarks.record import read_json, write_json
 from paper_repro.results import read_all
+from pop_fast import compiled
 from pop_fast.io.heartbeat import duration
 from pop_fast.train import TrainConfig, automatic
 from pop_fast.train.automatic import Choice
@@ -67,6 +68,7 @@ def results() -> dict[str, Any]:
     busy = {"name": "64x32-100", "processes": 8, "threads": 2, "cores": 2, "fair_factor": 5.0}
     commands = {"pop --help": {"wall_s": 0.2, "cpu_s": 0.1}}
     first_step = {"capture": "fox", "factor": 4, "wall_s": 1.75, "step_s": 0.02}
+    even = {"1": {"even share": 12.0, "handing over": 0.0}, "16": {"even share": 0.75, "handing over": 0.25}}
     return {
         "steps": {
             "peak": {"threads": 2, "vector_ops_per_s": 16e9, "bytes_per_s": 40e9},
@@ -74,6 +76,7 @@ def results() -> dict[str, Any]:
         },
         "busy": [{**busy, "engines": {"compiled": beside, "native": beside}}],
         "first-step": {"repeats": 5, "commands": commands, "first_step": first_step},
+        "cores": [{"name": "64x32-100", "num_gaussians": 100, "width": 64, "height": 32, "machines": even}],
         "memory": [
             {"what": "render", "by": "fast", **memory},
             {"what": "step", "by": "native", "working_gib": 0.25, **memory},
@@ -119,6 +122,7 @@ def test_every_table_says_what_was_measured_and_what_was_not(script: Any) -> Non
         "| update | 1.50 (0.50b, 3.0) | 1.50 (0.50b, 3.0) |",
         "| all | 10.50 (3.50, 3.0) | 10.50 (3.50, 3.0) |",
         "| of these in strips that are blended, that change | 50%, 25% | 50%, 25% |",
+        "| 64x32, 100 Gaussians | 16 | 1.00 | 12.0 | 0.75 | 0.25 |",
         "| 64x32-100 | `compiled`, native | 10.0 ms | 60.0 ms | 1.20 |",
         "| `pop train fox --factor 4 --preset quick`, to its first step | 1.75 |  |",
         "| two training steps, 64x32, 100 Gaussians | `compiled`, native | 0.50 GiB | 0.75 GiB | 0.25 GiB |",
@@ -158,6 +162,51 @@ def test_floors_follow_the_counts_and_the_machine(script: Any, monkeypatch: pyte
     too_little = r"project took 1.50 ms, and operations alone need .*: peak.cpp measures too little"
     with pytest.raises(SystemExit, match=too_little):
         parts.floors(row)
+
+
+def test_steps_on_more_cores_are_simulated_from_what_their_parts_take(script: Any) -> None:
+    cores = script("parts")
+    timed = [cores.Timed(0.001, [0.004, 0.004, 0.004, 0.012])]
+    assert cores.last_one_done(timed[0].parts, 1) == pytest.approx(0.024)
+    # by two threads: 4 + 4 ms and 4 ms, and the second one takes the last part too
+    assert cores.last_one_done(timed[0].parts, 2) == pytest.approx(0.016)
+    assert cores.last_one_done(timed[0].parts, 9) == pytest.approx(0.012)
+    step = [timed[0]] * len(cores.PART_OF)
+    moved = dict.fromkeys(PARTS, 0.0)
+    found = cores.simulated(step, 2, moved, None)
+    assert sum(found.values()) == pytest.approx(1e3 * (13 * (0.001 + 0.016) + 13 * cores.HANDOVER))
+    assert found["uneven parts"] == pytest.approx(1e3 * 13 * (0.016 - 0.012))
+    # 1 GB in a second is more than the 32 ms of both works of the update
+    slow = cores.simulated(step, 2, {**moved, "update": 1e9}, 1e9)
+    assert slow["memory"] == pytest.approx(1e3 * (1.0 - 0.032))
+    assert cores.simulated(step, 1, moved, None)["handing over"] == 0.0
+
+
+@pytest.mark.skipif(bool(compiled.why_not()), reason=compiled.why_not() or "")
+def test_a_traced_step_is_the_step_and_its_parts_are_those_that_are_booked(script: Any, tmp_path: Path) -> None:
+    cores, cases = script("parts"), script("cases")
+    tiny = cases.Case("64x32-300", 300, 64, 32)
+    runs = [script("steps").run_of_case(tiny, str(tmp_path / name), "native") for name in ("run", "traced")]
+    for training in runs:
+        training.take_steps(1)
+    trainers = [training.stepper.fused for training in runs]
+    phase = cores.phase_at(runs[0].config, runs[0].strategy, 1)
+    trainers[0].run(4, phase)
+    before = trainers[1].seconds
+    steps = list(cores.steps_of(trainers[1].traced(4, phase).tolist()))
+    assert len(steps) == 3
+    for name, tensor in trainers[0].params.items():
+        assert torch.equal(trainers[1].params[name], tensor), name
+    for part in PARTS:
+        of_part = [
+            sum(work.parts) for step in steps for name, work in zip(cores.PART_OF, step, strict=True) if name == part
+        ]
+        booked = trainers[1].seconds[part] - before[part]
+        # what is booked has the time between two works too
+        assert 0.0 < sum(of_part) <= booked, part
+    assert len(list(cores.steps_of(trainers[1].traced(5, phase).tolist()))) == 1
+    # and no longer
+    assert len(trainers[1].traced(5, phase)) == 0
 
 
 def test_the_peaks_of_this_machine_are_measured(script: Any, monkeypatch: pytest.MonkeyPatch) -> None:
