@@ -6,6 +6,7 @@ import ast
 import importlib
 import importlib.util
 import json
+import math
 import os
 import re
 import subprocess
@@ -84,8 +85,9 @@ def results() -> dict[str, Any]:
     }
 
 
-def test_notes_hold_the_tables_of_the_results(script: Any) -> None:
+def test_notes_hold_the_tables_of_the_results_and_the_curves_of_preset_quick(script: Any) -> None:
     assert script("results_table").main(["--check"]) == 0, "run 'python benchmarks/results_table.py --write'"
+    assert script("quick_curve").main(["--json", str(BENCHMARKS / "results" / "quick.json"), "--check"]) == 0
 
 
 def test_the_notes_and_the_page_of_speed_tell_in_words_what_their_tables_hold() -> None:
@@ -343,6 +345,43 @@ def test_what_a_function_imports_when_it_is_called_is_its_own_checkouts(ab_bench
     finally:
         ab_benchmark._forget()
         sys.modules.update(loaded)
+
+
+# Preset quick against the longer schedule: curves of held-out PSNR over seconds.
+
+
+def test_a_curve_is_read_between_its_points_and_nowhere_else(script: Any) -> None:
+    quick = script("quick_curve")
+    points = [{"seconds": 10.0, "psnr": 20.0}, {"seconds": 20.0, "psnr": 30.0}, {"seconds": 30.0, "psnr": 29.0}]
+    assert quick.psnr_at(points, 15.0) == 25.0
+    assert math.isnan(quick.psnr_at(points, 5.0))
+    assert math.isnan(quick.psnr_at(points, 31.0))
+    assert [quick.seconds_until(points, psnr) for psnr in (19.0, 24.0, 30.0)] == [10.0, 14.0, 20.0]
+    assert math.isnan(quick.seconds_until(points, 30.1))
+
+
+def test_the_tables_of_quick_are_means_of_the_seeds_that_have_both(script: Any, tmp_path: Path) -> None:
+    quick = script("quick_curve")
+    # runs that are not there do not empty the tables
+    with pytest.raises(SystemExit):
+        quick.main(["--json", str(tmp_path / "quikc.json"), "--write"])
+
+    def run(seconds: float, psnr: float) -> list[dict[str, float]]:
+        rest = {"ssim": 0.5, "gaussians": 1_000}
+        return [{"seconds": s * seconds, "psnr": psnr - 4.0 + 4.0 * s, **rest} for s in (0.5, 1.0)]
+
+    seeds = {"1": {"before": run(100.0, 30.0), "now": run(40.0, 31.0)}, "2": {"before": run(100.0, 28.0)}}
+    seeds["3"] = {"before": run(100.0, 32.0), "now": run(60.0, 31.0)}
+    (*_, row) = quick.ends_table({"toy": seeds})
+    assert row.startswith(
+        "| toy, 2 | 31.00 dB, 0.500, 1,000, 100 s | 31.00 dB, 0.500, 1,000, 50 s | +0.00 dB (-1.00 to +1.00)"
+    )
+    # 29.9 dB of the first seed are there after 29 s; the third never comes within 0.1 dB
+    assert row.endswith("| 0.50 | 0.29 (1 of 2 seeds) |")
+    (*_, row) = quick.curve_table({"toy": seeds})
+    assert row.startswith("| toy |  /  |")
+    # after half of the time one seed of quick has ended: there is no mean
+    assert "| 29.00 /  |" in row
 
 
 # Settings for few photographs, and what was foretold of runs that choose for themselves.
