@@ -21,11 +21,17 @@ from torch import Tensor
 from pop_fast.api.rasterize import rasterization
 from pop_fast.density import DensityControl, GsplatStrategy, POPStrategy, Strategy
 from pop_fast.density.control import SHORTEST_REFINE_EVERY
+from pop_fast.density.passes import Passes
+from pop_fast.density.protocol import Draws
 from pop_fast.errors import PopError
 from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.model import KEYS
 from pop_fast.train.presets import METHODS
-from pop_ref import taming
+from pop_ref import mini_splatting, selection, taming
+from pop_ref.contributions import contributions
+from pop_ref.records import Camera
+from pop_ref.render import render
+from pop_ref.training import gaussians_from_params
 from tests.app.tiny import skip_without, tiny_capture, tiny_config
 
 
@@ -361,10 +367,58 @@ def test_a_run_that_is_stopped_anywhere_goes_on_to_the_same_bits(method: str, ba
         assert all(torch.equal(again.params[key], whole.params[key]) for key in KEYS), f"after step {step}"
 
 
-def test_a_method_that_looks_at_the_views_says_so_where_nobody_shows_them(tmp_path: Any) -> None:
-    run = TrainingRun(tiny_method(tmp_path, "mini-splatting"), tiny_capture())
-    with pytest.raises(ValueError, match="this strategy looks at the training views"):
-        run.strategy.change(run.params, run.optimizers, run.state, 18)
+def test_a_method_that_looks_at_the_views_sees_those_of_the_run_as_they_are_drawn(tmp_path, monkeypatch):
+    # what each method makes of what it sees the laws of training say, and what a pass sees `tests/fast/test_passes.py`
+    config = tiny_method(tmp_path, "mini-splatting")
+    start = TrainingRun(config, tiny_capture())
+    assert start.state["first_count"] == len(start.params["means"])
+    initial = {key: value.detach().double() for key, value in start.params.items()}
+    run, drawn, generator = TrainingRun(config, tiny_capture(), initial=initial), [], np.random.default_rng(5)
+    profile, degrees, passed = METHODS["mini-splatting"].recipe.profile, [], Passes.contributions
+
+    def noted(passes: Passes, params: Any, index: int, sh_degree: int) -> Any:
+        degrees.append(sh_degree)
+        return passed(passes, params, index, sh_degree)
+
+    def uniforms(n: int) -> Tensor:
+        drawn.append(generator.random(n))
+        return torch.tensor(drawn[-1])
+
+    def importance(means: dict[str, np.ndarray], degree: int) -> np.ndarray:
+        seen = []
+        for view in run._train:
+            camera = Camera(view.viewmat[0].numpy(), view.K[0].numpy(), view.width, view.height)
+            found = render(gaussians_from_params(means), camera, sh_degree=degree, profile=profile)
+            size = (camera.width, camera.height, profile.tile_size)
+            weights = contributions(found.splats, found.tile_lists, *size, None, profile)
+            seen.append((weights, found.dominant_counts))
+        return mini_splatting.scene_importance(seen, False)
+
+    def changed(step: int) -> tuple[dict[str, np.ndarray], Any]:
+        """Hold density control after a step by itself; return the parameters before it."""
+        while run.step < step:
+            run.take_steps(run.step + 1)
+        before = {key: value.detach().numpy().copy() for key, value in run.params.items()}
+        if step == 18:
+            with pytest.raises(ValueError, match="this strategy looks at the training views"):
+                run.strategy.change(run.params, run.optimizers, run.state, step)
+        return before, run._change(step)
+
+    monkeypatch.setattr(Passes, "contributions", noted)
+    run.draws = Draws(lambda n: torch.tensor(generator.standard_normal((2, n, 3))), uniforms)
+    before, change = changed(18)
+    weights = importance(before, 1)
+    wanted = int(0.5 * np.sum(weights > 0))
+    chosen = selection.sample_without_replacement(weights, wanted, drawn[-1])
+    assert change.replaced == wanted > 20
+    for key in ("means", "sh0"):
+        np.testing.assert_array_equal(run.params[key].detach().numpy(), before[key][chosen])
+    run.step = 19
+    before, change = changed(24)
+    gone = selection.least_mass(importance(before, 2), 0.05)
+    assert 0 < change.pruned == gone.sum() < len(gone)
+    np.testing.assert_array_equal(run.params["means"].detach().numpy(), before["means"][~gone])
+    assert degrees == [1] * len(run._train) + [2] * len(run._train)
 
 
 def test_what_scores_cannot_be_taken_of_is_refused_before_the_first_step(tmp_path: Any) -> None:

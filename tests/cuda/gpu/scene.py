@@ -103,6 +103,10 @@ def skip_what_is_refused(config: Any) -> None:
         pytest.skip(f"the fused step has no {setting}; `pop train` refuses it")
 
 
+# share of the image that a blurred Gaussian dominates
+THETA = 0.02
+
+
 def fused_trainer(scene: TrainingScene, device, masks=None, steps: int = STEPS, placed=torch.clone, **options):
     """Return rows (parameters and moments), each put in its place by `placed`, and the trainer of them."""
     params = {name: placed(value.to(device)) for name, value in scene.params.items()}
@@ -112,22 +116,26 @@ def fused_trainer(scene: TrainingScene, device, masks=None, steps: int = STEPS, 
     return (params, m, v), FusedTrainer(params, m, v, views, scene.order[:steps], settings)
 
 
-def fused(scene: TrainingScene, device, **options):
+def fused(scene: TrainingScene, device, window: bool = False, **options):
     """Take the steps of one phase; return objectives, parameters and the trainer."""
     (params, _, _), trainer = fused_trainer(scene, device, **options)
     losses = []
     for step in range(STEPS):
-        trainer.run(step + 1, Phase(3, True, True, True))
+        trainer.run(step + 1, Phase(3, True, True, True, window=window))
         losses.append(float(trainer.values[2]))
     return losses, params, trainer
 
 
-def on_the_cpu(scene: TrainingScene) -> tuple[list[float], dict[str, Tensor]]:
-    """Take the steps with the strategy that `pop train` takes, and nothing grown; return losses and parameters."""
-    strategy = POPStrategy(refine_start_iter=STEPS, blur_start_iter=0)
+def on_the_cpu(scene: TrainingScene, **readings):
+    """Take the steps with the strategy that `pop train` takes, its statistics collected and nothing grown.
+
+    Returns:
+        Losses, POP terms, parameters and the strategy's state.
+    """
+    strategy = POPStrategy(refine_start_iter=STEPS, blur_start_iter=0, theta_blur=THETA, **readings)
     params = leaves_of(scene.params, "cpu")
     optimizer = torch.optim.Adam([{"params": [params[name]], "lr": LR[name]} for name in params], eps=1e-15)
-    state, losses = strategy.initialize_state(), []
+    state, losses, terms = strategy.initialize_state(), [], []
     for step in range(STEPS):
         view = scene.order[step]
         image, _, meta = drawn(rasterization, params, scene, views=[view], packed=False, dominance=True)
@@ -135,10 +143,13 @@ def on_the_cpu(scene: TrainingScene) -> tuple[list[float], dict[str, Tensor]]:
         term = strategy.regularizer(torch.sigmoid(params["opacities"]), state, step, meta)
         assert term is not None
         losses.append(loss.item())
+        terms.append(term.item())
+        strategy.step_pre_backward(params, {}, state, step, meta)
         (loss + term).backward()
         optimizer.step()
         optimizer.zero_grad()
-    return losses, {name: value.detach() for name, value in params.items()}
+        strategy.step_post_backward(params, {}, state, step, meta)
+    return losses, terms, {name: value.detach() for name, value in params.items()}, state
 
 
 def apart(found, wanted, name) -> float:

@@ -33,15 +33,26 @@ def mixed_sizes(capture):
     return replace(capture, views=(*capture.views[:2], small, *capture.views[3:]))
 
 
+WINDOW = {"pop_views": "window", "refine_start_iter": 8, "refine_stop_iter": 7}
+ENTROPY = {"lambda_pop": 0.0, "lambda_entropy": 0.05}
 REGULARIZERS = {"opacity_reg": 0.1, "scale_reg": 0.05}
-# what the laws of whole steps do not train: settings, of the strategy too, and what becomes of the capture
+# settings, of the strategy too, and what becomes of the capture
 CASES = {
-    "masks, sizes": {"edit": lambda capture: masked(mixed_sizes(capture))},
+    "plain": {},
+    "masks": {"edit": masked},
+    "sizes": {"edit": mixed_sizes},
     "background": {"background": (0.25, 0.5, 1.0), "antialiased": True},
+    "losses": {"l2_stop_iter": 4, "d_ssim_halved": True, "ssim_padding": "same"},
+    "inria": {"profile": "inria", "photometric_divisor": 2.0},
     "gsplat": {"profile": "gsplat_1_6", "sh_interval": 2},
+    "visible": {"strategy": {"pop_over": "visible"}},
+    "window": {"strategy": WINDOW},
+    "entropy": {"strategy": ENTROPY},
     "regularizers": {**REGULARIZERS, "strategy": {"lambda_entropy": 0.05}},
-    "batch, regularizers": {"batch_size": 2, **REGULARIZERS, "strategy": {"lambda_pop": 0.0, "lambda_entropy": 0.05}},
-    "batch, masks, sizes": {"batch_size": 3, "edit": lambda capture: masked(mixed_sizes(capture))},
+    "batch, regularizers": {"batch_size": 2, **REGULARIZERS, "strategy": ENTROPY},
+    "any view": {"strategy": {"blur_window": "any_view"}, "edit": masked},
+    "batch": {"batch_size": 3, "edit": lambda capture: masked(mixed_sizes(capture))},
+    "batch, window": {"batch_size": 2, "strategy": WINDOW},
     "batch, visible": {"batch_size": 2, "sh_interval": 2, "strategy": {"pop_over": "visible"}, "edit": masked},
 }
 
