@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from pop_ref.conformance.assertions import assert_close, assert_same_bits
+from pop_ref.conformance.assertions import assert_close, assert_close_along_rigid_motions, assert_same_bits
 from pop_ref.conformance.calls import (
     Call,
     Called,
@@ -226,7 +226,12 @@ def assert_gradients(backend: Any, of: Made) -> None:
                 rows = None if name in OF_CAMERA else ~kinked
                 for c, (expected, bounds) in enumerate(pulled):
                     bound = bounds["means2d" if name.startswith("means2d") else name]
-                    _assert_gradient(backend, of, name, value[b, c], expected[name], bound, rows, in_frame(of, b, c))
+                    given = (value[b, c], expected[name], bound)
+                    if name == "viewmats":
+                        viewmat, where = of.call.frames[b][c].scene.camera.viewmat, in_frame(of, b, c)
+                        assert_close_along_rigid_motions("agreement.v_viewmat", viewmat, *given, backend.dtype, where)
+                    else:
+                        _assert_gradient(backend, of, name, *given, rows, in_frame(of, b, c))
             else:
                 entry = f"batch entry {b}, " * bool(of.call.batch)
                 _assert_gradient(backend, of, name, value[b], *_summed(pulled, name), ~kinked, entry)
