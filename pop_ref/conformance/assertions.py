@@ -16,6 +16,8 @@ from pop_ref.margins import margins
 # beyond this many units a conic has no digits left to compare: the scene is set aside by a computed number
 WORST_CONDITION = 1.0 / 64.0
 
+MOTIONS = tuple(f"{kind} the camera's {axis}" for kind in ("shift along", "turn about") for axis in "xyz")
+
 
 def assert_close(
     key: str,
@@ -63,6 +65,40 @@ def assert_close(
             f" allowed {limit / eps:.3g} units of {eps * scale[where]:.3e};"
             f" {int(np.sum(wrong))} of {int(np.sum(compared))} differ"
         )
+
+
+def along_rigid_motions(viewmat: Any, v_viewmat: Any, sign: float = -1.0) -> np.ndarray:
+    """Return what a gradient by a view matrix says of shifts along the camera's axes and of turns about them. [6]
+
+    Only rigid matrices are view matrices, so these six numbers are all that there is to know. The twelve entries that a
+    program gives depend on how it finds the camera's centre: as `-R^T t`, or by inverting the matrix, as gsplat does.
+
+    Args:
+        viewmat, v_viewmat: the matrix and its gradient. [4, 4]
+        sign: of the second term of a turn; 1 adds bounds up.
+    """
+    M = v_viewmat[:3] @ viewmat[:3].T
+    turns = [M[2, 1] + sign * M[1, 2], M[0, 2] + sign * M[2, 0], M[1, 0] + sign * M[0, 1]]
+    return np.concatenate([v_viewmat[:3, 3], turns])
+
+
+def assert_close_along_rigid_motions(
+    key: str, viewmat: Any, actual: Any, expected: Any, error_bound: Any, dtype: Any, where: str = ""
+) -> None:
+    """Assert that two gradients by a view matrix say the same of every motion of its camera, within error bounds.
+
+    A last row that is not the expected one must be a multiple of the camera's centre (c, 1), as of an inverted matrix.
+    """
+    slopes = (along_rigid_motions(viewmat, actual), along_rigid_motions(viewmat, expected))
+    # a matrix of float32 is rigid to eight digits; in float64 the rest is no motion, and weighs as much as it departs
+    departs = np.max(np.abs(viewmat[:3, :3] @ viewmat[:3, :3].T - np.eye(3)))
+    departs = departs / tolerances.agreement(key, dtype) if departs > 64.0 * np.finfo(dtype).eps else 0.0
+    size = (1.0 + departs) * along_rigid_motions(np.abs(viewmat), error_bound, 1.0)
+    assert_close(key, *slopes, size, dtype, True, place=lambda i: f"{where}{MOTIONS[i[0]]}")
+    center = np.append(-viewmat[:3, :3].T @ viewmat[:3, 3], 1.0)
+    row, reach = actual[3] - expected[3], (1.0 + np.max(np.abs(center))) ** 2
+    size = np.full(4, np.sum(error_bound[:3, 3]) * reach)
+    assert_close(key, row, row[3] * center, size, dtype, True, place=lambda i: f"{where}last row, entry {list(i)}")
 
 
 def assert_same_bits(

@@ -67,6 +67,8 @@ class Call:
         covars: whether covariances are given instead of quaternions and scales.
         overruled: with covariances, whether quaternions and scales of other Gaussians are given, too.
         expanded: whether an argument that is the same in all batch entries has memory for the first alone.
+        layout: how its tensors lie in memory, as `torch_autograd.Laid` has it; others have no memory to lie in.
+        frozen: names of arguments that require no gradient where others do.
         no_background: whether the argument is left out; scenes are then black behind.
         sparse_grad: as gsplat's.
         absgrad: likewise, where gradients are asked for.
@@ -83,6 +85,8 @@ class Call:
     covars: bool = False
     overruled: bool = False
     expanded: bool = False
+    layout: str = "dense"
+    frozen: tuple[str, ...] = ()
     no_background: bool = False
     sparse_grad: bool = False
     absgrad: bool = True
@@ -199,6 +203,8 @@ class Call:
             "covars": self.covars and not self.overruled,
             "covars, quats and scales": self.overruled,
             "entries without memory of their own": self.expanded,
+            f"tensors that lie {self.layout} in memory": self.layout != "dense",
+            f"no gradient of {', '.join(self.frozen)}": bool(self.frozen),
             f"radius_clip={self.radius_clip:g}": self.radius_clip > 0.0,
             **{f"{name}={value:g}": True for name, value in self.planes.items()},
             f"tile_size={self.tile_size}": self.tile_size != 16,
@@ -236,8 +242,8 @@ def simpler_calls(call: Call) -> Iterator[Call]:
         behind = np.zeros(3) if call.no_background else np.array([0.25, 0.5, 0.75])
         yield _each_frame(call, lambda f: Frame(f.scene.with_overrides(background=behind), None, f.blind))
     for name, default in (("packed", False), ("render_mode", "RGB"), ("overruled", False), ("covars", False),
-                          ("expanded", False), ("radius_clip", 0.0), ("sparse_grad", False), ("dominance", False),
-                          ("absgrad", False)):  # fmt: skip
+                          ("expanded", False), ("layout", "dense"), ("frozen", ()), ("radius_clip", 0.0),
+                          ("sparse_grad", False), ("dominance", False), ("absgrad", False)):  # fmt: skip
         if getattr(call, name) != default and not (
             (name == "packed" and call.sparse_grad) or (name == "covars" and call.overruled)
         ):
@@ -304,12 +310,16 @@ class Called:
         images, alphas: [B, C, H, W, X], [B, C, H, W]
         meta: by key; empty where the rasterizer tells nothing.
         gradients: by argument in its own shape, None where it got none; means2d and means2d_abs from meta.
+        changed: names of arguments that are not what they were before the call.
+        strange: what is not of the shape or type that gsplat documents, in words; shapes of images are not among it.
     """
 
     images: np.ndarray
     alphas: np.ndarray
     meta: dict[str, Any] = field(default_factory=dict)
     gradients: dict[str, np.ndarray] = field(default_factory=dict)
+    changed: tuple[str, ...] = ()
+    strange: tuple[str, ...] = ()
 
 
 def drawn_scene(call: Call, frame: Frame) -> Scene:

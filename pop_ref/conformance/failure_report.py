@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pop_ref.conformance.adapter import OracleAdapter, View, error_bounds_of
+from pop_ref.conformance.assertions import MOTIONS, along_rigid_motions
 from pop_ref.conformance.calls import Call, call_as_code
 from pop_ref.conformance.capabilities import GRADIENTS, RENDER
 from pop_ref.conformance.cases import sensitivity
@@ -152,6 +153,10 @@ def first_gradient(backend: Any, scene: Scene) -> Difference | None:
     expected, found = (side.gradients(scene, v_image, v_T_final) for side in (ORACLE, backend))
     bounds = gradient_error_bounds(scene, error_bounds, v_image, v_T_final)
     smooth = ~error_bounds.screen.kinked
+    if "viewmat" in found:
+        V = scene.camera.viewmat
+        for side, sign in ((found, -1.0), (expected, -1.0), (bounds, 1.0)):
+            side["viewmat"] = along_rigid_motions(V if side is not bounds else np.abs(V), side["viewmat"], sign)
     for name in ("background", "sh", "opacities", "means2d", "means2d_abs", "scales", "quats", "means", "viewmat"):
         if name not in found or (name == "viewmat" and not np.all(smooth)):
             continue
@@ -160,9 +165,10 @@ def first_gradient(backend: Any, scene: Scene) -> Difference | None:
             wrong[~smooth] = False
         if np.any(wrong):
             i = tuple(int(k) for k in np.argwhere(wrong)[0])
-            row = "entry" if name in ("background", "viewmat") else f"Gaussian {i[0]}, entry"
-            entry = i if name in ("background", "viewmat") else i[1:]
-            return Difference(f"v_{name}", f"{row} {list(entry)}", expected[name][i], found[name][i])
+            row = "entry" if name == "background" else f"Gaussian {i[0]}, entry"
+            entry = i if name == "background" else i[1:]
+            where = MOTIONS[i[0]] if name == "viewmat" else f"{row} {list(entry)}"
+            return Difference(f"v_{name}", where, expected[name][i], found[name][i])
     return None
 
 

@@ -13,7 +13,7 @@ import functools
 import itertools
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -21,10 +21,14 @@ import numpy as np
 from pop_ref.conformance.calls import Call, fewer_gaussians, simpler_calls, with_backgrounds
 from pop_ref.conformance.signature import (
     Made,
+    assert_arguments_unchanged,
     assert_dominance,
     assert_gradients,
+    assert_gradients_without_that_of_means,
     assert_images,
+    assert_images_without_gradients,
     assert_rows,
+    assert_shapes_and_types,
     assert_tiles_where_told,
     made,
 )
@@ -230,10 +234,13 @@ def call_of(backend: Any, row: Mapping[str, str], number: int) -> Call:
     key = (tuple(row.items()), number, np.dtype(backend.dtype).name, backend.profile, reader)
     side = getattr(backend, "own_tile_size", None) if not backend.takes("tile_size") else None
     if (*key, side) not in _calls:
-        _calls[*key, side] = clear_call(backend, first_seed=16 * number, **asks)
+        layout = _IN_MEMORY[number % len(_IN_MEMORY)]
+        _calls[*key, side] = replace(clear_call(backend, first_seed=16 * number, **asks), layout=layout)
     return _calls[*key, side]
 
 
+# how a row's tensors lie, in turn: every level is given otherwise than densely, too
+_IN_MEMORY: Final = ("transposed", "dense", "sliced", "dense", "transposed")
 # by row and reader: two mutants are asked the same
 _calls: dict[tuple[Any, ...], Call] = {}
 
@@ -245,6 +252,10 @@ CHECKS: Final[dict[str, Callable[[Any, Made], None]]] = {
     "rows": assert_rows,
     "dominance": assert_dominance,
     "tiles": assert_tiles_where_told,
+    "arguments": assert_arguments_unchanged,
+    "types": assert_shapes_and_types,
+    "no gradients": assert_images_without_gradients,
+    "frozen means": assert_gradients_without_that_of_means,
 }
 
 

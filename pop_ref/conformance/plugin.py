@@ -273,23 +273,33 @@ def _cause(text: str) -> str:
     return text.splitlines()[0].removeprefix("E").strip() if first is None else ": ".join(first)
 
 
+def _kind_of(cause: str) -> str:
+    """Return what causes of one kind share: the arguments that are needed and the gradient that differs, not where."""
+    asked, _, rest = cause.partition(": ") if cause.startswith("with ") else ("", "", cause)
+    gradient = re.search(r"\bv_\w+", rest)
+    if gradient is None:
+        return cause
+    return f"{'' if asked == 'with every argument at its default' else asked} {gradient[0]}"
+
+
 def _law_of(report: Any) -> str:
     return dict(report.user_properties)["law"][2].replace("_", " ")
 
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
-    """Say how many laws hold, and what breaks, each cause once with the laws that it breaks."""
+    """Say how many laws hold, and what breaks, each kind of cause once with the laws that it breaks."""
     if not _chosen(config):
         return
     of = {kind: [r for r in terminalreporter.stats.get(kind, ()) if "law" in dict(r.user_properties)]
           for kind in ("passed", "failed", "skipped")}  # fmt: skip
-    causes: dict[str, list[str]] = {}
+    causes: dict[str, tuple[str, list[str]]] = {}
     for report in of["failed"]:
-        causes.setdefault(_cause(report.longreprtext), []).append(_law_of(report))
+        cause = _cause(report.longreprtext)
+        causes.setdefault(_kind_of(cause), (cause, []))[1].append(_law_of(report))
     terminalreporter.section("conformance")
     counts = f"{len(of['passed'])} laws hold, broken {len(of['failed'])}, not judged {len(of['skipped'])}"
     terminalreporter.write_line(f"{_chosen(config)}: {counts}")
-    for cause, laws in sorted(causes.items(), key=lambda pair: -len(pair[1])):
+    for cause, laws in sorted(causes.values(), key=lambda pair: -len(pair[1])):
         terminalreporter.write_line(f"  {cause}")
         for name in laws:
             terminalreporter.write_line(f"      breaks: {name}")

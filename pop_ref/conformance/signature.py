@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from pop_ref.conformance.assertions import assert_close, assert_same_bits
+from pop_ref.conformance.assertions import assert_close, assert_close_along_rigid_motions, assert_same_bits
 from pop_ref.conformance.calls import (
     Call,
     Called,
@@ -171,11 +171,15 @@ class Made:
 def made(backend: Any, call: Call) -> Made:
     """Have a call drawn, and pulled back where the rasterizer has gradients."""
     wanted = expectations(backend, call)
+    return Made(call, _called(backend, call, wanted), wanted)
+
+
+def _called(backend: Any, call: Call, wanted: list[list[Expected]]) -> Called:
     cotangents: tuple[Any, ...] = ()
     if backend.has(GRADIENTS):
         v_images = np.array([[e.v_image for e in row] for row in wanted])
         cotangents = (v_images, np.array([[-e.v_T_final for e in row] for row in wanted]))
-    return Made(call, backend.call(call, *cotangents), wanted)
+    return backend.call(call, *cotangents)
 
 
 def assert_call_is_the_oracles(backend: Any, call: Call) -> Made:
@@ -226,7 +230,12 @@ def assert_gradients(backend: Any, of: Made) -> None:
                 rows = None if name in OF_CAMERA else ~kinked
                 for c, (expected, bounds) in enumerate(pulled):
                     bound = bounds["means2d" if name.startswith("means2d") else name]
-                    _assert_gradient(backend, of, name, value[b, c], expected[name], bound, rows, in_frame(of, b, c))
+                    given = (value[b, c], expected[name], bound)
+                    if name == "viewmats":
+                        viewmat, where = of.call.frames[b][c].scene.camera.viewmat, in_frame(of, b, c)
+                        assert_close_along_rigid_motions("agreement.v_viewmat", viewmat, *given, backend.dtype, where)
+                    else:
+                        _assert_gradient(backend, of, name, *given, rows, in_frame(of, b, c))
             else:
                 entry = f"batch entry {b}, " * bool(of.call.batch)
                 _assert_gradient(backend, of, name, value[b], *_summed(pulled, name), ~kinked, entry)
@@ -261,6 +270,28 @@ def _assert_covariance_gradients(
     entry = f"batch entry {b}, " * bool(of.call.batch) + "through covars, "
     for name, value in zip(("quats", "scales"), v, strict=True):
         _assert_gradient(backend, of, name, value, *_summed(pulled, name), rows, entry)
+
+
+def assert_arguments_unchanged(backend: Any, of: Made) -> None:
+    """Assert that every argument is what it was before the call, as far as a program shows that."""
+    assert not of.called.changed, f"the call has changed its arguments {', '.join(of.called.changed)}"
+
+
+def assert_shapes_and_types(backend: Any, of: Made) -> None:
+    """Assert that what comes back has the shapes and types that gsplat documents."""
+    assert not of.called.strange, "; ".join(of.called.strange)
+
+
+def assert_images_without_gradients(backend: Any, of: Made) -> None:
+    """Assert that the images are the oracle's, too, where the call is made anew and nothing requires a gradient."""
+    if backend.has(GRADIENTS):
+        assert_images(backend, replace(of, called=backend.call(of.call)))
+
+
+def assert_gradients_without_that_of_means(backend: Any, of: Made) -> None:
+    """Assert that the gradients of the other arguments are the oracle's, too, where the means require none."""
+    if backend.has(GRADIENTS) and backend.has("differentiate"):
+        assert_gradients(backend, replace(of, called=_called(backend, replace(of.call, frozen=("means",)), of.wanted)))
 
 
 ROWS = ("means2d", "depths", "conics", "opacities")

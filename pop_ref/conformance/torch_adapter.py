@@ -6,10 +6,12 @@ torch is imported when an adapter is made, never when the kit is.
 from __future__ import annotations
 
 import functools
+import gc
 import importlib
 import inspect
 import itertools
 import sys
+import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from types import ModuleType, SimpleNamespace
@@ -31,7 +33,7 @@ from pop_ref.conformance.capabilities import (
 )
 from pop_ref.conformance.cases import BY_NAME, Case, with_own_lists
 from pop_ref.conformance.scenes import Scene, golden_scene, rounded_to
-from pop_ref.conformance.torch_autograd import Ask, Differentiated, differentiated
+from pop_ref.conformance.torch_autograd import Ask, Differentiated, Laid, differentiated
 from pop_ref.conformance.views import refuses_on_purpose
 from pop_ref.constants import PAPER, Profile
 
@@ -54,6 +56,14 @@ class _CountedWhenRead(View):
         if name in ("n_blended", "n_traversed"):
             return getattr(self._counted, name)
         return super().__getattribute__(name)
+
+
+def _laid(call: Call, value: Any, wanted: bool) -> Laid:
+    """Lay an argument of a call in memory as it asks; what has no memory of its own keeps that of the others."""
+    if not value.is_contiguous():
+        return Laid(value, "kept", wanted)
+    # torch takes no sparse gradient back through a view
+    return Laid(value, "dense" if call.sparse_grad else call.layout, wanted)
 
 
 class TorchAdapter(Adapter):
@@ -282,11 +292,29 @@ class TorchAdapter(Adapter):
         """Draw a scene and pull cotangents back in an order of passes, and of arguments in a layout, as it is asked."""
 
         def draw(of: Scene, arguments: dict[str, Any]) -> tuple[Any, Any]:
-            image, alphas, _ = self._call(of, arguments, dominance=False, counts=False)
+            image, alphas, _ = self._call(of, arguments, dominance=False, counts=False, packed=ask.packed)
             return image, alphas
 
+        def leaves(of: Scene, grad: bool) -> dict[str, Any]:
+            return self._leaves(of, grad) | {"K": self._tensor(of.camera.K[None])}
+
         arrays = (self._tensor(v_image), self._tensor(v_T_final))
-        return differentiated(scene, draw, self._leaves, arrays, ask, self._without)
+        return differentiated(scene, draw, leaves, arrays, ask, self._without)
+
+    def forgets(self, scene: Scene) -> tuple[str, ...]:
+        """Draw a scene, go back and let go of everything; draw another; return what is still there of the first."""
+
+        def drawn(of: Scene) -> dict[str, Any]:
+            leaves = self._leaves(of, grad=True)
+            image, alphas, _ = self._call(of, leaves, dominance=False, counts=False)
+            (image.sum() + alphas.sum()).backward()
+            found = leaves | {"image": image, "alphas": alphas}
+            return {name: weakref.ref(value) for name, value in found.items()}
+
+        first = drawn(scene)
+        drawn(scene.with_overrides(opacities=0.5 * scene.gaussians.opacities))
+        gc.collect()
+        return tuple(name for name, value in first.items() if value() is not None)
 
     def _drawn(self, scene: Scene, dominance: bool, counts: bool, grad: bool = False) -> View:
         leaves = self._leaves(scene, grad)
@@ -364,25 +392,34 @@ class TorchAdapter(Adapter):
         if self._rasterization is None:
             raise LookupError(f"{self.name} has no rasterization function")
         pulls, (B, C, _), camera = v_images is not None, call.shape, call.first.scene.camera
-        leaves = {name: self._entries(call, value).requires_grad_(pulls) for name, value in call.tensors().items()}
-        images, alphas, meta = self._rasterization(
-            **{name: self._tensor(value) for name, value in call.without_gradients().items()} | leaves,
-            Ks=self._tensor(call.intrinsics()),
-            width=(W := camera.width),
-            height=(H := camera.height),
-            sh_degree=call.sh_degree,
-            **self._taken(packed=call.packed, tile_size=call.tile_size, **self._asked_by(call)),
-            **(self._absgrad if pulls and call.absgrad else {}),
-        )
+        of = {name: self._entries(call, value) for name, value in call.tensors().items()}
+        laid = {name: _laid(call, value, pulls and name not in call.frozen) for name, value in of.items()}
+        laid["Ks"] = _laid(call, self._tensor(call.intrinsics()), False)
+        # where nothing is pulled back torch is told so, as in an evaluation
+        with self._torch.set_grad_enabled(pulls):
+            images, alphas, meta = self._rasterization(
+                **{name: self._tensor(value) for name, value in call.without_gradients().items()}
+                | {name: each.view for name, each in laid.items()},
+                width=(W := camera.width),
+                height=(H := camera.height),
+                sh_degree=call.sh_degree,
+                **self._taken(packed=call.packed, tile_size=call.tile_size, **self._asked_by(call)),
+                **(self._absgrad if pulls and call.absgrad else {}),
+            )
         assert images.shape[:-1] == (*call.batch, C, H, W), f"images have shape {[*images.shape]}"
+        strange = self._strange(images, alphas, meta)
         images, alphas = images.reshape(B, C, H, W, -1), alphas.reshape(B, C, H, W)
         gradients: dict[str, np.ndarray] = {}
         if pulls:
             means2d = meta.get("means2d")
             if means2d is not None and means2d.requires_grad:
                 means2d.retain_grad()
-            ((images * self._tensor(v_images)).sum() + (alphas * self._tensor(v_alphas)).sum()).backward()
-            gradients = {name: self._grad_of(leaf) for name, leaf in leaves.items() if name not in self._without}
+            loss = (images * self._tensor(v_images)).sum() + (alphas * self._tensor(v_alphas)).sum()
+            # a picture of nothing over no background may follow nothing
+            if loss.requires_grad:
+                loss.backward()
+            given = [name for name in of if name not in (*self._without, *call.frozen)]
+            gradients = {name: self._grad_of(laid[name]) for name in given}
             if means2d is not None and means2d.requires_grad:
                 absolute = getattr(means2d, "absgrad", None)
                 of_screen = {"means2d": self._grad_of(means2d)}
@@ -390,7 +427,22 @@ class TorchAdapter(Adapter):
                 rows = {name: unpacked(call, value, meta) for name, value in of_screen.items()}
                 gradients |= {name: value for name, value in rows.items() if value is not None}
         shown = {name: self._array(meta[name]) for name in meta if meta[name] is not None}
-        return Called(self._array(images), self._array(alphas), shown, gradients)
+        of["Ks"] = self._tensor(call.intrinsics())
+        changed = tuple(name for name, each in laid.items() if not self._torch.equal(each.view.detach(), of[name]))
+        return Called(self._array(images), self._array(alphas), shown, gradients, changed, strange)
+
+    def _strange(self, images: Any, alphas: Any, meta: dict[str, Any]) -> tuple[str, ...]:
+        """Say what is not as gsplat documents it: a channel of alphas, the type of the Gaussians, integers as ids."""
+        said = []
+        if alphas.shape != (*images.shape[:-1], 1):
+            said.append(f"alphas have shape {[*alphas.shape]}; it must be {[*images.shape[:-1], 1]}")
+        for name, value in (("images", images), ("alphas", alphas)):
+            if value.dtype != self._float:
+                said.append(f"{name} are of {value.dtype}; the Gaussians are of {self._float}")
+        for name in ("batch_ids", "camera_ids", "gaussian_ids", "flatten_ids", "isect_offsets"):
+            if meta.get(name) is not None and meta[name].is_floating_point():
+                said.append(f"meta[{name!r}] is of {meta[name].dtype}; what numbers things must be of integers")
+        return tuple(said)
 
     def _entries(self, call: Call, value: np.ndarray) -> Any:
         """Return an argument of a call; expanded, if it is the same in all batch entries and the call asks for that."""
@@ -442,7 +494,7 @@ class TorchAdapter(Adapter):
         if self._rasterization is None:
             raise LookupError(f"{self.name} has no rasterization function")
         asked = {"dominance": dominance, "counts": counts}
-        options: dict[str, Any] = {**more, **{name: asked[name] for name in self._instruments}}
+        options: dict[str, Any] = {"packed": False, **more, **{name: asked[name] for name in self._instruments}}
         if self._takes_profile:
             options["profile"] = scene.profile
         if scene.antialiased:
@@ -454,7 +506,7 @@ class TorchAdapter(Adapter):
             leaves["opacities"],
             leaves["sh"],
             leaves["viewmat"],
-            self._tensor(scene.camera.K[None]),
+            leaves["K"] if "K" in leaves else self._tensor(scene.camera.K[None]),
             scene.camera.width,
             scene.camera.height,
             sh_degree=scene.degree,
@@ -462,7 +514,6 @@ class TorchAdapter(Adapter):
             **self._taken(
                 near_plane=scene.profile.near_plane,
                 eps2d=scene.profile.eps2d,
-                packed=False,
                 tile_size=scene.side,
                 **options,
             ),
@@ -484,8 +535,10 @@ class TorchAdapter(Adapter):
             return lambda *args: self._tensor(value(*args), own)
         return value
 
-    def _grad_of(self, tensor: Any) -> np.ndarray:
-        grad = self._torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
+    def _grad_of(self, of: Any) -> np.ndarray:
+        grad = of.gradient if isinstance(of, Laid) else of.grad
+        if grad is None:
+            grad = self._torch.zeros_like(of.view if isinstance(of, Laid) else of)
         return self._array(grad.to_dense() if grad.is_sparse else grad)
 
     def _array(self, value: Any) -> Any:

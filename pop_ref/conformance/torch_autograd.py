@@ -32,6 +32,7 @@ class Ask:
         cotangent: of the outputs: "dense", one of LAYOUTS, "channels", a pixel's first number in all of its channels
             without memory for the others, or "expanded", the first number everywhere likewise.
         outputs: which of "image" and "alpha" have a cotangent.
+        packed: whether packed rows are drawn.
         before: what else is done: "nothing"; "no_grad" and "inference_mode" draw twice under torch's mode of that name,
             the former in another thread, and write to the first image in between; "another" draws another scene between
             the forward and the backward pass; "twice" goes back twice and draws another scene in between; "present"
@@ -44,6 +45,7 @@ class Ask:
     layout: str = "dense"
     cotangent: str = "dense"
     outputs: tuple[str, ...] = ("image", "alpha")
+    packed: bool = False
     before: str = "nothing"
 
 
@@ -88,6 +90,8 @@ class Laid:
             base = torch.stack([torch.full_like(value, float("nan")), value], dim=0)
         elif layout == "repeated":
             base = value[..., :1].clone()
+        elif layout == "kept":
+            base = value
         else:
             base = value.clone(memory_format=torch.contiguous_format)
         self.base = base.requires_grad_(wanted)
@@ -230,6 +234,8 @@ def _moved(laid: dict[str, Laid], values: dict[str, Any], draw: Callable[[], Any
             if name == "viewmat":
                 # a rotation stays one
                 each.view[..., :3, 3].add_(0.25)
+            elif name == "K":
+                each.view[..., :2, :].mul_(0.75)
             else:
                 each.view.mul_(0.75)
     draw()

@@ -40,6 +40,7 @@ from pop_ref.conformance.law import is_crash, missing
 from pop_ref.conformance.mutants import BLACK_BOXES, MUTANTS, living
 from pop_ref.conformance.mutants.trial import every_law, law_named, obeys
 from pop_ref.conformance.pairs import FACTORS, accepted, call_of, covering_rows, judged_pairs, pairs_of, possible_pairs
+from pop_ref.conformance.plugin import _kind_of
 from pop_ref.conformance.scenes import (
     Scene,
     cotangents,
@@ -390,6 +391,14 @@ def test_one_cause_that_breaks_several_laws_is_told_once_with_where_it_was_raise
     assert f"raised at {tmp_path / 'stranger.py'}:" in done.stdout
     # a call that ends in an assertion does not hide that the argument is refused
     assert "sparse_grad (NotImplementedError: sparse_grad)" in " ".join(done.stdout.split())
+
+
+def test_what_differs_in_one_gradient_is_told_once_wherever_it_differs() -> None:
+    told = ["AssertionError: autograd.v_means: first at [0, 1]", "with packed=True: gradients: agreement.v_means: a",
+            "with every argument at its default: gradients: agreement.v_means: Gaussian 0", "image: pixel (0, 0)",
+            "first gradient that differs: v_means, Gaussian 1, entry [0]"]  # fmt: skip
+    assert len({_kind_of(told[k]) for k in (0, 2, 4)}) == 1
+    assert len(set(map(_kind_of, told))) == 3
 
 
 def test_who_has_gsplat_and_nothing_else_reads_first_what_is_judged_and_what_is_refused(stranger: Judged) -> None:

@@ -26,6 +26,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import pop_ref
 from pop_ref.conformance import teeth, tolerances
@@ -34,6 +35,7 @@ from pop_ref.conformance.capabilities import STAGES
 from pop_ref.conformance.law_coverage import LIMITS, MODULES, PACKAGE, Log, Logged, code_lines, reason
 from pop_ref.conformance.mutants import BLACK_BOXES, FAMILIES, MUTANTS, PROGRAM, BlackBox
 from pop_ref.conformance.mutants import __main__ as command
+from pop_ref.conformance.mutants.black_box import breaking
 from pop_ref.conformance.mutants.copies import Mutant
 from pop_ref.conformance.mutants.trial import every_law, killed_by, law_named, obeys
 from pop_ref.conformance.pairs import accepted, call_of, covering_rows
@@ -53,6 +55,28 @@ TRIED = [
     for k, mutant in enumerate(OUTSIDE)
     for dtype in (mutant.precisions if EVERY_PRECISION else [mutant.precisions[k % 2]])
 ]
+
+
+def _inverted(given: dict[str, Any]) -> dict[str, Any]:
+    """Have a gradient by view matrices as it is where rotations are inverted, not transposed, and by the last row as
+    gsplat's, which inverts the matrix to find the camera's centre."""
+    viewmats = given["viewmats"]
+    R, t = viewmats[..., :3, :3], viewmats[..., :3, 3:]
+    apart = 0.5 * (torch.linalg.inv(R).mT - R)
+    center = torch.cat([-R.mT @ t, torch.ones_like(t[..., :1, :])], -2).detach()
+    apart = torch.nn.functional.pad(apart - apart.detach(), (0, 1, 0, 1))
+    # as much of the last row as moves nothing
+    row = 0.25 * (viewmats[..., 3:, :] @ center) * torch.nn.functional.pad(torch.ones_like(t), (3, 0, 0, 1))
+    return {"viewmats": viewmats + apart + (row - row.detach())}
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_a_gradient_that_differs_along_no_rigid_motion_is_sound(dtype: str) -> None:
+    laws = ("test_agreement:gradients_are_the_oracles", "test_scale:the_gradients_of_fifty_are_the_oracles",
+            "test_autograd:gradients_are_added_to_those_that_are_there",
+            "test_signature_arguments:several_cameras_in_one_call_see_what_each_sees_alone")  # fmt: skip
+    backend = BlackBox("inverted", "", breaking(_inverted), laws[0]).adapter(dtype)
+    assert [obeys(law_named(path), backend, 4) for path in laws] == [None] * len(laws)
 
 
 # every fourth here; the others are for `make test-all`

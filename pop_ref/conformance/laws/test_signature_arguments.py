@@ -31,8 +31,15 @@ from pop_ref.conformance.capabilities import (
     SPARSE_GRAD,
 )
 from pop_ref.conformance.law import law
-from pop_ref.conformance.signature import assert_call_is_the_oracles, assert_rows, expectations
-from pop_ref.conformance.views import clear_of_extents, frames
+from pop_ref.conformance.signature import (
+    assert_call_is_the_oracles,
+    assert_gradients,
+    assert_images,
+    assert_rows,
+    expectations,
+    made,
+)
+from pop_ref.conformance.views import ASKED, call_for, clear_of_extents, frames
 
 
 def _assert_it_matters(backend, call, **default):
@@ -46,12 +53,15 @@ def _assert_it_matters(backend, call, **default):
 def test_plain_colours_are_drawn_as_they_are(backend):
     for seed in (0, 1):
         assert_call_is_the_oracles(backend, Call((frames(backend, seed, channels=3),)))
+    # of a light probe, or of features
+    (frame,) = frames(backend, 0, channels=3)
+    assert_call_is_the_oracles(backend, Call(((dataclasses.replace(frame, colors=frame.colors * 2.0**12),),)))
 
 
 @law("signature", SIGNATURE, CHANNELS)
 def test_colours_of_any_number_of_channels_are_drawn_alike(backend):
     # as many as a renderer blends at a time, and more, too: gsplat's `channel_chunk` is 32
-    for channels in (1, 2, 4, 8, 32, 40, 64):
+    for channels in (1, 2, 4, 8, 32, 40, 64, 130):
         assert_call_is_the_oracles(backend, Call((frames(backend, channels, channels=channels),)))
 
 
@@ -60,6 +70,30 @@ def test_without_a_background_it_is_black(backend):
     for channels in (0, 3):
         row = frames(backend, 2, 2, channels=channels, black=True)
         assert_call_is_the_oracles(backend, Call((row,), no_background=True))
+
+
+def _behind(scene):
+    """Return the scene with every Gaussian behind its camera."""
+    V = scene.camera.viewmat
+    behind = V[:3, :3].T @ (np.array([0.0, 0.0, -8.0]) - V[:3, 3])
+    return scene.with_overrides(means=np.broadcast_to(behind, scene.gaussians.means.shape))
+
+
+@law("signature", SIGNATURE)
+def test_where_nothing_is_seen_there_is_the_background_whatever_is_asked(backend):
+    # a scene without Gaussians, and one behind the cameras; backgrounds learn of every pixel
+    for capability, asks in ASKED.items():
+        if not backend.has(capability):
+            continue
+        call = call_for(backend, **asks)
+        for rows, moved in (([], False), (slice(None), True)):
+            of = [[Frame(backend.sees(_behind(f.scene)) if moved else f.scene.rows(np.array(rows, dtype=int)),
+                         f.colors if moved or f.colors is None else f.colors[rows]) for f in row]
+                  for row in call.frames]  # fmt: skip
+            one = made(backend, dataclasses.replace(call, frames=tuple(map(tuple, of)), planes={}))
+            assert all(np.all(e.render.T_final == 1.0) for _, _, e in one.each()), "something is seen"
+            assert_images(backend, one)
+            assert_gradients(backend, one)
 
 
 @law("signature", SIGNATURE, COVARS)
@@ -82,6 +116,10 @@ def test_the_near_and_the_far_plane_are_where_the_call_says(backend):
         depths = expectations(backend, call)[0][0].render.splats.depths
         assert all(np.min(np.abs(depths - plane)) > 2.0**-8 for plane in planes.values()), "a depth is at a plane"
         assert_call_is_the_oracles(backend, call)
+    nowhere = Call((frames(backend, 5),), planes={"far_plane": np.inf})
+    assert_same_bits(
+        "image", backend.call(nowhere).images, backend.call(dataclasses.replace(nowhere, planes={})).images
+    )
 
 
 @law("signature", SIGNATURE, PLANES)

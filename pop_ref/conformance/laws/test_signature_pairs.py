@@ -38,3 +38,23 @@ def test_every_pair_of_arguments_tells_the_dominant_gaussians_of_every_camera(ba
 @law("signature", SIGNATURE)
 def test_every_pair_of_arguments_lists_tiles_front_to_back(backend):
     assert_every_pair(backend, "tiles")
+
+
+@law("signature", SIGNATURE, GRADIENTS)
+def test_every_pair_of_arguments_draws_the_same_without_gradients(backend):
+    assert_every_pair(backend, "no gradients")
+
+
+@law("signature", SIGNATURE, GRADIENTS, "differentiate")
+def test_every_pair_of_arguments_has_the_oracles_gradients_where_means_have_none(backend):
+    assert_every_pair(backend, "frozen means")
+
+
+@law("signature", SIGNATURE)
+def test_every_pair_of_arguments_leaves_the_arguments_as_they_are(backend):
+    assert_every_pair(backend, "arguments")
+
+
+@law("signature", SIGNATURE)
+def test_every_pair_of_arguments_is_answered_in_gsplats_shapes_and_types(backend):
+    assert_every_pair(backend, "types")

@@ -107,6 +107,20 @@ def test_tiles_of_a_number_beyond_16_bits_are_drawn(backend):
         assert_close("whole.tiles", getattr(view, name), getattr(whole, name), 16.0, backend.dtype)
 
 
+@law("whole", RENDER, PRINCIPAL_POINT)
+def test_a_picture_of_thousands_of_columns_or_rows_is_drawn_to_its_end(backend):
+    # beyond what twelve bits number, and what textures hold
+    for size in ((4100, 3), (3, 4100)):
+        K = np.array([[4096.0, 0.0, size[0] / 2.0], [0.0, 4096.0, size[1] / 2.0], [0.0, 0.0, 1.0]])
+        camera = Camera(np.eye(4), K, *size)
+        at = [(end, 1.5) if size[0] > 3 else (1.5, end) for end in (8.0, 1030.0, 2052.0, 4098.0)]
+        splats = pack([Record(x=x, y=y, depth=2.0, size=(2.0, 2.0, 2.0), opacity=0.75) for x, y in at], camera)
+        view = backend.plainly(backend.sees(Scene(splats, camera, (0.25, 0.5, 0.75))))
+        for x, y in at:
+            shown = view.T_final[int(y), int(x)] < 0.375 and view.image[int(y), int(x), 0] > 0.5
+            assert shown, f"the splat at {x}, {y} of a picture of {size[0]} x {size[1]} px is not drawn"
+
+
 GREY, RED, BLUE = ((0.0, 0.0, 0.0),), ((2.0, -1.0, -1.0),), ((-1.0, -1.0, 2.0),)
 
 
