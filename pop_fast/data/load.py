@@ -25,7 +25,7 @@ from zipfile import is_zipfile
 
 import numpy as np
 
-from pop_fast.data.cameras import PINHOLES, Numbers, check_size, make_camera
+from pop_fast.data.cameras import Numbers, check_size, make_camera
 from pop_fast.data.capture import (
     Capture,
     Listing,
@@ -558,8 +558,6 @@ def _block_shot(entry: Any) -> PosedImage:
         params = [float(p) for p in lens["params"]]
         if not np.isfinite(params).all():
             raise ValueError(f"{where} has parameters that are not finite")
-        if lens["model"] in PINHOLES and len(params) != max(PINHOLES[lens["model"]][1]) + 1:
-            raise ValueError(f"{where} has {len(params)} parameters, which are not those of {lens['model']}")
         camera = make_camera(lens["id"], lens["model"], width, height, params)
     shot = PosedImage(entry["name"], entry["folder"], entry["file"], camera, _matrix(entry["viewmat"]))
     mask = None if entry["mask"] is None else Path(entry["mask"])

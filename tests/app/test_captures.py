@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 
 from pop_fast.cli.data_check import look_over
 from pop_fast.data import Capture, CaptureError, View, initialize_params, load_capture
-from pop_fast.data.cameras import PINHOLES, make_camera
+from pop_fast.data.camera_models import CAMERA_MODELS
+from pop_fast.data.cameras import make_camera
 from pop_fast.data.colmap import model_name, parameter_count, read_model
 from pop_fast.data.load import list_capture
 from pop_fast.data.read_images import find_masks, find_photographs
@@ -392,10 +393,10 @@ print([len(load_capture(folder).views) for folder in sys.argv[1:]])
 """
 
 
-@pytest.mark.parametrize("name", PINHOLES)
+@pytest.mark.parametrize("name", PARAMS)
 def test_a_pinhole_is_pycolmaps_pinhole(name):
     number = int(pycolmap.CameraModelId.__members__[name])
-    assert (PINHOLES[name][0], model_name(number)) == (number, name)
+    assert (CAMERA_MODELS[name].number, model_name(number)) == (number, name)
     ours = make_camera(7, name, 40, 22, PARAMS[name])
     theirs = pycolmap.Camera(camera_id=7, model=name, width=40, height=22, params=PARAMS[name])
     assert not isinstance(ours, pycolmap.Camera)
