@@ -230,7 +230,7 @@ def find_listing(root: Path, source: Source = "auto", images: str | None = None)
         raise CaptureError(f"{root}: has no {EXPORTS[source][1]}; export it there, or choose another --source")
     folder = photo_folder(root)
     if source == "auto":
-        _refuse_several(root, folder)
+        refuse_several(root)
     if not photographs(folder):
         hint = unreadable_photographs(folder) or "give the folder of a capture"
         raise CaptureError(f"{root}: has no photographs, no COLMAP model and no transforms.json; {hint}")
@@ -273,16 +273,28 @@ def _about_passed_over(root: Path, used: Listing) -> list[str]:
     return notes
 
 
-def _refuse_several(root: Path, photos: Path) -> None:
-    """Refuse a folder of captures, whose photographs would all be searched for the cameras of one."""
-    inside = [path for path in sorted(root.iterdir()) if path.is_dir() and path.name[0] != "."]
-    found = [path for path in inside if photos in (root, path) and _lists(path) and list_images(path)]
+def refuse_several(root: Path, besides: Path | None = None) -> None:
+    """Refuse a folder with captures in it, whose photographs would be searched for cameras as those of one scene.
+
+    They would be where the search takes subfolders, or where such a capture is of the photographs to be searched, as
+    `dense` of a COLMAP workspace. What is written to `besides` is none of them.
+    """
+    photos = photo_folder(root)
+    searched = {path.name for path in list_images(photos)}
+    found: list[Path] = []
+    for path in sorted(root.iterdir()):
+        written = besides is not None and path.resolve() == besides.resolve()
+        if written or path.name[0] == "." or not path.is_dir() or not _lists(path):
+            continue
+        own = {image.name for image in list_images(path)}
+        if own and (photos in (root, path) or own & searched):
+            found.append(path)
     if found:
         names = ", ".join(path.name for path in found[:_NAMED])
         what = f"captures in it have theirs ({names})" if len(found) > 1 else f"a capture in it has its own ({names})"
         raise CaptureError(
             f"{root}: has no cameras, but {what}; give one of these: pop train {quote(str(found[0]))}, or search all "
-            "photographs as those of one scene with --source photos"
+            "photographs as those of one scene with pop train --source photos"
         )
 
 

@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pop_fast.cli.data_check import look_over
+from pop_fast.cli.sfm import run as search
 from pop_fast.data import Capture, CaptureError, View, initialize_params, load_capture
 from pop_fast.data.camera_models import CAMERA_MODELS
 from pop_fast.data.cameras import make_camera
@@ -459,6 +460,18 @@ def test_a_folder_of_captures_names_them_and_the_command_unless_all_photographs_
     found = assert_one_line(lambda: load_capture(tmp_path), "captures in it have theirs (a walk, b)", "--source photos")
     assert f"pop train '{tmp_path / 'a walk'}'" in found
     assert_one_line(lambda: load_capture(tmp_path, source="photos"), "has 9 photographs but no cameras")
+    assert_one_line(lambda: search([str(tmp_path)]), "captures in it have theirs (a walk, b)")
+
+
+def test_cameras_of_the_photographs_in_a_folder_beside_them_are_named_before_they_are_searched(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path / "dense").parent
+    (root / "images").mkdir()
+    write_photograph(root / "images" / "other.png", photograph(0))
+    assert_one_line(lambda: load_capture(root), "1 photographs but no cameras")
+    write_photograph(root / "images" / "00.png", photograph(0))
+    assert_one_line(lambda: load_capture(root), "a capture in it has its own (dense)", f"pop train {root / 'dense'}")
+    # but for the place that the search is to write to
+    assert_one_line(lambda: search([str(root), "--out", str(root / "dense")]), "did not write")
 
 
 def test_points_that_no_camera_can_have_measured_are_left_out_and_told(tmp_path: Path) -> None:
