@@ -409,6 +409,8 @@ def _assemble(root: Path, listing: Listing, views: list[View], normalize: bool, 
                 transform = normalizing_transform(viewmats, cloud.xyz if cloud else None)
             moved = transform_viewmats(transform, viewmats)
             views = [replace(view, viewmat=viewmat) for view, viewmat in zip(views, moved, strict=True)]
+        else:
+            notes = notes + _about_origin(np.stack([view.camera_center for view in views]))
         if cloud:
             cloud = SparsePoints(transform_points(transform, cloud.xyz), cloud.rgb)
             source = f"{made_from}: {len(views)} views, {len(cloud)} points"
@@ -424,6 +426,16 @@ def _assemble(root: Path, listing: Listing, views: list[View], normalize: bool, 
     name = root.resolve().name
     found = (listing.sfm_seconds, listing.unplaced)
     return Capture(name, tuple(views), cloud.xyz, cloud.rgb, source, transform, tuple(notes), *found)
+
+
+def _about_origin(centers: np.ndarray) -> list[str]:
+    """Tell that cameras stand so far from the origin that float32, in which scenes are trained, blurs their places."""
+    farthest, apart = np.abs(centers).max(), np.linalg.norm(centers - np.median(centers, axis=0), axis=1).max()
+    step = float(np.spacing(np.float32(farthest)))
+    if step <= 1e-4 * apart:
+        return []
+    text = f"cameras stand {farthest:.2g} from the origin and {apart:.2g} from each other, where float32 has steps of"
+    return [f"{text} {step:.2g}: leave out --no-normalize, which keeps these coordinates"]
 
 
 _ROUNDS = 20

@@ -474,6 +474,20 @@ def test_cameras_of_the_photographs_in_a_folder_beside_them_are_named_before_the
     assert_one_line(lambda: search([str(root), "--out", str(root / "dense")]), "did not write")
 
 
+def test_a_world_too_far_from_its_origin_for_float32_is_told(tmp_path: Path) -> None:
+    root = transforms_capture(tmp_path)
+    assert raw(root).notes == ()
+    moved = np.array([5e5, 5.4e6, 300.0])
+    edit_transforms(root, lambda listing: [place(frame, moved) for frame in listing["frames"]])
+    assert "steps of 0.5: leave out --no-normalize" in raw(root).notes[-1]
+    assert load_capture(root).notes == ()
+
+
+def place(frame: dict[str, Any], moved: np.ndarray) -> None:
+    for row, more in zip(frame["transform_matrix"], moved, strict=False):
+        row[3] += more
+
+
 def test_points_that_no_camera_can_have_measured_are_left_out_and_told(tmp_path: Path) -> None:
     xyz, rgb = cloud()
     usual = load_capture(colmap_capture(tmp_path / "usual"))

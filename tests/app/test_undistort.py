@@ -271,6 +271,15 @@ def test_the_units_of_a_capture_do_not_matter(exponent: int) -> None:
     assert np.allclose(one, other, atol=1e-10)
 
 
+def test_a_capture_in_coordinates_of_a_map_is_normalised_as_near_its_origin() -> None:
+    viewmats, (points, _) = ring(8), cloud(200)
+    there = similarity(np.zeros(3), np.array([5e5, 5.4e6, 300.0]), 1.0)
+    far = normalizing_transform(transform_viewmats(there, viewmats), transform_points(there, points)) @ there
+    near = normalizing_transform(viewmats, points)
+    assert scale_of(far) == pytest.approx(scale_of(near), rel=0.1)
+    assert np.allclose(transform_points(far, points), transform_points(near, points), atol=0.1)
+
+
 def test_cameras_whose_up_is_plus_y_are_turned_half_round_without_a_mirror() -> None:
     world = similarity(np.array([-np.pi / 2, 0.0, 0.0]), np.zeros(3), 1.0)
     viewmats = transform_viewmats(world, ring(4))
