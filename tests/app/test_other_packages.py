@@ -202,6 +202,8 @@ def test_it_trains_saves_resumes_and_exports(site: Path, shared_capture: Path, t
 def test_its_method_stands_in_a_table(site: Path, tmp_path: Path) -> None:
     places = ("--scale", "toy", "--results", tmp_path / "results")
     call(site, "paper_repro.cli", "run", "mine", "demo", *places, "--work", tmp_path / "work")
+    (result,) = (tmp_path / "results").rglob("*.jsonl")
+    assert '"huber":' in result.read_text()
     lines = call(site, "paper_repro.cli", "table", "beyond", *places).splitlines()
     (line,) = (line for line in lines if "Fading, by somebody else" in line and "not run" not in line)
     assert any(cell.strip().replace(".", "").isdigit() for cell in line.split("|"))
