@@ -443,6 +443,11 @@ def _run(words: list[str]) -> int:
         commands = "\n".join(f"  {name:<{width}}{about}" for name, (_, about) in COMMANDS.items())
         print(_TEXT.format(commands=commands, snakefile="paper_repro/Snakefile"))
         return 0
+    if words[0] in ("-V", "--version"):
+        from importlib.metadata import version
+
+        print(f"pop-repro {version('pop-splatting')}")
+        return 0
     for length in (2, 1):
         name = " ".join(words[:length])
         if name in COMMANDS:

@@ -40,11 +40,9 @@ _APART: Final = frozenset(
 )
 # as many points as a curve of the whole schedule has with one each 100 steps
 _POINTS: Final = 300
-# what the points of a curve have, where it was measured
-_COLUMNS: Final = (
-    *("step", "num_gaussians", "psnr", "psnr_test", "seconds", "n_blended", "n_traversed"),
-    *("l1", "l2", "d_ssim", "pop", "cloned", "split", "pruned"),
-)
+# what the points of a curve have, where it was measured, before and after the loss between pixels
+_COLUMNS: Final = ("step", "num_gaussians", "psnr", "psnr_test", "seconds", "n_blended", "n_traversed")
+_CHANGES: Final = ("d_ssim", "pop", "cloned", "split", "pruned")
 _PROBED: Final = ("grad_", "probe_")
 # a PSNR of five digits has three after the point
 _PRECISE: Final = ("psnr", "psnr_test", "seconds")
@@ -286,8 +284,11 @@ def digits(name: str) -> int:
 
 def _point(found: Mapping[str, Any]) -> dict[str, Any]:
     """Take what a curve holds, in one order, rounded to what a figure shows; what JSON cannot hold is left out."""
+    from pop_fast.train.presets import LOSSES
+
     more = sorted(name for name in found if name.startswith(_PROBED))
-    values = {name: found[name] for name in (*_COLUMNS, *more) if found.get(name) is not None}
+    names = (*_COLUMNS, *sorted(LOSSES), *_CHANGES, *more)
+    values = {name: found[name] for name in names if found.get(name) is not None}
     return {
         name: float(f"{value:.{digits(name)}g}") if isinstance(value, float) else value
         for name, value in values.items()

@@ -1,4 +1,4 @@
-"""Values by name, to which other packages add theirs: profiles here; methods, backends, losses, formats in `pop_fast`.
+"""Values by name, to which other packages add theirs: profiles here; methods, backends, losses, ... in `pop_fast`.
 
 A registry knows three kinds of names: those of the package that it belongs to, those that a program registers while it
 runs, and those that installed packages declare under an entry point group, as

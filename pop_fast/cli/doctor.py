@@ -151,11 +151,12 @@ def backends() -> Iterator[DoctorLine]:
 
 def plugins() -> Iterator[DoctorLine]:
     """Load what other packages add, and tell which package each is of and why one cannot be used."""
+    from pop_fast.data.camera_models import CAMERA_MODELS
     from pop_fast.io.formats import FORMATS
     from pop_fast.train.presets import LOSSES, METHODS
     from pop_ref.constants import PROFILES
 
-    for registry in (METHODS, PROFILES, LOSSES, FORMATS, BACKENDS):
+    for registry in (METHODS, PROFILES, LOSSES, FORMATS, CAMERA_MODELS, BACKENDS):
         for name, package, fault in registry.added():
             found = f"of {package}" if fault is None else f"{fault} (optional)"
             yield DoctorLine(f"{registry.kind} {name}", "ok" if fault is None else "off", found)

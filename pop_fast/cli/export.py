@@ -158,6 +158,16 @@ def note_lost_frame(out: Path, name: str, frame: Frame | None) -> None:
         print(f"note: {out}: {what}; commands that read it need --training-frame", file=sys.stderr)
 
 
+def _note_coarse_places(out: Path, transform: np.ndarray) -> None:
+    """Say on stderr that a capture's coordinates are too large for the numbers of a file, as those of a map."""
+    farthest = float(np.abs(np.linalg.inv(transform)[:3, 3]).max())
+    step = float(np.spacing(np.float32(farthest)))
+    # of the cameras' distance, which is 1 in the training frame
+    if step * np.cbrt(np.linalg.det(transform[:3, :3])) > 1e-4:
+        what = f"the scene is {farthest:.2g} from the origin of the capture's coordinates, where numbers of files have"
+        print(f"note: {out}: {what} steps of {step:.2g}; --frame training keeps all that was trained", file=sys.stderr)
+
+
 def check_file(out: Path, source: Path, overwrite: bool) -> None:
     """Refuse a file that is not to be replaced, or is the splat itself."""
     if out.is_dir():
@@ -175,6 +185,8 @@ def _output(args: Args, out: Path, name: str, splat: Splat, opened: _Opened) -> 
         return page_output(views, opened.config, splat.sh_degree, args.splat)
     transform, frame = _output_frame(splat, args)
     note_lost_frame(out, name, frame)
+    if transform is not None and frame is not None and frame.name == "capture":
+        _note_coarse_places(out, transform)
     return Output(name, splat.config.antialiased, frame, transform)
 
 

@@ -45,9 +45,12 @@ class Args:
 def run(argv: Sequence[str]) -> int:
     args = parse(Args, argv, "sfm", examples=_EXAMPLES)
     from pop_fast.data import run_sfm
+    from pop_fast.data.load import refuse_several
     from pop_fast.data.sfm import photo_folder
     from pop_fast.io.images import unreadable_photographs
 
+    if args.photos.is_dir():
+        refuse_several(args.photos, args.out)
     with bars() as progress:
         options = {field.name: getattr(args, field.name) for field in fields(SfmOptions)}
         found = run_sfm(args.photos, args.out, progress, overwrite=args.overwrite, **options)

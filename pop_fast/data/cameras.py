@@ -1,6 +1,7 @@
-"""Cameras as files describe them: numbers by field, poses of either handedness, rotations, pinholes, Brown's lenses.
+"""Cameras as files describe them: numbers by field, poses of either handedness, rotations, models.
 
-Cameras without distortion need no COLMAP: a capture of pinholes loads where pycolmap is not installed.
+Cameras of a model whose `distort` the table of models has need no COLMAP: a capture of pinholes loads where pycolmap is
+not installed.
 """
 
 from __future__ import annotations
@@ -9,12 +10,13 @@ import math
 import signal
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 
+from pop_fast.data.camera_models import CAMERA_MODELS, CameraModel, fields_of, known_model, models_of
 from pop_fast.errors import CaptureError
 from pop_fast.io.ply import FARTHEST
 
@@ -149,64 +151,86 @@ def viewmat_from_pose(where: str, pose: np.ndarray, opengl: bool) -> np.ndarray:
     return affine(rotation.T, -rotation.T @ pose[:3, 3])
 
 
-def brown_lens(
-    radial: Sequence[float], tangential: Sequence[float]
-) -> tuple[Literal["PINHOLE", "OPENCV", "FULL_OPENCV"], list[float]]:
-    """Choose COLMAP's smallest model for Brown's distortion, and its parameters after the pinhole's four.
+def choose_model(program: str, kind: str, number: Numbers, called: str) -> tuple[str, list[float]]:
+    """Choose the camera model of a list's camera, the first of `CAMERA_MODELS` that has all terms which it gives.
 
-    Radial terms are k1, k2, k3; tangential ones p1, p2 as OpenCV has them: x gains 2 p1 x y + p2 (r^2 + 2 x^2).
+    Args:
+        program: whose list it is, as `CameraModel.fields` has it.
+        kind: what the list calls the model.
+        number: gives its fields.
+        called: what an error calls the model.
+
+    Returns:
+        The model's name, and its terms in order.
+
+    Raises:
+        CaptureError: no model of that kind has such a term, or no photograph of that kind can be used.
     """
-    k1, k2, k3 = radial
-    if k3:
-        return "FULL_OPENCV", [k1, k2, *tangential, k3, 0.0, 0.0, 0.0]
-    if k1 or k2 or any(tangential):
-        return "OPENCV", [k1, k2, *tangential]
-    return "PINHOLE", []
-
-
-# COLMAP's name of a model: its number there, and where fx, fy, cx and cy stand among its parameters
-PINHOLES: Final = {"SIMPLE_PINHOLE": (0, (0, 0, 1, 2)), "PINHOLE": (1, (0, 1, 2, 3))}
+    given = {name: value for name in fields_of(program) if (value := number(name, 0.0))}
+    models, foreign = models_of(program), dict(given)
+    for model in models[kind]:
+        if model.refusal is not None:
+            raise CaptureError(f"{number.where}: {called} is {model.refusal}")
+        names = model.fields[program, kind]
+        left = {name: value for name, value in given.items() if name not in names.values()}
+        if not left:
+            return model.name, [given.get(names.get(term, ""), 0.0) for term in model.terms]
+        foreign = min(foreign, left, key=len)
+    name = next(iter(foreign))
+    others = [other for other, known in models.items() if any(name in m.fields[program, other].values() for m in known)]
+    fix = f", or use a model that has it: {', '.join(others)}" if others else ""
+    raise CaptureError(
+        f"{number.where}: {name} is {foreign[name]:g}, but {called} has no such term; remove {', '.join(foreign)} if "
+        f"the photographs are undistorted, else undistort them there{fix}"
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class PinholeCamera:
-    """What is used of a `pycolmap.Camera`, under the same names: sizes, focal lengths and principal point in px."""
+class ModelCamera:
+    """A camera of a model with `distort`: what is used of a `pycolmap.Camera`, under the same names, sizes in px."""
 
     camera_id: int
-    model_name: str
+    model: CameraModel
     width: int
     height: int
-    params: np.ndarray  # as COLMAP orders them
+    params: np.ndarray  # as the model orders them
 
-    def _param(self, which: int) -> float:
-        return float(self.params[PINHOLES[self.model_name][1][which]])
+    @property
+    def model_name(self) -> str:
+        return self.model.name
+
+    def _param(self, *names: str) -> float:
+        return float(next(self.params[i] for i, name in enumerate(self.model.params) if name in names))
 
     @property
     def focal_length_x(self) -> float:
-        return self._param(0)
+        return self._param("f", "fx")
 
     @property
     def focal_length_y(self) -> float:
-        return self._param(1)
+        return self._param("f", "fy")
 
     @property
     def principal_point_x(self) -> float:
-        return self._param(2)
+        return self._param("cx")
 
     @property
     def principal_point_y(self) -> float:
-        return self._param(3)
+        return self._param("cy")
 
     def mean_focal_length(self) -> float:
         return 0.5 * (self.focal_length_x + self.focal_length_y)
 
     def focal_length_idxs(self) -> list[int]:
-        return sorted(set(PINHOLES[self.model_name][1][:2]))
+        return [i for i, name in enumerate(self.model.params) if name in ("f", "fx", "fy")]
 
     def img_from_cam(self, points: np.ndarray) -> np.ndarray:
-        """Project points in front of the camera: x = f X / Z + c. float64 [P, 3] -> float64 [P, 2]"""
+        """Project points in front of the camera. float64 [P, 3] -> float64 [P, 2]"""
+        assert self.model.distort is not None
+        x, y = (points[:, :2] / points[:, 2:]).T
+        bent = np.stack(self.model.distort(x, y, *(self._param(term) for term in self.model.terms)), axis=1)
         focal = np.array([self.focal_length_x, self.focal_length_y])
-        return focal * (points[:, :2] / points[:, 2:]) + np.array([self.principal_point_x, self.principal_point_y])
+        return focal * bent + np.array([self.principal_point_x, self.principal_point_y])
 
 
 def require_colmap() -> Any:
@@ -219,15 +243,23 @@ def require_colmap() -> Any:
             # its log takes SIGTERM to print where the program was
             signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
     except ImportError as error:
+        own = [name for name, model in CAMERA_MODELS.usable() if model.distort is not None]
         raise CaptureError(
             f"pycolmap, which finds cameras and reads those with distortion, cannot be imported ({error}); pip install "
-            f"pycolmap, or use photographs of known cameras of the models {', '.join(PINHOLES)}"
+            f"pycolmap, or use photographs of known cameras of the models {', '.join(own)}"
         ) from error
     return pycolmap
 
 
 def make_camera(camera_id: int, model: str, width: int, height: int, params: list[float]) -> Any:
-    """Build a camera whose fields are not judged yet: a `PinholeCamera`, or a `pycolmap.Camera` of any other model."""
-    if model in PINHOLES:
-        return PinholeCamera(camera_id, model, width, height, np.array(params, dtype=np.float64))
+    """Build a camera whose fields are not judged yet: a `ModelCamera`, or a `pycolmap.Camera` of COLMAP's other models.
+
+    Raises:
+        CaptureError: the model has another number of parameters, or is COLMAP's where pycolmap is not installed.
+    """
+    known = known_model(model)
+    if known is not None and len(params) != len(known.params):
+        raise CaptureError(f"camera {camera_id} has {len(params)} parameters; {model} has {', '.join(known.params)}")
+    if known is not None and known.distort is not None:
+        return ModelCamera(camera_id, known, width, height, np.array(params, dtype=np.float64))
     return require_colmap().Camera(camera_id=camera_id, model=model, width=width, height=height, params=params)

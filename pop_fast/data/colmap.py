@@ -19,7 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from pop_fast.data.cameras import PINHOLES, make_camera, require_colmap, rigid_from_quat
+from pop_fast.data.camera_models import CAMERA_MODELS, known_model
+from pop_fast.data.cameras import make_camera, require_colmap, rigid_from_quat
 from pop_fast.data.capture import PosedImage, SparsePoints
 from pop_fast.errors import CaptureError
 from pop_fast.io.ply import FARTHEST, find_bad_coordinate
@@ -193,16 +194,14 @@ def model_names() -> dict[int, str]:
 
 def model_name(number: int) -> str | None:
     """Return the name of a camera model, or None where no model has that number."""
-    for name, (own, _) in PINHOLES.items():
-        if own == number:
-            return name
-    return model_names().get(number)
+    listed = (name for name, model in CAMERA_MODELS.usable() if model.number == number)
+    return next(listed, None) or model_names().get(number)
 
 
 @cache
 def parameter_count(name: str) -> int:
-    if name in PINHOLES:
-        return max(PINHOLES[name][1]) + 1
+    if (known := known_model(name)) is not None:
+        return len(known.params)
     models = require_colmap()
     return len(models.Camera.create_from_model_id(1, models.CameraModelId.__members__[name], 1.0, 1, 1).params)
 
@@ -431,7 +430,7 @@ def _is_number(word: str) -> bool:
 
 def _text_camera(line: _Line) -> Any:
     model = line.words[1]
-    if model not in PINHOLES and model not in model_names().values():
+    if model not in CAMERA_MODELS and model not in model_names().values():
         raise CaptureError(f"{line.where}: MODEL is {model!r}; use one of {', '.join(model_names().values())}")
     words = line.words[4].split()
     if len(words) != parameter_count(model):

@@ -33,16 +33,17 @@ import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, BinaryIO, Final, Literal, cast
+from typing import Any, BinaryIO, Final, cast
 
 import numpy as np
 
+from pop_fast.data.camera_models import fields_of, models_of
 from pop_fast.data.cameras import (
     WIDEST,
     Numbers,
     affine,
-    brown_lens,
     check_size,
+    choose_model,
     make_camera,
     shortened,
     viewmat_from_pose,
@@ -124,7 +125,6 @@ def _name(written: object) -> str:
 
 _HEAD = 4096
 _EXPORT_XML = "export the cameras again (Agisoft XML)"
-_RADIAL, _TANGENTIAL = ("k1", "k2", "k3", "k4"), ("p1", "p2")
 
 
 def find_metashape(root: Path) -> Path | None:
@@ -247,16 +247,12 @@ def _metashape_camera(path: Path, label: str, sensor: ET.Element | None, number:
     if focal <= 0.0 or focal + read("b1", 0.0) <= 0.0:
         raise CaptureError(f"{where}: calibration: f is {focal:g}; it must be > 0")
     pinhole = [focal + read("b1", 0.0), focal, 0.5 * width + read("cx", 0.0), 0.5 * height + read("cy", 0.0)]
-    radial, tangential = [read(k, 0.0) for k in _RADIAL], (read("p2", 0.0), read("p1", 0.0))
-    kind = chosen.get("type", sensor.get("type", "frame"))
-    if kind in ("fisheye", "equidistant_fisheye") and not any(tangential):
-        return make_camera(number, "OPENCV_FISHEYE", width, height, pinhole + radial)
-    if kind != "frame" or radial[3] != 0.0:
-        what = f"the type {kind!r}" if kind != "frame" else f"k4 = {radial[3]:g}"
-        fix = "undistort the photographs there, or calibrate type 'frame' with k1 to k3, p1, p2"
-        raise CaptureError(f"{where}: calibration has {what}, which is not supported; {fix}")
-    model, lens = brown_lens(radial[:3], tangential)
-    return make_camera(number, model, width, height, pinhole + lens)
+    kind = chosen.get("type", sensor.get("type", "frame")).removeprefix("equidistant_")
+    if kind not in (known := models_of("metashape")):
+        fix = f"undistort the photographs there, or calibrate a type of {', '.join(known)}"
+        raise CaptureError(f"{where}: calibration has the type {kind!r}, which is not supported; {fix}")
+    model, terms = choose_model("metashape", kind, read, f"the type {kind!r}")
+    return make_camera(number, model, width, height, pinhole + terms)
 
 
 _POSE: Final = ("x", "y", "alt", "heading", "pitch", "roll")
@@ -350,13 +346,11 @@ def _realitycapture_camera(where: str, read: Numbers, width: int, height: int, n
     focal = read("f")
     if focal <= 0.0:
         raise CaptureError(f"{where}: f is {focal:g}; it must be > 0, in mm for a longer side of {_FILM:g} mm")
-    if read("k4", 0.0) != 0.0:
-        raise CaptureError(f"{where}: k4 is {read('k4'):g}, which is not supported; calibrate with k1 to k3")
     scale = max(width, height) / _FILM
     pinhole = [focal * scale, focal * scale]
     pinhole += [0.5 * width + read("px", 0.0) * scale, 0.5 * height + read("py", 0.0) * scale]
-    model, lens = brown_lens([read(k, 0.0) for k in ("k1", "k2", "k3")], (read("t1", 0.0), read("t2", 0.0)))
-    return make_camera(number, model, width, height, pinhole + lens)
+    model, terms = choose_model("realitycapture", "Brown", read, "Brown's model")
+    return make_camera(number, model, width, height, pinhole + terms)
 
 
 _POLYCAM: Final = "keyframes/corrected_cameras or keyframes/cameras"
@@ -383,12 +377,17 @@ def read_export(root: Path, program: str = "auto", images: str | None = None) ->
     return None
 
 
-_ROLLING: Final = "rolling_shutter"
+# fields that say more than a pinhole holds, and what that means
+_IGNORED: Final = {
+    "rolling_shutter": "every photograph counts as taken at one moment",
+    "fisheye_crop_radius": "mask the photographs where they are dark outside the lens's circle",
+}
 _NO_PINHOLE: Final = ("latlong", "equirectangular", "orthographic", "ftheta_p0")  # instant-ngp's other lenses
 _POINTS = ("sparse_pc.ply", "points3D.ply", "points3d.ply")
 # what is measured in pixels of the size w x h; without it, only a field of view can be used
 _IN_PIXELS = ("fl_x", "fl_y", "cx", "cy")
-_MODELS = ("OPENCV", "OPENCV_FISHEYE", "PINHOLE", "SIMPLE_PINHOLE", "perspective")
+# nerfstudio's list of terms in the place of fields
+_TERMS: Final = "distortion_params"
 
 
 def find_transforms(folder: Path) -> list[Path]:
@@ -415,8 +414,9 @@ def read_transforms(paths: list[Path]) -> tuple[list[PosedImage], SparsePoints |
         # a list for training alone says nothing of what to hold out
         split = cast("Split | None", path.stem.partition("_")[2] or None) if len(paths) > 1 else None
         shots += _read_listing(path, listing, split)
-        if any(fields.get(_ROLLING) not in (None, [0] * 4) for fields in (listing, *listing["frames"])):
-            notes.append(f"{_ROLLING} of {path.name} is ignored: every photograph counts as taken at one moment")
+        for name, means in _IGNORED.items():
+            if any(fields.get(name) not in (None, [0] * 4) for fields in (listing, *listing["frames"])):
+                notes.append(f"{name} of {path.name} is ignored: {means}")
         points = listing.get("ply_file_path")
         if points is not None and not isinstance(points, str):
             raise CaptureError(
@@ -531,18 +531,22 @@ def _transform_viewmat(where: str, frame: dict[str, Any]) -> np.ndarray:
 
 def _camera(where: str, fields: dict[str, Any], camera_id: int) -> Any:
     """Build the camera of a frame: its own fields before the file's."""
-    number = Numbers(where, fields)
+    number = Numbers(where, {**fields, **_listed_terms(where, fields.get(_TERMS))})
     if other := next((name for name in _NO_PINHOLE if fields.get(name)), None):
         raise CaptureError(f"{where}: {other} is no lens that is supported; cut the photographs into perspective views")
     width, height = int(number("w")), int(number("h"))
     if not (1 <= width <= WIDEST and 1 <= height <= WIDEST):
         raise CaptureError(f"{where}: w x h is {width} x {height}; both must be at least 1 and at most {WIDEST}")
-    model = "OPENCV_FISHEYE" if fields.get("is_fisheye") else str(fields.get("camera_model", "OPENCV"))
-    if model not in _MODELS:
-        fix = f"use one of {', '.join(_MODELS)}, or a COLMAP model"
-        if model == "EQUIRECTANGULAR":
-            fix = "no pinhole image can hold a full sphere: cut it into perspective views"
-        raise CaptureError(f"{where}: camera_model is {model!r}; {fix}")
+    kind = "OPENCV_FISHEYE" if fields.get("is_fisheye") else str(fields.get("camera_model", "OPENCV"))
+    if kind not in (known := models_of("transforms")):
+        usable = ", ".join(kind for kind, (first, *_) in known.items() if first.refusal is None)
+        raise CaptureError(f"{where}: camera_model is {kind!r}; use one of {usable}, or a COLMAP model")
+    model, terms = choose_model("transforms", kind, number, f"camera_model {kind}")
+    if model == "FULL_OPENCV" != kind and number("k4", 0.0) and not (number("k5", 0.0) or number("k6", 0.0)):
+        raise CaptureError(
+            f"{where}: k4 is {number('k4'):g}, which camera_model {kind} has not: name the model BROWN4 if it is the "
+            "factor of r^8, as of Metashape, RealityCapture and nerfstudio, or FULL_OPENCV if it is that of OpenCV"
+        )
     focal_x = _focal(number, "fl_x", "camera_angle_x", width)
     if focal_x is None:
         raise CaptureError(f"{where}: has neither fl_x nor camera_angle_x; one of them must give the focal length")
@@ -550,8 +554,15 @@ def _camera(where: str, fields: dict[str, Any], camera_id: int) -> Any:
     if not (focal_x > 0.0 and focal_y > 0.0):
         raise CaptureError(f"{where}: has focal lengths {focal_x}, {focal_y}; both must be > 0")
     pinhole = [focal_x, focal_y, number("cx", width / 2), number("cy", height / 2)]
-    name, lens = _lens(where, model, number)
-    return make_camera(camera_id, name, width, height, pinhole + lens)
+    return make_camera(camera_id, model, width, height, pinhole + terms)
+
+
+def _listed_terms(where: str, terms: Any) -> dict[str, Any]:
+    """Give the entries of nerfstudio's list of terms names of their own."""
+    most = sum(name.startswith(_TERMS) for name in fields_of("transforms"))
+    if terms is not None and not (isinstance(terms, list) and len(terms) <= most):
+        raise CaptureError(f"{where}: {_TERMS} is {shortened(terms)}; it must be a list of up to {most} numbers")
+    return {f"{_TERMS}[{i}]": value for i, value in enumerate(terms or [])}
 
 
 def _angle(where: str, fields: dict[str, Any]) -> float | None:
@@ -559,7 +570,7 @@ def _angle(where: str, fields: dict[str, Any]) -> float | None:
     number = Numbers(where, fields)
     if "w" in fields or "h" in fields:
         return None
-    measured = any(name in fields for name in _IN_PIXELS) or any(fields.get(k) for k in _RADIAL)
+    measured = any(name in fields for name in _IN_PIXELS) or any(fields.get(k) for k in fields_of("transforms"))
     if measured or "camera_angle_x" not in fields:
         raise CaptureError(f"{where}: w and h are absent; they give the size that the intrinsics are measured in")
     angle = number("camera_angle_x")
@@ -575,26 +586,3 @@ def _focal(number: Numbers, focal: str, angle: str, size: float) -> float | None
         half = math.tan(number(angle) / 2.0)
         return 0.5 * size / half if half > 0.0 else 0.0
     return None
-
-
-def _lens(
-    where: str, model: str, number: Numbers
-) -> tuple[Literal["PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE"], list[float]]:
-    own = {"PINHOLE": (), "SIMPLE_PINHOLE": (), "OPENCV_FISHEYE": _RADIAL}.get(model, (*_RADIAL, *_TANGENTIAL))
-    foreign = (name for name in (*_RADIAL, *_TANGENTIAL) if name not in own)
-    if told := [name for name in foreign if number(name, 0.0)]:
-        raise CaptureError(
-            f"{where}: {told[0]} is {number(told[0])}, but camera_model {model} has no such term; "
-            f"remove {', '.join(told)} if the photographs are undistorted, else name the model OPENCV"
-        )
-    if model.endswith("PINHOLE"):
-        return "PINHOLE", []
-    k1, k2, k3, k4 = (number(k, 0.0) for k in _RADIAL)
-    if model == "OPENCV_FISHEYE":
-        return "OPENCV_FISHEYE", [k1, k2, k3, k4]
-    if k4:
-        raise CaptureError(
-            f"{where}: k4 is {k4}; OPENCV's fourth radial term is not supported, calibrate with k1 to k3"
-        )
-    p1, p2 = (number(p, 0.0) for p in _TANGENTIAL)
-    return brown_lens((k1, k2, k3), (p1, p2))

@@ -25,7 +25,7 @@ from zipfile import is_zipfile
 
 import numpy as np
 
-from pop_fast.data.cameras import PINHOLES, Numbers, check_size, make_camera
+from pop_fast.data.cameras import Numbers, check_size, make_camera
 from pop_fast.data.capture import (
     Capture,
     Listing,
@@ -230,7 +230,7 @@ def find_listing(root: Path, source: Source = "auto", images: str | None = None)
         raise CaptureError(f"{root}: has no {EXPORTS[source][1]}; export it there, or choose another --source")
     folder = photo_folder(root)
     if source == "auto":
-        _refuse_several(root, folder)
+        refuse_several(root)
     if not photographs(folder):
         hint = unreadable_photographs(folder) or "give the folder of a capture"
         raise CaptureError(f"{root}: has no photographs, no COLMAP model and no transforms.json; {hint}")
@@ -273,16 +273,28 @@ def _about_passed_over(root: Path, used: Listing) -> list[str]:
     return notes
 
 
-def _refuse_several(root: Path, photos: Path) -> None:
-    """Refuse a folder of captures, whose photographs would all be searched for the cameras of one."""
-    inside = [path for path in sorted(root.iterdir()) if path.is_dir() and path.name[0] != "."]
-    found = [path for path in inside if photos in (root, path) and _lists(path) and list_images(path)]
+def refuse_several(root: Path, besides: Path | None = None) -> None:
+    """Refuse a folder with captures in it, whose photographs would be searched for cameras as those of one scene.
+
+    They would be where the search takes subfolders, or where such a capture is of the photographs to be searched, as
+    `dense` of a COLMAP workspace. What is written to `besides` is none of them.
+    """
+    photos = photo_folder(root)
+    searched = {path.name for path in list_images(photos)}
+    found: list[Path] = []
+    for path in sorted(root.iterdir()):
+        written = besides is not None and path.resolve() == besides.resolve()
+        if written or path.name[0] == "." or not path.is_dir() or not _lists(path):
+            continue
+        own = {image.name for image in list_images(path)}
+        if own and (photos in (root, path) or own & searched):
+            found.append(path)
     if found:
         names = ", ".join(path.name for path in found[:_NAMED])
         what = f"captures in it have theirs ({names})" if len(found) > 1 else f"a capture in it has its own ({names})"
         raise CaptureError(
             f"{root}: has no cameras, but {what}; give one of these: pop train {quote(str(found[0]))}, or search all "
-            "photographs as those of one scene with --source photos"
+            "photographs as those of one scene with pop train --source photos"
         )
 
 
@@ -397,6 +409,8 @@ def _assemble(root: Path, listing: Listing, views: list[View], normalize: bool, 
                 transform = normalizing_transform(viewmats, cloud.xyz if cloud else None)
             moved = transform_viewmats(transform, viewmats)
             views = [replace(view, viewmat=viewmat) for view, viewmat in zip(views, moved, strict=True)]
+        else:
+            notes = notes + _about_origin(np.stack([view.camera_center for view in views]))
         if cloud:
             cloud = SparsePoints(transform_points(transform, cloud.xyz), cloud.rgb)
             source = f"{made_from}: {len(views)} views, {len(cloud)} points"
@@ -412,6 +426,16 @@ def _assemble(root: Path, listing: Listing, views: list[View], normalize: bool, 
     name = root.resolve().name
     found = (listing.sfm_seconds, listing.unplaced)
     return Capture(name, tuple(views), cloud.xyz, cloud.rgb, source, transform, tuple(notes), *found)
+
+
+def _about_origin(centers: np.ndarray) -> list[str]:
+    """Tell that cameras stand so far from the origin that float32, in which scenes are trained, blurs their places."""
+    farthest, apart = np.abs(centers).max(), np.linalg.norm(centers - np.median(centers, axis=0), axis=1).max()
+    step = float(np.spacing(np.float32(farthest)))
+    if step <= 1e-4 * apart:
+        return []
+    text = f"cameras stand {farthest:.2g} from the origin and {apart:.2g} from each other, where float32 has steps of"
+    return [f"{text} {step:.2g}: leave out --no-normalize, which keeps these coordinates"]
 
 
 _ROUNDS = 20
@@ -558,8 +582,6 @@ def _block_shot(entry: Any) -> PosedImage:
         params = [float(p) for p in lens["params"]]
         if not np.isfinite(params).all():
             raise ValueError(f"{where} has parameters that are not finite")
-        if lens["model"] in PINHOLES and len(params) != max(PINHOLES[lens["model"]][1]) + 1:
-            raise ValueError(f"{where} has {len(params)} parameters, which are not those of {lens['model']}")
         camera = make_camera(lens["id"], lens["model"], width, height, params)
     shot = PosedImage(entry["name"], entry["folder"], entry["file"], camera, _matrix(entry["viewmat"]))
     mask = None if entry["mask"] is None else Path(entry["mask"])

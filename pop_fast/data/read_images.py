@@ -28,6 +28,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from pop_fast.data.camera_models import known_model
 from pop_fast.data.cameras import make_camera
 from pop_fast.data.capture import PosedImage, Progress, View
 from pop_fast.errors import CaptureError
@@ -452,13 +453,12 @@ def undistortion(camera: Any, width: int, height: int) -> Undistortion:
     """Plan the undistortion of photographs stored at width x height px, whatever size the camera was calibrated at.
 
     Raises:
-        ValueError: a full-sphere camera, or no zoom between 0.5 and 4 keeps the new image inside the photograph. The
+        ValueError: a model that is refused, or no zoom between 0.5 and 4 keeps the new image inside the photograph. The
             message continues "camera <id> ...".
     """
-    if camera.model_name == "EQUIRECTANGULAR":
-        raise ValueError(
-            "is EQUIRECTANGULAR, a full sphere that no pinhole image can hold; cut it into perspective views"
-        )
+    known = known_model(camera.model_name)
+    if known is not None and known.refusal is not None:
+        raise ValueError(f"is {known.name}, {known.refusal}")
     resize = np.array([width / camera.width, height / camera.height])
     K = intrinsics(camera)
     K[:2] *= resize[:, None]

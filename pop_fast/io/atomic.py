@@ -221,6 +221,7 @@ def _beside(path: Path) -> Iterator[Path]:
     """Name a partial next to `path` for the block to make and rename; nothing of it is left, whatever happens."""
     with os_errors_name(path):
         _check_ordinary(path)
+        made = [parent for parent in path.absolute().parents if not parent.exists()]
         path.parent.mkdir(parents=True, exist_ok=True)
         _sweep(path)
         partial = _partial(path)
@@ -228,6 +229,10 @@ def _beside(path: Path) -> Iterator[Path]:
             yield partial
         finally:
             _remove(partial)
+            # what was written, or others write, is not empty and stays
+            with contextlib.suppress(OSError):
+                for parent in made:
+                    parent.rmdir()
         _sync_folder(path.parent)
 
 

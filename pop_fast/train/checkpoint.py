@@ -172,7 +172,7 @@ def check_fits(
         if is_of_another_version(name, ours, theirs):
             wrote, fix = (
                 f"is of a version with other settings than this one ({name})",
-                "resume with that, or train anew",
+                "resume with the version that wrote it, or train anew in another result folder",
             )
         raise PopError(f"{path}: {wrote}; {fix}")
     for name, ours in fingerprint.items():

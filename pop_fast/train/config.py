@@ -406,7 +406,12 @@ def first_difference(ours: dict[str, Any], theirs: dict[str, Any]) -> tuple[str,
 
 
 def is_of_another_version(name: str, ours: dict[str, Any], theirs: dict[str, Any]) -> bool:
-    """Tell whether only one of two `binding()`s can have a setting: another version of the package wrote the other."""
+    """Tell whether another version of the package wrote the other of two `binding()`s, by a setting that differs.
+
+    Only one of them can have it, or the other took the near plane of a profile in units of the training frame.
+    """
+    if name == "near_plane" and theirs.get(name) is None and theirs.get("profile") in NEAR_IN_CAPTURE_UNITS:
+        return True
     return name not in _USUAL and (name not in ours or name not in theirs)
 
 

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from pop_fast.data import Capture, load_capture
+from pop_fast.data.cameras import make_camera
 from pop_fast.errors import PopError
 
 WIDTH, HEIGHT = 40, 30
@@ -114,6 +115,8 @@ def write_model(
 
 
 def camera(model: str = "PINHOLE", params: Sequence[float] = PINHOLE, width: int = WIDTH, height: int = HEIGHT) -> Any:
+    if model not in pycolmap.CameraModelId.__members__:
+        return make_camera(0, model, width, height, list(params))
     return pycolmap.Camera(model=model, width=width, height=height, params=list(params))
 
 

@@ -158,7 +158,7 @@ def test_a_folder_appears_only_when_its_block_ends(tmp_path: Path) -> None:
 
 
 def test_a_failing_block_leaves_no_folder_and_a_full_disk_is_named(tmp_path: Path) -> None:
-    new = tmp_path / "new"
+    new = tmp_path / "of" / "parents" / "new"
 
     def half(error: Callable[[Path], Exception]) -> None:
         with folder_atomically(new) as folder:

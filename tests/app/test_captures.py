@@ -16,8 +16,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pop_fast.cli.data_check import look_over
+from pop_fast.cli.sfm import run as search
 from pop_fast.data import Capture, CaptureError, View, initialize_params, load_capture
-from pop_fast.data.cameras import PINHOLES, make_camera
+from pop_fast.data.camera_models import CAMERA_MODELS
+from pop_fast.data.cameras import make_camera
 from pop_fast.data.colmap import model_name, parameter_count, read_model
 from pop_fast.data.load import list_capture
 from pop_fast.data.read_images import find_masks, find_photographs
@@ -392,10 +394,10 @@ print([len(load_capture(folder).views) for folder in sys.argv[1:]])
 """
 
 
-@pytest.mark.parametrize("name", PINHOLES)
+@pytest.mark.parametrize("name", PARAMS)
 def test_a_pinhole_is_pycolmaps_pinhole(name):
     number = int(pycolmap.CameraModelId.__members__[name])
-    assert (PINHOLES[name][0], model_name(number)) == (number, name)
+    assert (CAMERA_MODELS[name].number, model_name(number)) == (number, name)
     ours = make_camera(7, name, 40, 22, PARAMS[name])
     theirs = pycolmap.Camera(camera_id=7, model=name, width=40, height=22, params=PARAMS[name])
     assert not isinstance(ours, pycolmap.Camera)
@@ -458,6 +460,32 @@ def test_a_folder_of_captures_names_them_and_the_command_unless_all_photographs_
     found = assert_one_line(lambda: load_capture(tmp_path), "captures in it have theirs (a walk, b)", "--source photos")
     assert f"pop train '{tmp_path / 'a walk'}'" in found
     assert_one_line(lambda: load_capture(tmp_path, source="photos"), "has 9 photographs but no cameras")
+    assert_one_line(lambda: search([str(tmp_path)]), "captures in it have theirs (a walk, b)")
+
+
+def test_cameras_of_the_photographs_in_a_folder_beside_them_are_named_before_they_are_searched(tmp_path: Path) -> None:
+    root = colmap_capture(tmp_path / "dense").parent
+    (root / "images").mkdir()
+    write_photograph(root / "images" / "other.png", photograph(0))
+    assert_one_line(lambda: load_capture(root), "1 photographs but no cameras")
+    write_photograph(root / "images" / "00.png", photograph(0))
+    assert_one_line(lambda: load_capture(root), "a capture in it has its own (dense)", f"pop train {root / 'dense'}")
+    # but for the place that the search is to write to
+    assert_one_line(lambda: search([str(root), "--out", str(root / "dense")]), "did not write")
+
+
+def test_a_world_too_far_from_its_origin_for_float32_is_told(tmp_path: Path) -> None:
+    root = transforms_capture(tmp_path)
+    assert raw(root).notes == ()
+    moved = np.array([5e5, 5.4e6, 300.0])
+    edit_transforms(root, lambda listing: [place(frame, moved) for frame in listing["frames"]])
+    assert "steps of 0.5: leave out --no-normalize" in raw(root).notes[-1]
+    assert load_capture(root).notes == ()
+
+
+def place(frame: dict[str, Any], moved: np.ndarray) -> None:
+    for row, more in zip(frame["transform_matrix"], moved, strict=False):
+        row[3] += more
 
 
 def test_points_that_no_camera_can_have_measured_are_left_out_and_told(tmp_path: Path) -> None:

@@ -335,6 +335,15 @@ def test_an_export_measures_as_its_run_moved_into_the_other_frame_and_back(
         shutil.copy("t.ply", "s.ply")
 
 
+def test_coordinates_of_a_map_that_a_file_cannot_hold_are_told_with_the_frame_that_it_can(pop: Pop, own: Path) -> None:
+    for place, told in ((5.4e6, True), (5.4, False)):
+        transform = np.diag([0.25, 0.25, 0.25, 1.0])
+        transform[0, 3] = -0.25 * place
+        save_ply("m.ply", load_ply(own), frame=Frame.of_training(transform))
+        said = pop.done("export", "m.ply", "--out", "u.ply", "--frame", "capture", "--overwrite").err
+        assert ("note: u.ply: the scene is 5.4e+06 from" in said and "steps of 0.5; --frame training" in said) == told
+
+
 def test_a_ply_that_says_nothing_is_taken_to_be_in_the_capture_s_frame_with_a_note(
     pop, export, psnr, shared_capture, trained
 ):

@@ -259,6 +259,15 @@ def test_any_number_of_a_camera_in_the_address_names_a_camera(asked: str, found:
     assert without_browser(page, doings, f"#camera={asked}") == expected
 
 
+def test_in_a_frame_the_wheel_scrolls_the_page_around_it_until_the_picture_is_clicked() -> None:
+    doings = "let focused = false; const taken = []; document.hasFocus = () => focused;"
+    doings += "for (const [parent, click] of [[{}, false], [{}, true], [window, false]]) { window.parent = parent;"
+    doings += "focused = click; let mine = 0; heard.wheel({ deltaY: 9, preventDefault() { mine += 1; } });"
+    doings += "taken.push(mine); } console.log(JSON.stringify(taken))"
+    page = page_of(many(5), [], TrainConfig(), 3, "x")
+    assert without_browser(page, doings) == [0, 1, 1]
+
+
 def test_that_the_graphics_card_is_lost_is_said_until_the_page_is_loaded_again() -> None:
     page = page_of(many(5), [], TrainConfig(), 3, "x")
     doings = "const before = elements.message.textContent; lost = true; heard.webglcontextlost(); drag(20);"

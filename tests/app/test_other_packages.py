@@ -1,4 +1,4 @@
-"""What other people write: a strategy, and a package with a backend, a method, a loss, a profile, a format and a row.
+"""What other people write: a strategy, and a package with one value of each registry and a row.
 
 The package changes no file of ours. The strategy follows gsplat's protocol and knows nothing of ours.
 """
@@ -32,6 +32,7 @@ from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.choose import choose_backend
 from pop_fast.train.presets import METHODS, Method
 from pop_ref.recipes import RECIPES
+from tests.app.captures import edit_transforms, transforms_capture
 from tests.app.conftest import ROOT, TRAIN
 from tests.app.tiny import assert_same_run, records, run_until, tiny_capture, tiny_config
 from tests.fast.test_rasterization import cameras, scene
@@ -44,6 +45,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pop_fast.data.camera_models import CameraModel
 from pop_fast.density import DensityControl
 from pop_fast.train.presets import Method
 from pop_ref.constants import GSPLAT_1_5
@@ -92,6 +94,8 @@ class Fading(DensityControl):
 PROFILE = replace(GSPLAT_1_5, name="mine", alpha_ceiling=0.9)
 METHOD = Method(Fading, replace(RECIPES["gsplat"], pixelwise="huber", profile=PROFILE), "Fading")
 ROW = Path(__file__).with_name("row.toml")
+BARREL = {("transforms", "BARREL"): {"k": "bend"}}
+LENS = CameraModel("mine", ("fx", "fy", "cx", "cy", "k"), None, lambda x, y, k: (x - k * x**3, y - k * y**3), BARREL)
 
 
 def __getattr__(name):
@@ -127,7 +131,7 @@ bytes_per_gaussian = 236
 description = "Prunes the faintest."
 [paper]
 """
-KINDS = {"backends": "BACKEND", "methods": "METHOD", "profiles": "PROFILE", "rows": "ROW"}
+KINDS = {"backends": "BACKEND", "methods": "METHOD", "profiles": "PROFILE", "rows": "ROW", "camera_models": "LENS"}
 ENTRIES = "".join(f"[pop_splatting.{kind}]\nmine = {NAME}:{value}\n" for kind, value in KINDS.items())
 ENTRIES += f"[pop_splatting.losses]\nhuber = {NAME}:LOSS\n[pop_splatting.formats]\nnumbers = {NAME}:FORMAT\n"
 
@@ -198,9 +202,18 @@ def test_it_trains_saves_resumes_and_exports(site: Path, shared_capture: Path, t
 def test_its_method_stands_in_a_table(site: Path, tmp_path: Path) -> None:
     places = ("--scale", "toy", "--results", tmp_path / "results")
     call(site, "paper_repro.cli", "run", "mine", "demo", *places, "--work", tmp_path / "work")
+    (result,) = (tmp_path / "results").rglob("*.jsonl")
+    assert '"huber":' in result.read_text()
     lines = call(site, "paper_repro.cli", "table", "beyond", *places).splitlines()
     (line,) = (line for line in lines if "Fading, by somebody else" in line and "not run" not in line)
     assert any(cell.strip().replace(".", "").isdigit() for cell in line.split("|"))
+
+
+def test_its_camera_model_is_read_from_transforms_json(site: Path, tmp_path: Path) -> None:
+    root = transforms_capture(tmp_path, camera_model="BARREL", bend=0.1)
+    assert "4 x mine 40x30" in call(site, "pop_fast.cli", "data", "check", root)
+    edit_transforms(root, lambda listing: listing.update(bend=200.0))
+    assert "(mine) has distortion" in call(site, "pop_fast.cli", "data", "check", root, status=1)
 
 
 def test_no_file_of_ours_names_it() -> None:

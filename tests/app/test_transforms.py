@@ -16,7 +16,7 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from pop_fast.data import Capture, load_capture
-from pop_fast.data.exports import read_metashape, read_transforms
+from pop_fast.data.exports import read_metashape, read_realitycapture, read_transforms
 from pop_fast.data.sfm import photographs
 from pop_fast.errors import CaptureError
 from tests.app.captures import (
@@ -122,6 +122,16 @@ def test_fields_of_a_frame_count_before_those_of_the_file(root: Path, own: dict[
         ({"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k4": 0.4}, "OPENCV_FISHEYE", [0.1, 0.0, 0.0, 0.4]),
         ({"is_fisheye": True, "k2": 0.1}, "OPENCV_FISHEYE", [0.0, 0.1, 0.0, 0.0]),
         ({"camera_model": "PINHOLE", "k1": 0.0, "p2": 0.0}, "PINHOLE", []),
+        ({"camera_model": "RADIAL", "k1": 0.1}, "OPENCV", [0.1, 0.0, 0.0, 0.0]),
+        # nerfstudio's k4 is the factor of r^8, OpenCV's is in a denominator
+        ({f"k{i}": i / 10 for i in range(1, 7)}, "FULL_OPENCV", [0.1, 0.2, 0.0, 0.0, 0.3, 0.4, 0.5, 0.6]),
+        ({"camera_model": "FULL_OPENCV", "k4": 0.4}, "FULL_OPENCV", [*[0.0] * 5, 0.4, 0.0, 0.0]),
+        ({"camera_model": "BROWN4", "k4": 0.4, "p1": 0.1}, "BROWN4", [0.0, 0.0, 0.0, 0.4, 0.1, 0.0]),
+        (
+            {"camera_model": "FISHEYE624", "distortion_params": [i / 100 for i in range(12)]},
+            "RAD_TAN_THIN_PRISM_FISHEYE",
+            [i / 100 for i in range(12)],
+        ),
     ],
 )
 def test_lenses_become_colmap_models(tmp_path: Path, fields: dict[str, Any], model: str, terms: list[float]) -> None:
@@ -440,7 +450,12 @@ BAD_FIELDS: dict[str, tuple[Edit, tuple[str, ...]]] = {
     "unknown lens": (frame(camera_model="PANINI"), ("frames[1]", "camera_model is 'PANINI'", "OPENCV")),
     "another lens": (frame(latlong=True), ("frames[1]", "latlong is no lens that is supported", "perspective views")),
     "full sphere": (frame(camera_model="EQUIRECTANGULAR"), ("frames[1]", "full sphere", "perspective views")),
-    "fourth radial term": (frame(k4=0.1), ("frames[1]", "k4 is 0.1")),
+    "fourth radial term": (frame(k4=0.1), ("frames[1]", "k4 is 0.1", "BROWN4", "FULL_OPENCV")),
+    "fifth radial term": (frame(camera_model="OPENCV_FISHEYE", k5=0.1), ("frames[1]", "k5 is 0.1", "has it", "OPENCV")),
+    "thin prism": (frame(s1=0.1), ("frames[1]", "s1 is 0.1", "undistort")),
+    "terms of another": (frame(distortion_params=[0.1]), ("distortion_params[0] is 0.1", "FISHEYE624")),
+    "terms a number": (frame(distortion_params=3), ("frames[1]", "distortion_params is 3", "list of up to 12")),
+    "terms by the dozen": (frame(distortion_params=[0] * 13), ("distortion_params is [0", "list of up to 12")),
     "terms of a pinhole": (frame(camera_model="PINHOLE", k1=0.1), ("frames[1]", "k1 is 0.1", "PINHOLE", "OPENCV")),
     "p2 of a fisheye": (frame(camera_model="OPENCV_FISHEYE", p2=0.1), ("frames[1]", "p2 is 0.1")),
     "focal length of 400 digits": (frame(fl_x=10**400), ("frames[1]", "fl_x is 1000", "finite")),
@@ -572,13 +587,16 @@ def test_points_in_the_folder_of_an_export_are_read(write: Callable[..., Path]) 
     assert len(raw(folder).points) == len(cloud()[0])
 
 
-def test_a_metashape_lens_is_opencvs_with_its_tangential_terms_exchanged(original: Capture, write: Callable) -> None:
-    lens = "<k1>-0.1</k1><k2>0.02</k2><k3>0.003</k3><p1>0.004</p1><p2>-0.005</p2>"
+@pytest.mark.parametrize("k4", [0.0, -0.2])
+def test_a_metashape_lens_is_browns_with_its_tangential_terms_exchanged(
+    k4: float, original: Capture, write: Callable
+) -> None:
+    lens = f"<k1>-0.1</k1><k2>0.02</k2><k3>0.003</k3><k4>{k4}</k4><p1>0.004</p1><p2>-0.005</p2>"
     folder = write("metashape", lens=lens)
     camera = read_metashape(folder / "cameras.xml", folder, "images")[0][0].camera
     x, y = 0.25, -0.125
     r2 = x * x + y * y
-    radial = 1.0 - 0.1 * r2 + 0.02 * r2**2 + 0.003 * r2**3
+    radial = 1.0 - 0.1 * r2 + 0.02 * r2**2 + 0.003 * r2**3 + k4 * r2**4
     # Metashape's manual, appendix D, frame cameras
     xd = x * radial + 0.004 * (r2 + 2 * x * x) + 2 * -0.005 * x * y
     yd = y * radial + -0.005 * (r2 + 2 * y * y) + 2 * 0.004 * x * y
@@ -587,14 +605,27 @@ def test_a_metashape_lens_is_opencvs_with_its_tangential_terms_exchanged(origina
     np.testing.assert_allclose(camera.img_from_cam(np.array([[x, y, 1.0]]))[0], expected, rtol=0.0, atol=1e-9)
 
 
-def test_a_metashape_fisheye_is_opencvs(original: Capture, write: Callable[..., Path]) -> None:
-    folder = write("metashape", lens="<k1>0.1</k1><k4>0.01</k4>", kind="fisheye")
+@pytest.mark.parametrize("p1", [0.0, 0.03])
+def test_a_metashape_fisheye_is_opencvs_or_has_tangential_terms(
+    p1: float, original: Capture, write: Callable[..., Path]
+) -> None:
+    folder = write("metashape", lens=f"<k1>0.1</k1><k4>0.01</k4><p1>{p1}</p1>", kind="fisheye")
     camera = read_metashape(folder / "cameras.xml", folder, "images")[0][0].camera
+    assert camera.model_name == ("THIN_PRISM_FISHEYE" if p1 else "OPENCV_FISHEYE")
     angle = 0.5
-    distorted = angle * (1.0 + 0.1 * angle**2 + 0.01 * angle**8)
+    distorted = angle * (1.0 + 0.1 * angle**2 + 0.01 * angle**8) + 3.0 * p1 * angle**2
     K = original.views[0].K
     seen = camera.img_from_cam(np.array([[np.tan(angle), 0.0, 1.0]]))[0]
     np.testing.assert_allclose(seen, [K[0, 0] * distorted + K[0, 2], K[1, 2]], rtol=0.0, atol=1e-9)
+
+
+def test_realitycaptures_fourth_radial_term_is_browns(original: Capture, write: Callable) -> None:
+    folder = write("realitycapture")
+    lines = (folder / "cameras.csv").read_text().splitlines()
+    rows = [f"{line.rsplit(',', 6)[0]},1,2,3,4,5,6" for line in lines[1:]]
+    (folder / "cameras.csv").write_text("\n".join([lines[0], *rows]))
+    camera = read_realitycapture(folder / "cameras.csv", folder, "")[0][0].camera
+    assert (camera.model_name, camera.params[4:].tolist()) == ("BROWN4", [1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
 
 
 # what is put in the place of what, and what is said of it
@@ -609,7 +640,7 @@ DAMAGED = {
     "metashape: sensor": ("metashape", '<sensor id="3"', '<sensor id="4"', r"camera view_000\.png: sensor_id names no"),
     "metashape: focal": ("metashape", r"<f>[0-9.]*</f><b1>", "<f>x</f><b1>", r"sensor 3: calibration: f is 'x'"),
     "metashape: skew": ("metashape", "<b1>", "<b2>3</b2><b1>", r"sensor 3: calibration: b2 is 3, a skew"),
-    "metashape: k4": ("metashape", "<b1>", "<k4>3</k4><b1>", r"sensor 3: calibration has k4 = 3.*undistort"),
+    "metashape: p3": ("metashape", "<b1>", "<p3>3</p3><b1>", r"calibration: p3 is 3, but the type 'frame'.*undistort"),
     "metashape: kind": ("metashape", '"frame" class="adj', '"spherical" class="adj', r"the type 'spherical'"),
     "metashape: pose": ("metashape", r"<transform>[-0-9.e]+ ", "<transform>", r"view_000\.png: transform is .*16 fin"),
     "metashape: scale": ("metashape", "<scale>2.5", "<scale>-1", r"component 0: transform/scale is -1\.0; it must"),

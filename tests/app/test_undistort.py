@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+import pycolmap
 import pytest
 import torch
 from hypothesis import given
@@ -14,6 +16,7 @@ from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
 
 from pop_fast.data import apply_similarity, load_capture, to_capture_frame
+from pop_fast.data.camera_models import CAMERA_MODELS
 from pop_fast.data.capture import normalizing_transform, transform_points, transform_viewmats
 from pop_fast.data.gaussians import rotate_sh
 from pop_fast.data.read_images import intrinsics, undistortion
@@ -33,6 +36,7 @@ PINHOLE_TERMS = {
     "SIMPLE_DIVISION": (50.0, 33.0, 22.5, 0.0),
     "DIVISION": (50.0, 52.0, 33.0, 22.5, 0.0),
     "EUCM": (50.0, 52.0, 33.0, 22.5, 0.0, 1.0),
+    "BROWN4": (50.0, 52.0, 33.0, 22.5, *[0.0] * 6),
 }
 DISTORTED = {
     "SIMPLE_RADIAL": (50.0, 33.0, 22.5, 0.08),
@@ -50,6 +54,7 @@ DISTORTED = {
     "SIMPLE_DIVISION": (50.0, 33.0, 22.5, -0.1),
     "DIVISION": (50.0, 52.0, 33.0, 22.5, -0.1),
     "EUCM": (50.0, 52.0, 33.0, 22.5, 0.5, 1.1),
+    "BROWN4": (50.0, 52.0, 33.0, 22.5, 0.10, -0.05, 0.01, -0.02, 0.004, -0.003),
 }
 
 
@@ -70,6 +75,44 @@ def test_no_distortion_leaves_the_photograph_and_the_intrinsics_as_they_are(mode
 
 def test_a_fisheye_without_coefficients_is_still_a_fisheye() -> None:
     assert undistortion(lens("OPENCV_FISHEYE", (50.0, 52.0, 33.0, 22.5, 0.0, 0.0, 0.0, 0.0)), W, H).maps is not None
+
+
+def test_the_table_of_models_has_colmaps_numbers_and_parameters_and_each_field_names_a_term() -> None:
+    for name, model in CAMERA_MODELS.items():
+        if model.number is not None:
+            kind = pycolmap.CameraModelId.__members__[name]
+            theirs = pycolmap.Camera.create_from_model_id(1, kind, 1.0, 1, 1)
+            assert (model.number, ",".join(model.params)) == (int(kind), theirs.params_info.replace(" ", ""))
+        assert all(set(fields) <= set(model.terms) for fields in model.fields.values())
+        # readers give the focal lengths and the principal point first
+        assert not any(model.fields.values()) or model.params[:4] == ("fx", "fy", "cx", "cy")
+
+
+def test_browns_polynomial_is_opencvs_without_k4_which_is_the_factor_of_the_eighth_power() -> None:
+    *pinhole, k1, k2, k3, k4, p1, p2 = DISTORTED["BROWN4"]
+    points = np.random.default_rng(0).uniform([-0.6, -0.6, 0.5], [0.6, 0.6, 1.5], (50, 3))
+    found = [lens("BROWN4", (*pinhole, k1, k2, k3, k, p1, p2)).img_from_cam(points) for k in (0.0, k4)]
+    K = np.array([[pinhole[0], 0.0, pinhole[2]], [0.0, pinhole[1], pinhole[3]], [0.0, 0.0, 1.0]])
+    expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, np.array([k1, k2, p1, p2, k3]))[0][:, 0]
+    np.testing.assert_allclose(found[0], expected, rtol=0.0, atol=1e-9)
+    xy = points[:, :2] / points[:, 2:]
+    far = k4 * (xy**2).sum(axis=1, keepdims=True) ** 4 * xy * pinhole[:2]
+    np.testing.assert_allclose(found[1] - found[0], far, rtol=0.0, atol=1e-9)
+
+
+def test_the_model_of_arias_glasses_is_colmaps() -> None:
+    k, p0, p1 = np.array([0.02, -0.01, 0.03, 0.01, -0.02, 0.01]), 0.01, 0.02
+    s0, s1, s2, s3 = 0.03, 0.01, 0.02, 0.04
+    a, b = 0.5, -0.25
+    # Project Aria's documentation, camera intrinsic models: FisheyeRadTanThinPrism
+    r = np.hypot(a, b)
+    x, y = np.arctan(r) * (1.0 + k @ np.arctan(r) ** np.arange(2, 14, 2)) * np.array([a, b]) / r
+    r2 = x * x + y * y
+    u = x + p0 * (2 * x * x + r2) + 2 * p1 * x * y + s0 * r2 + s1 * r2 * r2
+    v = y + p1 * (2 * y * y + r2) + 2 * p0 * x * y + s2 * r2 + s3 * r2 * r2
+    one = lens("RAD_TAN_THIN_PRISM_FISHEYE", (50.0, 52.0, 33.0, 22.5, *k, p0, p1, s0, s1, s2, s3))
+    found = one.img_from_cam(np.array([[a, b, 1.0]]))[0]
+    np.testing.assert_allclose(found, [50.0 * u + 33.0, 52.0 * v + 22.5], rtol=0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("shrunk", [1, 2])
@@ -226,6 +269,15 @@ def test_the_units_of_a_capture_do_not_matter(exponent: int) -> None:
     seen = [(viewmats, points), (transform_viewmats(scaled, viewmats), transform_points(scaled, points))]
     one, other = (transform_points(normalizing_transform(v, p), p) for v, p in seen)
     assert np.allclose(one, other, atol=1e-10)
+
+
+def test_a_capture_in_coordinates_of_a_map_is_normalised_as_near_its_origin() -> None:
+    viewmats, (points, _) = ring(8), cloud(200)
+    there = similarity(np.zeros(3), np.array([5e5, 5.4e6, 300.0]), 1.0)
+    far = normalizing_transform(transform_viewmats(there, viewmats), transform_points(there, points)) @ there
+    near = normalizing_transform(viewmats, points)
+    assert scale_of(far) == pytest.approx(scale_of(near), rel=0.1)
+    assert np.allclose(transform_points(far, points), transform_points(near, points), atol=0.1)
 
 
 def test_cameras_whose_up_is_plus_y_are_turned_half_round_without_a_mirror() -> None:

@@ -37,6 +37,7 @@ def test_help_names_every_command_and_is_the_answer_to_nothing(capsys):
     assert all(f"  {command} " in text for command in COMMANDS)
     assert call(capsys=capsys) == call("help", capsys=capsys) == text
     assert call("help", "run", capsys=capsys).startswith("usage: pop-repro run ")
+    assert call("--version", capsys=capsys).startswith("pop-repro 0.")
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, ""])

@@ -315,6 +315,8 @@
     else orbit(dx * 0.005, dy * 0.005);
   });
   canvas.addEventListener("wheel", (event) => {
+    // in the frame of a report the wheel is the report's until the picture is clicked
+    if (window.parent !== window && !document.hasFocus()) return;
     event.preventDefault();
     zoom(Math.exp(Math.sign(event.deltaY) * Math.min(Math.abs(event.deltaY), 100) * 0.0015));
   }, { passive: false });

@@ -253,8 +253,8 @@ def viewer_section(page: str | None) -> str:
     """Show the page that shows the splat, in a frame of its own; nothing where there is none."""
     if page is None:
         return ""
-    about = "Drag, pinch or use the arrows; it starts at a training camera. The same page is next to this report as "
-    about += '<a href="viewer.html">viewer.html</a>.'
+    about = "Drag, pinch, or click it and use the wheel or the arrows; it starts at a training camera. "
+    about += 'The same page is next to this report as <a href="viewer.html">viewer.html</a>.'
     if not is_framed(page):
         return f'<h2>The splat</h2><p>{len(page) / 1e6:.0f} MB, in <a href="viewer.html">viewer.html</a>.</p>'
     return (
