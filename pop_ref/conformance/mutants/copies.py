@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import importlib.abc
 import importlib.util
-import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -13,10 +12,11 @@ from dataclasses import dataclass
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import CodeType, ModuleType
-from typing import Any, Final
+from typing import Any
 
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.backends import program
+from pop_ref.conformance.changes import sides
 
 ORACLE, PROGRAM = "pop_ref", "pop_fast"
 
@@ -63,19 +63,12 @@ class Mutant:
 # by file: of every mutant its name, its story, the line with each change in it as «before→after», and the law that
 # kills it
 Lines = Mapping[str, tuple[tuple[str, str, str, str], ...]]
-_CHANGE: Final = re.compile("«([^→]*)→([^»]*)»")
 
 
 def mutants_of(lines: Lines, package: str = ORACLE) -> tuple[Mutant, ...]:
-    """Return the mutants of a table.
-
-    Example:
-        >>> (mutant,) = mutants_of({"ssim.py": (("covariance_with_c1", "", "s_xy + «C2→C1»", ""),)})
-        >>> mutant.old, mutant.new
-        ('s_xy + C2', 's_xy + C1')
-    """
+    """Return the mutants of a table."""
     return tuple(
-        Mutant(name, story, file, _CHANGE.sub(r"\1", line), _CHANGE.sub(r"\2", line), law, package)
+        Mutant(name, story, file, *sides(line), law, package)
         for file, every in lines.items()
         for name, story, line, law in every
     )
