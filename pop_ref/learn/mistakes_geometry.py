@@ -7,11 +7,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from pop_ref.learn.probes import Oracle
-from pop_ref.learn.splat import rotmats_from_quats
-
-# of one function, by what is wrong: where to look, and what each such mistake computes
-Known = dict[str, tuple[str, *tuple[Callable[..., Any], ...]]]
+# of one function, by what is wrong: where to look, and each such mistake, as a change in the oracle's source or as what
+# it computes of the oracle's functions by name and the arguments
+Known = dict[str, tuple[str, *tuple[str | Callable[..., Any], ...]]]
 
 
 def with_turned_rotation(viewmat: np.ndarray) -> np.ndarray:
@@ -21,129 +19,16 @@ def with_turned_rotation(viewmat: np.ndarray) -> np.ndarray:
     return turned
 
 
-def _without_length_back(o: Oracle, quats: Any, v_rotmats: Any) -> Any:
-    """Make `rotmats_from_quats_vjp` up to the unit quaternion; R is quadratic, so central differences are exact."""
-    units = quats / np.linalg.norm(quats, axis=1, keepdims=True)
-    slopes = [0.5 * (rotmats_from_quats(units + e) - rotmats_from_quats(units - e)) for e in np.eye(4)]
-    return np.stack([np.sum(v_rotmats * slope, axis=(1, 2)) for slope in slopes], axis=1)
-
-
-def _positive_first_harmonics(o: Oracle, dirs: Any, degree: int) -> Any:
-    signs = np.ones((degree + 1) ** 2)
-    signs[1:4:2] = -1.0
-    return signs * o["sh_basis"](dirs, degree)
-
-
-def _colors(half: float, unit: bool) -> Callable[..., Any]:
-    """Make `colors_from_sh` without the half, or with directions as they are given."""
-
-    def made(o: Oracle, sh: Any, dirs: Any, degree: int) -> Any:
-        basis = o["sh_basis"](dirs / np.linalg.norm(dirs, axis=1, keepdims=True) if unit else dirs, degree)
-        sums = [row @ each[: basis.shape[1]] for row, each in zip(basis, sh, strict=True)]
-        return np.maximum(np.array(sums) + half, 0.0)
-
-    return made
-
-
-def _without_z_of_the_diagonal(
-    o: Oracle, means_cam: Any, K: Any, width: int, height: int, v: Any, *profile: Any
-) -> Any:
-    """Make `projection_jacobians_vjp` that forgets that fx / z and fy / z depend on z."""
-    back = o["projection_jacobians_vjp"](means_cam, K, width, height, v, *profile).copy()
-    back[:, 2] += (K[0, 0] * v[:, 0, 0] + K[1, 1] * v[:, 1, 1]) / means_cam[:, 2] ** 2
-    return back
-
-
 _TRANSPOSED: Final = (
     "It turns the world into the Gaussian's own frame, and what is wanted turns the Gaussian's axes into the world."
 )
 
 
-def _along_q(o: Oracle, quats: Any, v: Any) -> Any:
-    """Make `unit_quats_from_quats_vjp` that takes the part along u out as a multiple of q."""
-    length = np.linalg.norm(quats, axis=1, keepdims=True)
-    return (v - quats * np.sum(quats / length * v, axis=1, keepdims=True)) / length
-
-
-def _covars_back(widths: bool = True, turned: bool = True) -> Callable[..., Any]:
-    """Make `covars_from_quats_scales_vjp` without the widths in the cotangent of R, or without R in that of s."""
-
-    def made(o: Oracle, quats: Any, scales: Any, v_covars: Any) -> Any:
-        R = o["rotmats_from_quats"](quats)
-        v_M = (v_covars + np.swapaxes(v_covars, 1, 2)) @ (R * scales[:, None, :])
-        v_R = v_M * scales[:, None, :] if widths else v_M
-        v_s = np.sum(R * v_M, axis=1) if turned else np.sum(v_M, axis=1)
-        return o["rotmats_from_quats_vjp"](quats, v_R), v_s
-
-    return made
-
-
-def _colors_back(divided: bool) -> Callable[..., Any]:
-    """Make `colors_from_sh_vjp` that keeps the part along the direction, divided by the length or not."""
-
-    def made(o: Oracle, sh: Any, dirs: Any, degree: int, v_colors: Any) -> Any:
-        length = np.linalg.norm(dirs, axis=1, keepdims=True)
-        n = (degree + 1) ** 2
-        lit = o["colors_from_sh"](sh, dirs, degree) > 0.0
-        v_basis = np.einsum("nkc,nc->nk", sh[:, :n], np.where(lit, v_colors, 0.0))
-        v_units = o["sh_basis_vjp"](dirs / length, degree, v_basis)
-        return o["colors_from_sh_vjp"](sh, dirs, degree, v_colors)[0], v_units / length if divided else v_units
-
-    return made
-
-
-def _first_degree(x: float, y: float, z: float) -> Callable[..., Any]:
-    """Make `sh_basis` whose harmonics of degree 1 stand in the order x, y, z, with these signs."""
-
-    def made(o: Oracle, dirs: Any, degree: int) -> Any:
-        basis = o["sh_basis"](dirs, degree)
-        if degree > 0:
-            basis[:, 1:4] = np.sqrt(3.0 / (4.0 * np.pi)) * np.array([x, y, z]) * dirs
-        return basis
-
-    return made
-
-
-def _point_over_z(o: Oracle, means_cam: Any, K: Any, *given: Any) -> Any:
-    """Make `project_means` that divides the principal point by z, too."""
-    focal = np.array([K[0, 0], K[1, 1]])
-    return (means_cam[:, :2] * focal + K[:2, 2]) / means_cam[:, 2:]
-
-
-def _once_by_z(o: Oracle, means_cam: Any, K: Any, width: int, height: int, v: Any, *profile: Any) -> Any:
-    """Make `projection_jacobians_vjp` that divides an offset by z once where it should by z^2."""
-    back = o["projection_jacobians_vjp"](means_cam, K, width, height, v, *profile).copy()
-    z = means_cam[:, 2]
-    entries = o["projection_jacobians"](means_cam, K, width, height, *profile)
-    for axis in (0, 1):
-        free = K[axis, axis] * means_cam[:, axis] / z**2
-        inside = np.isclose(entries[:, axis, 2], -free, rtol=1e-12, atol=0.0)
-        back[:, 2] -= np.where(inside, free / z, 0.0) * v[:, axis, 2]
-    return back
-
-
-def _turned_back(name: str) -> Callable[..., Any]:
-    """Make a camera's vjp whose first result has R where R^T is asked for, or the reverse."""
-
-    def made(o: Oracle, values: Any, viewmat: Any, v: Any) -> Any:
-        (wrong, *_), (_, *right) = (o[name](values, each, v) for each in (with_turned_rotation(viewmat), viewmat))
-        return wrong, *right
-
-    return made
-
-
-def _two_of_one(o: Oracle, quats: Any, v_rotmats: Any, *, half: int) -> Any:
-    """Make `rotmats_from_quats_vjp` with one number of the unit quaternion's cotangent halved."""
-    v_units = _without_length_back(o, quats, v_rotmats)
-    v_units[:, half] *= 0.5
-    return o["unit_quats_from_quats_vjp"](quats, v_units)
-
-
-def _rotation_left(name: str, formula: str) -> Known:
+def _rotation_left(formula: str, change: str) -> Known:
     return {
         "R stands where R^T is asked for: what the camera turned is turned back.": (
             f"The way forward turns by R, the way back by its transpose: {formula}.",
-            _turned_back(f"{name}_vjp"),
+            change,
         )
     }
 
@@ -214,21 +99,19 @@ GEOMETRY: Final[dict[str, Known]] = {
     "unit_quats_from_quats_vjp": {
         "The part along q is still in it: a longer q is the same rotation, so the loss does not ask for it.": (
             "Take u (u . v) from v before you divide by the length.",
-            lambda o, quats, v: v / np.linalg.norm(quats, axis=1, keepdims=True),
+            "(v_u« - u * (u @ v_u)→»)",
         ),
         "The division by the length is missing: twice as long a q turns half as fast.": (
             "v_q = (v - u (u . v)) / |q|.",
-            lambda o, quats, v: o["unit_quats_from_quats_vjp"](quats, v) * np.linalg.norm(quats, axis=1, keepdims=True),
+            "(v_u - u * (u @ v_u))« / math.hypot(*quats[i].tolist())→»",
         ),
         "The part along q is taken out with q itself, whose length is not 1; it must be taken out with u = q / |q|.": (
             "v_q = (v - u (u . v)) / |q|: both u have length 1.",
-            _along_q,
+            "v_u - «u→quats[i]» * (u @ v_u)",
         ),
         "The part along q is added where it must be taken away.": (
             "v_q = (v - u (u . v)) / |q|, with a minus.",
-            lambda o, quats, v: (
-                2.0 * v / np.linalg.norm(quats, axis=1, keepdims=True) - o["unit_quats_from_quats_vjp"](quats, v)
-            ),
+            "v_u «-→+» u * (u @ v_u)",
         ),
     },
     "rotmats_from_quats": {
@@ -244,20 +127,20 @@ GEOMETRY: Final[dict[str, Known]] = {
         "Your quaternion is used as it is given; it must be divided by its length first, since only then is it a"
         " rotation.": (
             "Training moves its four numbers freely, so that its length is anything; unit_quats_from_quats divides.",
-            lambda o, quats: rotmats_from_quats(quats),
+            "enumerate(«unit_quats_from_quats(quats)→quats».tolist())",
         ),
     },
     "rotmats_from_quats_vjp": {
         "The division by the length is not walked back: yours is the cotangent of the unit quaternion, not of q.": (
             "End with unit_quats_from_quats_vjp(quats, v_units).",
-            _without_length_back,
+            "return «unit_quats_from_quats_vjp(quats, v_units)→v_units»",
         ),
         **{
             f"A two is missing from the cotangent of {letter} of the unit quaternion; the other three have it.": (
                 "Every entry of R has a two before its products, as in 2 (x y - w z).",
-                lambda o, quats, v, k=k: _two_of_one(o, quats, v, half=k),
+                f"«2.0 * →»({row}",
             )
-            for k, letter in enumerate("wxyz")
+            for letter, row in zip("wxyz", ("x * (v21", "w * (v21", "w * (v02", "w * (v10"), strict=True)
         },
         "The cotangent is read with its rows and columns exchanged.": (
             "v_rotmats[i, j, k] belongs to row j and column k of the i-th matrix.",
@@ -286,17 +169,17 @@ GEOMETRY: Final[dict[str, Known]] = {
     "covars_from_quats_scales_vjp": {
         "The widths are missing from the cotangent of R: a column of M is a column of R times its width.": (
             "M_ij = R_ij s_j, so v_R_ij = v_M_ij s_j, and then rotmats_from_quats_vjp.",
-            _covars_back(widths=False),
+            "v_rotmats[i] = v_M« * s→»",
         ),
         "R is missing from the cotangent of the widths: a width multiplies a column of R.": (
             "M_ij = R_ij s_j, so v_s_j is the sum over i of R_ij v_M_ij.",
-            _covars_back(turned=False),
+            "np.sum(«R * →»v_M, axis=0)",
         ),
     },
     "sh_basis": {
         "Two of your harmonics of degree 1 have the wrong sign: they are (-y, z, -x) times a constant.": (
             "The signs are a convention, and every file of splats follows it.",
-            _positive_first_harmonics,
+            "[:n_sh]«→\n        basis[i, 1:4:2] *= -1.0»",
         ),
         "Your direction runs from the Gaussian to the camera; it is asked for from the camera to the Gaussian.": (
             "Use (x, y, z) as they are given: the harmonics of degree 1 are (-y, z, -x) times a constant.",
@@ -304,7 +187,10 @@ GEOMETRY: Final[dict[str, Known]] = {
         ),
         "Your harmonics of degree 1 stand in the order x, y, z; they are (-y, z, -x) times a constant.": (
             "The order is a convention as well as the signs, and every file of splats follows it.",
-            *(_first_degree(*signs) for signs in ((1.0, 1.0, 1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, -1.0))),
+            *(
+                f"[:n_sh]«→\n        basis[i, 1:4] = _C1 * np.array([{signs}])[: n_sh - 1]»"
+                for signs in ("x, y, z", "-x, y, -z", "-x, -y, -z")
+            ),
         ),
         "y and z are exchanged in the basis.": (
             "The three functions of degree 1 are those of -y, z and -x, in this order.",
@@ -320,18 +206,19 @@ GEOMETRY: Final[dict[str, Known]] = {
     "colors_from_sh": {
         "The half is missing: a Gaussian whose coefficients are 0 is grey, not black.": (
             "c = max(sum_k Y_k h_k + 0.5, 0).",
-            _colors(half=0.0, unit=True),
+            "sh[i, :n_sh]« + 0.5→»",
         ),
         "Your direction is used as it is given; the harmonics ask for one of length 1.": (
             "Divide each direction by its length before sh_basis.",
-            _colors(half=0.5, unit=False),
+            "sh_basis(«_unit(dirs)→dirs», degree)",
         ),
     },
     "colors_from_sh_vjp": {
         "The division of the direction by its length is not walked back: a longer direction has the same"
         " colour, so that nothing may be left along it.": (
             "v_d = (v_u - u (u . v_u)) / |d|, as for the quaternion of chapter 1b.",
-            *map(_colors_back, (True, False)),
+            "(v_u« - u * (u @ v_u)→»)",
+            "v_dirs[i] = «(v_u - u * (u @ v_u)) / math.hypot(*dirs[i].tolist())→v_u»",
         ),
     },
     "camera_center": {
@@ -376,7 +263,7 @@ GEOMETRY: Final[dict[str, Known]] = {
             lambda o, means, viewmat: o["means_cam_from_means"](means, viewmat) - 2.0 * viewmat[:3, 3],
         ),
     },
-    "means_cam_from_means_vjp": _rotation_left("means_cam_from_means", "v_mean = R^T v_p, in rows v_p @ R"),
+    "means_cam_from_means_vjp": _rotation_left("v_mean = R^T v_p, in rows v_p @ R", "R«.T→» @ v_means_cam[i]"),
     "covars_cam_from_covars": {
         "Your camera's rotation is transposed.": (
             "A linear map A turns a covariance S into A S A^T; here A is R = viewmat[:3, :3].",
@@ -391,19 +278,15 @@ GEOMETRY: Final[dict[str, Known]] = {
             lambda o, covars, viewmat: viewmat[:3, :3] @ covars @ viewmat[:3, :3],
         ),
     },
-    "covars_cam_from_covars_vjp": _rotation_left("covars_cam_from_covars", "v_Sigma = R^T V R"),
+    "covars_cam_from_covars_vjp": _rotation_left("v_Sigma = R^T V R", "R«.T→» @ V @ R«→.T»"),
     "project_means": {
         "The principal point is missing: you measure from the optical axis, pixels are counted from the corner.": (
             "Add (cx, cy) = (K[0, 2], K[1, 2]).",
-            lambda o, means_cam, K, width, height, *profile: (
-                o["project_means"](means_cam, K, width, height, *profile) - K[:2, 2]
-            ),
+            "x / z« + cx→», fy * y / z« + cy→»",
         ),
         "You take the picture's middle for the principal point, which need not lie there.": (
             "Add (cx, cy) = (K[0, 2], K[1, 2]).",
-            lambda o, means_cam, K, width, height, *profile: (
-                o["project_means"](means_cam, K, width, height, *profile) - K[:2, 2] + np.array([width, height]) / 2.0
-            ),
+            "«_intrinsics(K, width, height, profile)→K[0, 0], K[1, 1], width / 2.0, height / 2.0»",
         ),
         "The numbers of K for x and for y are exchanged: x goes with fx and cx, y with fy and cy.": (
             "fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2].",
@@ -411,17 +294,15 @@ GEOMETRY: Final[dict[str, Known]] = {
         ),
         "The principal point is divided by z: a point is first divided by its depth and then moved by (cx, cy).": (
             "u = fx x / z + cx.",
-            _point_over_z,
+            "+ cx«→ / z», fy * y / z + cy«→ / z»",
         ),
         "The focal lengths are exchanged: fx is K[0, 0] and goes with x, fy is K[1, 1] and goes with y.": (
             "u = (fx x / z + cx, fy y / z + cy).",
-            lambda o, means_cam, K, *given: (
-                means_cam[:, :2] / means_cam[:, 2:] * np.array([K[1, 1], K[0, 0]]) + K[:2, 2]
-            ),
+            "«fx→fy» * x / z + cx, «fy→fx» * y / z",
         ),
         "You do not divide by the depth: what is twice as far is half as large.": (
             "u = fx x / z + cx and v = fy y / z + cy.",
-            lambda o, means_cam, K, *given: means_cam[:, :2] * np.diag(K)[:2] + K[:2, 2],
+            "x« / z→» + cx, fy * y« / z→» + cy",
         ),
     },
     "project_means_vjp": {
@@ -431,27 +312,23 @@ GEOMETRY: Final[dict[str, Known]] = {
         ),
         "The depth is missing under fx and fy: u changes by fx / z where x changes by 1.": (
             "v_x = fx / z v_u and v_y = fy / z v_v.",
-            lambda o, means_cam, *given: (
-                o["project_means_vjp"](means_cam, *given) * np.where(np.arange(3) < 2, means_cam[:, 2:], 1.0)
-            ),
+            "fx« / z→» * v_x, fy« / z→» * v_y,",
         ),
     },
     "projection_jacobians": {
         "The column of z lacks one division by the depth: the slope of 1 / z is -1 / z^2.": (
             "The entries of z are -fx tx / z^2 and -fy ty / z^2.",
-            lambda o, means_cam, *given: (
-                o["projection_jacobians"](means_cam, *given) * np.where(np.arange(3) < 2, 1.0, means_cam[:, None, 2:])
-            ),
+            "-fx * tx / «(z * z)→z»], [0.0, fy / z, -fy * ty / «(z * z)→z»]",
         ),
     },
     "projection_jacobians_vjp": {
         "Two terms of z are missing: fx / z and fy / z on the Jacobian's diagonal depend on z, too.": (
             "Add -(fx v_xx + fy v_yy) / z^2 to the cotangent of z.",
-            _without_z_of_the_diagonal,
+            "v_z_x + v_z_y« - (fx * v_xx + fy * v_yy) / (z * z)→»",
         ),
         "A two is missing from the cotangent of z: fx x / z^2 has z under it twice.": (
             "The derivative of -fx x / z^2 by z is 2 fx x / z^3 where x/z is not clamped.",
-            _once_by_z,
+            "v_z_x«→ / (2.0 if v_x else 1.0)» + v_z_y«→ / (2.0 if v_y else 1.0)»",
         ),
     },
     "project_covars": {

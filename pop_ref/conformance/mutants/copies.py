@@ -16,6 +16,7 @@ from typing import Any
 
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.backends import program
+from pop_ref.conformance.changes import sides
 
 ORACLE, PROGRAM = "pop_ref", "pop_fast"
 
@@ -59,14 +60,18 @@ class Mutant:
         return text.replace(self.old, self.new)
 
 
-# by file: of every mutant its name, its story, the line before and after, and the law that kills it
-Lines = Mapping[str, tuple[tuple[str, str, str, str, str], ...]]
+# by file: of every mutant its name, its story, the line with each change in it as «before→after», and the law that
+# kills it
+Lines = Mapping[str, tuple[tuple[str, str, str, str], ...]]
 
 
 def mutants_of(lines: Lines, package: str = ORACLE) -> tuple[Mutant, ...]:
     """Return the mutants of a table."""
-    of = ((file, line) for file, every in lines.items() for line in every)
-    return tuple(Mutant(name, story, file, old, new, law, package) for file, (name, story, old, new, law) in of)
+    return tuple(
+        Mutant(name, story, file, *sides(line), law, package)
+        for file, every in lines.items()
+        for name, story, line, law in every
+    )
 
 
 @functools.cache
