@@ -41,7 +41,7 @@ from pop_fast.stages.tiles import tile_lists
 from pop_fast.train import TrainConfig, choose
 from tests.app.captures import edit_transforms, photograph, transforms_capture, write_photograph
 from tests.app.conftest import ROOT, TRAIN, Outcome, Pop, in_a_child
-from tests.app.damage import says
+from tests.app.damage import contents, says
 from tests.app.tiny import interrupt
 
 
@@ -233,6 +233,15 @@ def test_eval_of_a_result_updates_its_stats_and_report(pop: Pop, result: Path) -
     after = json.loads((result / STATS).read_text())
     assert (after["psnr"], after["seconds"]) == (before["psnr"], before["seconds"])
     assert (result / "report.html").is_file()
+
+
+def test_eval_measures_a_result_that_may_not_be_written_to(pop: Pop, result: Path, monkeypatch) -> None:
+    before = contents(result)
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "stats")
+    outcome = pop.done("eval", result)
+    assert "PSNR" in outcome.out
+    assert f"note: {result / 'stats'} may not be written to" in outcome.err
+    assert contents(result) == before
 
 
 def test_the_size_of_photographs_is_told_where_it_is_asked_for_by_another_name(pop: Pop) -> None:
