@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import tyro
 
-from pop_fast.cli import parse
+from pop_fast.cli import parse, printable
 from pop_fast.cli.options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import check_file, write_json
@@ -65,7 +65,7 @@ def run(argv: Sequence[str]) -> int:
     _, stats = measured(splat, args, nets)
     if args.per_view:
         for name, numbers in stats["per_view"].items():
-            print(f"{name}: " + ", ".join(f"{key} {value:.4f}" for key, value in numbers.items()))
+            print(f"{printable(name)}: " + ", ".join(f"{key} {value:.4f}" for key, value in numbers.items()))
     print("\n".join(_lines(stats)))
     if args.json is not None:
         write_json(args.json, stats)

@@ -445,6 +445,8 @@ def test_escape_sequences_in_names_are_shown_and_not_obeyed(pop: Pop, shared_cap
     assert "\x1b" not in outcome.out + outcome.err
     assert r"a\x1b[31m" in outcome.out
     assert "\x1b" not in pop("data", "check", evil).out
+    for words in (("compare", tmp_path / "r"), ("render", tmp_path / "r", "--out", tmp_path / "v")):
+        assert r"a\x1b[31m" in pop.done(*words).out
 
 
 def test_messages_keep_letters_of_all_languages_and_are_no_longer_than_can_be_read() -> None:
