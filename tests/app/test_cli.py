@@ -203,6 +203,9 @@ def test_eval_repeats_the_numbers_of_training(pop, shared_result, shared_capture
     trained, measured = (json.loads(path.read_text()) for path in (shared_result / STATS, written))
     for key in ("psnr", "ssim", "num_GS", "n_blended", "n_traversed", "per_view"):
         assert measured[key] == trained[key], key
+    page = (ROOT / "docs" / "using.md").read_text(encoding="utf-8").partition("**For programs.**")[2]
+    named = set(re.findall(r"`([a-z]\w+[_.\w]*)`", page.partition("The files in")[0]))
+    assert named == {key for key in measured if not key.startswith("lpips_")}
     assert f"PSNR       {trained['psnr']:.3f} dB" in outcome.out
     assert "view_000.png: psnr" in outcome.out
     # a PLY needs a capture, and agrees with the checkpoint
