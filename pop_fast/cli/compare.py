@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final
 
 import tyro
 
-from pop_fast.cli import parse
+from pop_fast.cli import parse, printable
 from pop_fast.cli.options import CaptureArguments
 from pop_fast.errors import PopError
 from pop_fast.train.load_result import CaptureRecord, Splat, load_splat, read_record, unbundled
@@ -53,7 +53,7 @@ def run(argv: Sequence[str]) -> int:
         raise PopError(f"{unfinished[0]}: {why} {unfinished[0]}")
     for path in unfinished:
         print(f"note: {path}: {why} {path}", file=sys.stderr)
-    rows = [row(stats) for stats in found]
+    rows = [[printable(cell) for cell in row(stats)] for stats in found]
     print(markdown(rows) if args.markdown else plain(rows))
     return 0
 

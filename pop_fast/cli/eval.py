@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import tyro
 
-from pop_fast.cli import parse
+from pop_fast.cli import parse, printable
 from pop_fast.cli.options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import check_file, write_json
@@ -35,8 +36,8 @@ _EXAMPLES: Final = """
 class Args(CaptureArguments):
     """Measure a splat on the held-out views of a capture: PSNR, SSIM, LPIPS where weights are given.
 
-    For a result folder the numbers also go into its stats and its report, unless an option asks for another capture,
-    other photographs or another frame than those of its training.
+    For a result folder the numbers also go into its stats and its report, unless it may not be written to, or an option
+    asks for another capture, other photographs or another frame than those of its training.
     """
 
     splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|FILE")]
@@ -56,6 +57,7 @@ def run(argv: Sequence[str]) -> int:
     if args.json is not None:
         check_file(args.json)
     splat = load_splat(args.splat)
+    keeps = _keeps(splat, args)
     from pop_fast.train.lpips import LPIPS
 
     chosen = {"vgg": args.lpips_vgg or splat.config.lpips_vgg, "alex": args.lpips_alex or splat.config.lpips_alex}
@@ -63,14 +65,25 @@ def run(argv: Sequence[str]) -> int:
     _, stats = measured(splat, args, nets)
     if args.per_view:
         for name, numbers in stats["per_view"].items():
-            print(f"{name}: " + ", ".join(f"{key} {value:.4f}" for key, value in numbers.items()))
+            print(f"{printable(name)}: " + ", ".join(f"{key} {value:.4f}" for key, value in numbers.items()))
     print("\n".join(_lines(stats)))
     if args.json is not None:
         write_json(args.json, stats)
-    as_trained = all(getattr(args, option.name) == option.default for option in fields(CaptureOptions))
-    if args.splat.is_dir() and splat.step is not None and as_trained:
+    if keeps and splat.step is not None:
         _record(args.splat, splat.step, stats)
     return 0
+
+
+def _keeps(splat: Splat, args: Args) -> bool:
+    """Say whether the numbers go into a result's stats and report; a note tells first where they cannot."""
+    as_trained = all(getattr(args, option.name) == option.default for option in fields(CaptureOptions))
+    if not (args.splat.is_dir() and splat.step is not None and as_trained):
+        return False
+    for place in (args.splat, args.splat / "stats"):
+        if place.is_dir() and not os.access(place, os.W_OK | os.X_OK):
+            print(f"note: {place} may not be written to; stats and report stay as they are", file=sys.stderr)
+            return False
+    return True
 
 
 def measured(splat: Splat, options: CaptureOptions, nets: Sequence[LPIPS]) -> tuple[str, dict[str, Any]]:

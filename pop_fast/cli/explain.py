@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import tyro
 
-from pop_fast.cli import parse
+from pop_fast.cli import parse, printable
 from pop_fast.cli.options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import check_file, check_folder, folder_atomically, write_file, write_json
@@ -93,7 +93,7 @@ def _explain(args: Args, at: tuple[int, int] | None) -> int:
     maps += parting.maps if parting else ()
     if at is not None:
         explanation = explain_pixel(scene, *at)
-        print(table(explanation, args.all))
+        print(printable(table(explanation, args.all)))
         if parting:
             print(
                 "\n" + "\n".join(part for line in parting.lines for part in wrap(line, WIDTH, subsequent_indent="    "))
@@ -107,7 +107,7 @@ def _explain(args: Args, at: tuple[int, int] | None) -> int:
     if args.maps is not None:
         with folder_atomically(args.maps, args.overwrite) as folder:
             write_maps(maps, folder)
-        print(f"{len(maps)} maps of {view.name} -> {args.maps}")
+        print(printable(f"{len(maps)} maps of {view.name} -> {args.maps}"))
     return 0
 
 

@@ -6,7 +6,6 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import numpy as np
@@ -270,8 +269,8 @@ class FinishOptions(LimitOptions):
 def finish(folder: Path, capture: Capture, options: Any) -> int:
     """Write what surrounds a run whose results are complete; see `after_results`."""
     own = FinishOptions(**{f.name: getattr(options, f.name) for f in fields(FinishOptions)})
-    left = f"the results in {folder} are complete; pop export {quote(str(folder))} writes the files"
-    return after_results(lambda: _finish(folder, capture, own), "writing exports", "", left)
+    left = f"the results in {folder} are complete; the same command writes the rest, pop train with --resume"
+    return after_results(lambda: _finish(folder, capture, own), "writing what surrounds the results", "", left)
 
 
 def after_results(write: Callable[[], object], doing: str, failed: str, left: str) -> int:

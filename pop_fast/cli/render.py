@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import tyro
 
-from pop_fast.cli import parse
+from pop_fast.cli import parse, printable
 from pop_fast.cli.options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import check_file, check_folder, folder_atomically, write_json
@@ -93,7 +93,7 @@ def _render(args: Args, video: VideoFile | None) -> int:
             index = {"splat": str(splat.path), "capture": capture.name, "path": args.path, "renders": listing}
             write_json(folder / _INDEX, index)
     targets = " and ".join(str(target) for target in (args.out, args.video) if target is not None)
-    print(f"{written} view{'' if written == 1 else 's'} of {capture.name} -> {targets}")
+    print(printable(f"{written} view{'' if written == 1 else 's'} of {capture.name} -> {targets}"))
     return 0
 
 

@@ -305,7 +305,7 @@ def report(folder: Path) -> int:
     def write() -> None:
         from pop_fast.view.report import write_report
 
-        print(f"report: {write_report(folder)}")
+        print(printable(f"report: {write_report(folder)}"))
 
     left = f"the results in {folder} are complete; pop report {quote(str(folder))} writes the report"
     return after_results(write, "writing the report", "the report could not be written: ", left)

@@ -55,6 +55,8 @@ _GAPS = 3
 _SIDE = 64
 # px, of SSIM: that of `pop_fast.stages.losses`, which needs torch
 _WINDOW = 11
+# px, more than any picture has: COLMAP's error of what lies behind a camera is the largest number
+_BEHIND = 1e9
 
 
 @dataclass(frozen=True)
@@ -300,6 +302,7 @@ def about_reprojection(root: Path) -> Iterator[CaptureFinding]:
             observations = int(reconstruction.compute_num_observations())
             reconstruction.update_point_3d_errors()
             error = float(reconstruction.compute_mean_reprojection_error()) if observations else 0.0
+            errors = [point.error for point in reconstruction.points3D.values()]
     # COLMAP holds tracks against each other, and says what does not agree by errors of many kinds, without a file
     except Exception as problem:
         words = " ".join(str(problem).split())
@@ -308,6 +311,11 @@ def about_reprojection(root: Path) -> Iterator[CaptureFinding]:
         return
     if observations == 0:
         yield ok("reprojection", "the model has no tracks, so its error is unknown")
+        return
+    behind = sum(each > _BEHIND for each in errors)
+    if behind:
+        seen = f"{behind:,} of {len(errors):,} points lie behind a camera that saw them"
+        yield warn("reprojection", f"{seen}: are these poses right?")
         return
     state: State = "ok" if error < 2.0 else "warn"
     yield CaptureFinding(state, "reprojection", f"mean error {error:.2f} px over {observations:,} observations")

@@ -12,6 +12,7 @@ import contextlib
 import ctypes
 import errno
 import json
+import math
 import os
 import shutil
 import sys
@@ -107,9 +108,22 @@ def write_file(path: str | os.PathLike[str], content: str | bytes) -> None:
     write_atomically(path, lambda file: file.write(data))
 
 
+def json_text(content: Any, indent: int | None = None) -> str:
+    """Return the JSON of a value for every parser, which has no NaN and no infinity: they become null."""
+    return json.dumps(_finite(content), indent=indent, allow_nan=False) + "\n"
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def write_json(path: str | os.PathLike[str], content: Any, indent: int | None = 2) -> None:
-    """Write one file of JSON whole or not at all; see `write_atomically`."""
-    write_file(path, json.dumps(content, indent=indent) + "\n")
+    """Write one file of JSON whole or not at all; see `write_atomically` and `json_text`."""
+    write_file(path, json_text(content, indent))
 
 
 @contextmanager

@@ -25,11 +25,11 @@
     blocks/                         of a training in blocks: `pop_fast.blocks.plan` says what
 
 A record of metrics.jsonl holds: step, view (or the names of a batch), loss, l1 or l2 (the pixel-wise term), d_ssim,
-pop (weighted, absent when off), psnr (of the training view), num_gaussians, n_blended and n_traversed (per pixel; not
-in runs on a GPU), sh_degree, lr_means, it_per_s, seconds (training alone); after a change of the Gaussians also
-cloned, split, pruned, and reset when opacities were. Statistics of runs on a GPU also hold gpu, gpu_memory_bytes,
-instance_buffers_grown, photograph_bytes (on the GPU) and photographs_passing (copied there for each of their steps);
-where processes train together also received_bytes, which others have sent to the one that writes.
+pop (weighted, absent when off), psnr (of the training view, null where they are equal), num_gaussians, n_blended and
+n_traversed (per pixel; not in runs on a GPU), sh_degree, lr_means, it_per_s, seconds (training alone); after a change
+of the Gaussians also cloned, split, pruned, and reset when opacities were. Statistics of runs on a GPU also hold gpu,
+gpu_memory_bytes, instance_buffers_grown, photograph_bytes (on the GPU) and photographs_passing (copied there for each
+of their steps); where processes train together also received_bytes, which others have sent to the one that writes.
 """
 
 from __future__ import annotations
@@ -53,6 +53,7 @@ from pop_fast.io.atomic import (
     FolderLock,
     check_place,
     is_left_behind,
+    json_text,
     os_errors_name,
     write_atomically,
     write_file,
@@ -215,7 +216,7 @@ class ResultFolder:
 
     def log(self, record: dict[str, Any]) -> None:
         """Append a record; before metrics.jsonl is open it waits."""
-        line = (json.dumps(record) + "\n").encode()
+        line = json_text(record).encode()
         if self._metrics is None:
             self._waiting.append(line)
         else:
@@ -244,7 +245,7 @@ class ResultFolder:
 
     def write_stats(self, kind: str, step: int, stats: dict[str, Any]) -> None:
         """Write stats/{kind}_step{step}.json."""
-        write_json(self.stats_path(kind, step), _finite(stats))
+        write_json(self.stats_path(kind, step), stats)
 
     def read_stats(self, kind: str, step: int) -> dict[str, Any] | None:
         """Read what `write_stats` wrote, or None."""
@@ -287,15 +288,6 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
-
-
-def _finite(value: Any) -> Any:
-    """Replace what JSON cannot hold: NaN and infinities become null."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 @dataclass(frozen=True)

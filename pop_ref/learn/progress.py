@@ -146,7 +146,9 @@ def _notes(folder: Path) -> dict[str, Any]:
 
 
 def _keep(folder: Path, notes: dict[str, Any]) -> None:
-    (folder / _NOTES).write_text(json.dumps(notes, indent=1) + "\n", encoding="utf-8")
+    beside = folder / f"{_NOTES}.partial"
+    beside.write_text(json.dumps(notes, indent=1) + "\n", encoding="utf-8")
+    beside.replace(folder / _NOTES)
 
 
 def _digest(path: Path) -> str:

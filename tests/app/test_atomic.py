@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import json
+import math
 import os
 import signal
 import subprocess
@@ -16,7 +18,14 @@ import pytest
 
 from pop_fast.errors import PopError
 from pop_fast.io import atomic
-from pop_fast.io.atomic import FolderLock, check_file, file_atomically, folder_atomically, write_atomically
+from pop_fast.io.atomic import (
+    FolderLock,
+    check_file,
+    file_atomically,
+    folder_atomically,
+    write_atomically,
+    write_json,
+)
 from pop_fast.train import TrainingRun
 from pop_fast.train.results import ResultFolder
 from tests.app.captures import assert_one_line
@@ -54,6 +63,18 @@ def test_a_written_file_holds_what_the_writer_wrote_and_parents_are_made(tmp_pat
     write_atomically(target, lambda file: file.write(b"new"))
     assert target.read_bytes() == b"new"
     assert os.listdir(target.parent) == ["b.bin"]
+
+
+def test_json_of_a_number_that_is_not_finite_is_read_by_every_parser(tmp_path: Path) -> None:
+    equal = {"psnr": math.inf, "per_view": [{"psnr": math.nan}]}
+    write_json(tmp_path / "eval.json", equal)
+    results = ResultFolder(tmp_path)
+    results.log(equal)
+    results.open_metrics(0)
+    results.close()
+    for name in ("eval.json", "metrics.jsonl"):
+        found = json.loads((tmp_path / name).read_text(), parse_constant=pytest.fail)
+        assert found == {"psnr": None, "per_view": [{"psnr": None}]}
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,7 @@ from pop_fast.stages.tiles import tile_lists
 from pop_fast.train import TrainConfig, choose
 from tests.app.captures import edit_transforms, photograph, transforms_capture, write_photograph
 from tests.app.conftest import ROOT, TRAIN, Outcome, Pop, in_a_child
-from tests.app.damage import says
+from tests.app.damage import contents, says
 from tests.app.tiny import interrupt
 
 
@@ -203,6 +203,9 @@ def test_eval_repeats_the_numbers_of_training(pop, shared_result, shared_capture
     trained, measured = (json.loads(path.read_text()) for path in (shared_result / STATS, written))
     for key in ("psnr", "ssim", "num_GS", "n_blended", "n_traversed", "per_view"):
         assert measured[key] == trained[key], key
+    page = (ROOT / "docs" / "using.md").read_text(encoding="utf-8").partition("**For programs.**")[2]
+    named = set(re.findall(r"`([a-z]\w+[_.\w]*)`", page.partition("The files in")[0]))
+    assert named == {key for key in measured if not key.startswith("lpips_")}
     assert f"PSNR       {trained['psnr']:.3f} dB" in outcome.out
     assert "view_000.png: psnr" in outcome.out
     # a PLY needs a capture, and agrees with the checkpoint
@@ -233,6 +236,15 @@ def test_eval_of_a_result_updates_its_stats_and_report(pop: Pop, result: Path) -
     after = json.loads((result / STATS).read_text())
     assert (after["psnr"], after["seconds"]) == (before["psnr"], before["seconds"])
     assert (result / "report.html").is_file()
+
+
+def test_eval_measures_a_result_that_may_not_be_written_to(pop: Pop, result: Path, monkeypatch) -> None:
+    before = contents(result)
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "stats")
+    outcome = pop.done("eval", result)
+    assert "PSNR" in outcome.out
+    assert f"note: {result / 'stats'} may not be written to" in outcome.err
+    assert contents(result) == before
 
 
 def test_the_size_of_photographs_is_told_where_it_is_asked_for_by_another_name(pop: Pop) -> None:
@@ -436,6 +448,8 @@ def test_escape_sequences_in_names_are_shown_and_not_obeyed(pop: Pop, shared_cap
     assert "\x1b" not in outcome.out + outcome.err
     assert r"a\x1b[31m" in outcome.out
     assert "\x1b" not in pop("data", "check", evil).out
+    for words in (("compare", tmp_path / "r"), ("render", tmp_path / "r", "--out", tmp_path / "v")):
+        assert r"a\x1b[31m" in pop.done(*words).out
 
 
 def test_messages_keep_letters_of_all_languages_and_are_no_longer_than_can_be_read() -> None:

@@ -15,6 +15,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
@@ -297,6 +298,18 @@ def test_tracks_that_colmap_refuses_are_told_with_the_models_folder(
     for ours, theirs in zip(load_capture(copy).views, load_capture(shared_capture).views, strict=True):
         assert len(ours.seen)
         assert np.array_equal(ours.seen, theirs.seen)
+
+
+def test_points_behind_cameras_that_saw_them_are_counted(check: Check, shared_capture: Path, tmp_path: Path) -> None:
+    root = tmp_path / "turned"
+    shutil.copytree(shared_capture, root)
+    model = pycolmap.Reconstruction(root / "sparse" / "0")
+    image = model.images[min(model.images)]
+    turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.diag([-1.0, 1.0, -1.0])), np.zeros(3))
+    image.frame.rig_from_world = turn * image.frame.rig_from_world
+    model.write(root / "sparse" / "0")
+    line = finding(check(root), "LOOK", "reprojection")
+    assert line.endswith("points lie behind a camera that saw them: are these poses right?")
 
 
 def test_photographs_alone_are_looked_over(check: Check, bare: Path, tmp_path: Path) -> None:

@@ -369,6 +369,19 @@ def test_the_map_turns_green_with_a_pass_and_back_with_a_change(mine: Path) -> N
     assert state(read_work(mine), stage) == WRITTEN
 
 
+def test_what_has_passed_is_kept_where_a_disk_is_full(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path, *_words: str, **_how: str) -> None:
+        path.write_bytes(b"{")
+        raise OSError(28, "No space left on device")
+
+    write(mine, "alpha")
+    note_passed(mine, BY_NAME["alpha"])
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OSError, match="No space left"):
+        note_passed(mine, BY_NAME["alpha"])
+    assert state(read_work(mine), BY_NAME["alpha"]) == PASSED
+
+
 def test_the_picture_is_the_oracles_with_the_students_stages_in_it(mine: Path) -> None:
     sound, complaints = picture(read_work(mine), 16)
     assert not complaints
