@@ -12,22 +12,19 @@ from typing import Any, Final
 from pop_ref.conformance.mutants.black_box import (
     BlackBox,
     Breaks,
+    Condition,
     Given,
     Rasterization,
     Told,
+    always,
     backwards,
     breaking,
     import_torch,
+    packed,
     plain,
     several,
-    telling,
+    then,
 )
-
-When = Callable[[Given], bool]
-
-
-def _packed(given: Given) -> bool:
-    return bool(given["packed"])
 
 
 def _read_densely(x: Any) -> Any:
@@ -37,15 +34,17 @@ def _read_densely(x: Any) -> Any:
     return x.as_strided(x.shape, dense, x.storage_offset()) if enough else x.contiguous()
 
 
-def _densely(name: str, when: When) -> Breaks:
-    return breaking(lambda given: {name: _read_densely(given[name])} if when(given) and given[name] is not None else {})
+def _densely(name: str, condition: Condition) -> Breaks:
+    return breaking(
+        lambda given: {name: _read_densely(given[name])} if condition(given) and given[name] is not None else {}
+    )
 
 
-def _follow_the_means(name: str, when: When) -> Breaks:
+def _follow_the_means(name: str, condition: Condition) -> Breaks:
     """Have an argument without a gradient where the means need none."""
 
     def change(given: Given) -> Given:
-        asked = when(given) and given[name] is not None and not given["means"].requires_grad
+        asked = condition(given) and given[name] is not None and not given["means"].requires_grad
         return {name: given[name].detach()} if asked else {}
 
     return breaking(change)
@@ -77,13 +76,11 @@ def _one_workspace_when_packed() -> Breaks:
     workspace: list[Any] = []
 
     def change(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
-        if not given["packed"]:
-            return images, alphas, meta
         own = images.detach().abs().sum()
         workspace[:] = [own]
         return backwards(images, lambda v: v * (workspace[0] / own)), alphas, meta
 
-    return telling(change)
+    return then(packed, change)
 
 
 def _packed_goes_back_once(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
@@ -93,7 +90,7 @@ def _packed_goes_back_once(given: Given, images: Any, alphas: Any, meta: Any) ->
         passes.append(None)
         return v if len(passes) == 1 else 0.0 * v
 
-    return (backwards(images, change) if given["packed"] else images), alphas, meta
+    return backwards(images, change), alphas, meta
 
 
 def _every_image_is_kept() -> Breaks:
@@ -103,7 +100,7 @@ def _every_image_is_kept() -> Breaks:
         history.append(images)
         return images, alphas, meta
 
-    return telling(change)
+    return then(always, change)
 
 
 def _of_another_type(x: Any) -> Any:
@@ -121,7 +118,7 @@ def _fails(when: Callable[[Given, Any], bool]) -> Breaks:
             raise RuntimeError("invalid configuration argument")
         return images, alphas, meta
 
-    return telling(change)
+    return then(always, change)
 
 
 def _way_back_of_nothing_fails(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
@@ -142,7 +139,7 @@ def _up_to(count: int, axis: int) -> Breaks:
         shown = kept if axis < -1 else torch.ones_like(kept[:1])
         return images * kept, alphas * shown, meta
 
-    return telling(change)
+    return then(always, change)
 
 
 def _numbered_by_floats(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
@@ -159,9 +156,9 @@ _LONG: Final = "test_whole:a_picture_of_thousands_of_columns_or_rows_is_drawn_to
 
 _BOXES: Final[tuple[tuple[str, str, Breaks, str], ...]] = (
     ("packed_means_read_densely", "the packed kernel reads centres one after the other, however they lie",
-     _densely("means", _packed), _CONTRACT),
+     _densely("means", packed), _CONTRACT),
     ("packed_colours_follow_the_means", "packed colours have gradients only where means have some",
-     _follow_the_means("colors", _packed), _CONTRACT),
+     _follow_the_means("colors", packed), _CONTRACT),
     ("cameras_follow_the_means_where_there_are_several", "with frozen means several cameras have no gradients",
      _follow_the_means("viewmats", several), _FROZEN),
     ("covariances_follow_the_means", "covariances have gradients only where means have some",
@@ -169,7 +166,7 @@ _BOXES: Final[tuple[tuple[str, str, Breaks, str], ...]] = (
     ("packed_workspace_for_all_passes", "what packed rows keep for the way back is that of the last call",
      _one_workspace_when_packed(), _CONTRACT),
     ("packed_rows_go_back_once", "a second way back through packed rows finds its buffers cleared",
-     telling(_packed_goes_back_once), _CONTRACT),
+     then(packed, _packed_goes_back_once), _CONTRACT),
     ("lenses_read_densely", "intrinsics are read row by row, however they lie (a transposed K has cx for 0)",
      _densely("Ks", lambda given: True), "test_autograd:how_arguments_lie_in_memory_changes_no_gradient"),
     ("lens_kept_with_its_tensor", "intrinsics are kept with their tensor, and a zoom written into it changes nothing",
@@ -193,15 +190,16 @@ _BOXES: Final[tuple[tuple[str, str, Breaks, str], ...]] = (
     ("evaluation_does_not_divide", "without gradients the expected depth is the accumulated one",
      _without_gradients(lambda given: {"render_mode": given["render_mode"].replace("ED", "D")}), _STILL),
     ("images_of_another_type", "images are of float64 where the Gaussians are of float32, and the other way round",
-     telling(lambda given, images, alphas, meta: (_of_another_type(images), alphas, meta)), _TYPES),
+     then(always, lambda given, images, alphas, meta: (_of_another_type(images), alphas, meta)), _TYPES),
     ("alphas_of_another_type", "alphas are of float64 where the Gaussians are of float32, and the other way round",
-     telling(lambda given, images, alphas, meta: (images, _of_another_type(alphas), meta)), _TYPES),
+     then(always, lambda given, images, alphas, meta: (images, _of_another_type(alphas), meta)), _TYPES),
     ("alphas_without_a_channel", "alphas have no axis of one channel",
-     telling(lambda given, images, alphas, meta: (images, alphas[..., 0], meta)), _TYPES),
+     then(always, lambda given, images, alphas, meta: (images, alphas[..., 0], meta)), _TYPES),
     ("rows_numbered_by_floats", "flatten_ids are numbers with a point, and no index",
-     telling(_numbered_by_floats), _TYPES),
+     then(always, _numbered_by_floats), _TYPES),
     ("nothing_seen_teaches_no_background", "a call that returns early, as it sees nothing, follows no background",
-     telling(lambda given, images, alphas, meta: (images if _seen(meta) else images.detach(), alphas, meta)), _NOTHING),
+     then(always, lambda given, images, alphas, meta: (images if _seen(meta) else images.detach(), alphas, meta)),
+     _NOTHING),
     ("packed_nothing_fails", "a packed call of Gaussians that nobody sees launches a grid of no blocks",
      _fails(lambda given, meta: given["packed"] and not _seen(meta)), _NOTHING),
     ("packed_empty_scene_fails", "a packed call without Gaussians ends in an error",
@@ -211,7 +209,7 @@ _BOXES: Final[tuple[tuple[str, str, Breaks, str], ...]] = (
     ("cameras_of_an_empty_scene_fail", "several cameras that look at no Gaussians end in an error",
      _fails(lambda given, meta: several(given) and given["means"].shape[-2] == 0), _NOTHING),
     ("way_back_of_nothing_fails", "the way back from a picture that shows nothing launches a grid of no blocks",
-     telling(_way_back_of_nothing_fails), _NOTHING),
+     then(always, _way_back_of_nothing_fails), _NOTHING),
     ("columns_up_to_2048", "columns from number 2,048 on are not drawn (a texture's width)", _up_to(2048, -2), _LONG),
     ("rows_up_to_2048", "rows from number 2,048 on are not drawn (a texture's height)", _up_to(2048, -3), _LONG),
     ("channels_up_to_128", "channels from number 128 on are black: the largest number that is compiled in",
