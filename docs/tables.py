@@ -430,7 +430,10 @@ def power() -> str:
 def reached() -> str:
     """Make the tables of what laws reach: ranges of arguments, and lines of the oracle that none runs."""
     logged = read_json(RESULTS / "law_coverage.json")
-    ranges = [[name, f"{low:.3g}", f"{high:.3g}", LIMITS[name]] for name, (low, high) in logged["ranges"].items()]
+    ranges = [
+        [name, *("infinite" if x is None else f"{x:.3g}" for x in of), LIMITS[name]]
+        for name, of in logged["ranges"].items()
+    ]
     choices = [[name, ", ".join(f"`{value}`" for value in values)] for name, values in logged["choices"].items()]
     lines, refusals, others, changed = 0, 0, dict[tuple[str, str], int](), list[str]()
     for file, found in logged["modules"].items():

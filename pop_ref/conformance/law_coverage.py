@@ -45,12 +45,12 @@ REASONS: Final[dict[str, str]] = {
 # by argument: why laws stop where they do
 LIMITS: Final[dict[str, str]] = {
     "Gaussians": "the oracle is slow: larger scenes have recorded answers, up to 70,000",
-    "width, px": "footprints, tiles and borders are all there; larger pictures are more of the same tiles",
+    "width, px": "more than twelve bits number; larger pictures are more of the same tiles",
     "height, px": "as the width",
     "tile_size, px": "the largest that common kernels have",
     "cameras": "more than a warp of 32 threads",
     "batch entries": "entries do not mix; larger batches are more of the same",
-    "channels": "two chunks of 32",
+    "channels": "more than four chunks of 32",
     "sh_degree": "degree 3 is the highest that is defined",
     "opacity": "an opacity is a probability",
     "standard deviation, world units": "0 is a point; what is larger covers every picture",
@@ -186,7 +186,8 @@ def run(examples: int = EXAMPLES) -> dict[str, Any]:
     return {
         "examples": examples,
         "modules": {file: _lines(file, seen) for file, seen in log.lines.items()},
-        "ranges": {name: list(log.ranges[name]) for name in sorted(log.ranges)},
+        # JSON has no infinity
+        "ranges": {name: [x if np.isfinite(x) else None for x in log.ranges[name]] for name in sorted(log.ranges)},
         "choices": {name: sorted(log.choices[name]) for name in sorted(log.choices)},
     }
 
