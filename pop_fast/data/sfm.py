@@ -9,8 +9,8 @@ orientation is written next to the model (`sparse/upright.json`), and `load_capt
 
 The search runs in a process of its own. COLMAP computes for minutes inside one call, where no signal is heard. A
 process can be ended at any moment, and takes COLMAP's threads, its log and its memory with it. The words of the two
-processes are lines of JSON: one job, and for it any number of reports of progress and one end. Between two reports the
-one that waits counts what COLMAP has written to its database: photographs with features, and pairs that were compared.
+processes are lines of JSON: one job, and for it any number of reports of progress and one end. Nobody else opens
+COLMAP's database meanwhile: COLMAP does not wait for a lock, and a reader made its searches fail.
 
 It leaves a list of its files, so that replacing a result removes nothing else. The list lies next to the model as
 `sparse/sfm.sha256`, in the format of `sha256sum`, with paths relative to the capture.
@@ -23,18 +23,15 @@ import hashlib
 import itertools
 import json
 import os
-import queue
 import shutil
 import signal
-import sqlite3
 import subprocess
 import sys
 import tempfile
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import IO, Any, Final, Literal
+from typing import Any, Final, Literal
 
 from pop_fast.children import python_command
 from pop_fast.data.cameras import require_colmap
@@ -241,18 +238,10 @@ _RATIO: Final = 0.85
 # photographs, and the square of it pairs, between two reports of progress
 _BATCH: Final = 8
 _DONE: Final = b"."
-# s between two looks into the database
-_LOOK_EVERY: Final = 0.5
-# the stages of which COLMAP says nothing itself, and the table of its database that has a row for each one that is done
 _FEATURES: Final = "finding features in photographs"
 _MATCHES: Final = "matching pairs of photographs"
 _CAMERAS: Final = "finding cameras of photographs"
 _AGAIN: Final = ", again and more thoroughly"
-_TABLES: Final = {
-    stage + again: table
-    for again in ("", _AGAIN)
-    for stage, table in ((_FEATURES, "descriptors"), (_MATCHES, "two_view_geometries"))
-}
 # bytes that a disk has left on which COLMAP, which does not say why it ends, can go on
 _SPARE: Final = 4 * 2**20
 # letters of what COLMAP says that an error shows
@@ -337,43 +326,14 @@ def _listen(child: subprocess.Popen[bytes], search: Search, progress: Progress |
     with contextlib.suppress(BrokenPipeError):
         child.stdin.write(json.dumps(asdict(search)).encode() + b"\n")
         child.stdin.flush()
-    lines: queue.Queue[bytes] = queue.Queue()
-    threading.Thread(target=_hand_on, args=(child.stdout, lines), name="sfm", daemon=True).start()
-    stage, told, total = "", 0, 0
-    while True:
-        try:
-            line = lines.get(timeout=_LOOK_EVERY)
-        except queue.Empty:
-            done = _rows(search.database, _TABLES.get(stage))
-        else:
-            word = json.loads(line) if line else None
-            if not isinstance(word, list):
-                return word
+    for line in child.stdout:
+        word = json.loads(line)
+        if not isinstance(word, list):
+            return str(word)
+        if progress is not None:
             stage, done, total = word
-            # another stage, or a model that was given up for another
-            told = 0
-        if progress is not None and stage:
-            told = min(max(told, done), total)
-            progress(stage, told, total)
-
-
-def _hand_on(pipe: IO[bytes], lines: queue.Queue[bytes]) -> None:
-    """Put every line into a queue, and an empty one at the end."""
-    with contextlib.suppress(ValueError, OSError):
-        for line in pipe:
-            lines.put(line)
-    lines.put(b"")
-
-
-def _rows(database: Path, table: str | None) -> int:
-    """Count the rows of a table; 0 where that cannot be done now. COLMAP's database lets others read meanwhile."""
-    if table is None:
-        return 0
-    try:
-        with contextlib.closing(sqlite3.connect(f"{database.as_uri()}?mode=ro", uri=True, timeout=0.1)) as opened:
-            return int(opened.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
-    except sqlite3.Error:
-        return 0
+            progress(stage, done, total)
+    return None
 
 
 def main() -> None:

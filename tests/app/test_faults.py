@@ -409,7 +409,7 @@ EXEMPT = {
     "pop_fast.cli.explain:_explain": "parses what it has made itself",
     "pop_fast.demo.make:_write_model": "makes a model, and reads none",
     **dict.fromkeys(
-        (f"pop_fast.data.sfm:{name}" for name in ("_extract", "_listen", "_rows", "find_cameras", "main")),
+        (f"pop_fast.data.sfm:{name}" for name in ("_extract", "_listen", "find_cameras", "main")),
         "reads what the search has written, and what its own child process says",
     ),
     "pop_fast.data.sfm:_stage": "tells by twelve bytes whether COLMAP reads the format; decoders judge the photograph",
