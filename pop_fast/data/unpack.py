@@ -25,7 +25,7 @@ from pop_fast.data.capture import Progress
 from pop_fast.data.photo_quality import look_the_same, sharpness, thumbnail
 from pop_fast.errors import CaptureError, PopError
 from pop_fast.io.atomic import folder_atomically
-from pop_fast.io.images import QUIET, VIDEO_SUFFIXES
+from pop_fast.io.images import QUIET, VIDEO_SUFFIXES, named_for_opencv
 from pop_fast.io.read_back import PICTURE, check_members, check_memory
 
 _FIX = "unpack it yourself, and give the folder"
@@ -229,8 +229,8 @@ def _is_ours(file: Path, pattern: str) -> bool:
 def _open(path: Path, *settings: int) -> Any:
     if not path.is_file():
         raise CaptureError(f"{path}: no such file; give a video")
-    with QUIET:
-        video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, settings)
+    with QUIET, named_for_opencv(path) as name:
+        video = cv2.VideoCapture(name, cv2.CAP_FFMPEG, settings)
     if not video.isOpened():
         raise CaptureError(f"{path}: is not a video that OpenCV can read; {_CONVERT}")
     width, height = (int(video.get(size)) for size in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))

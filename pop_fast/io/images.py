@@ -277,6 +277,19 @@ class _Quiet:
 QUIET: Final = _Quiet()
 
 
+@contextmanager
+def named_for_opencv(video: Path) -> Iterator[str]:
+    """Name a video to open: OpenCV crashes at what is not UTF-8, and takes what precedes a colon for a protocol."""
+    name = str(video.absolute())
+    with ExitStack() as stack:
+        if name.encode(errors="ignore").decode() != name:
+            folder, suffix = tempfile.TemporaryDirectory(prefix="pop_video_"), video.suffix
+            link = Path(stack.enter_context(folder), f"link{suffix.encode(errors='ignore').decode()}")
+            link.symlink_to(name)
+            name = str(link)
+        yield name
+
+
 def _decode(path: Path) -> np.ndarray:
     try:
         data = path.read_bytes()
@@ -288,8 +301,7 @@ def _decode(path: Path) -> np.ndarray:
         return _decode_heif(path, data)
     size = size_of(data)
     _check_size(path, size, len(data), bytes_per_pixel(data))
-    defect = _defect(data)
-    if defect:
+    if defect := _defect(data):
         raise CaptureError(f"{path}: {defect}; {FIX}")
     if size is None:
         # a size that nobody has seen is nobody's to judge, and OpenCV also decodes what no camera writes

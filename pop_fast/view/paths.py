@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from pop_fast.data.capture import camera_centers, focus_point, look_at_one_point
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import file_atomically
-from pop_fast.io.images import QUIET
+from pop_fast.io.images import QUIET, named_for_opencv
 
 # an orbit keeps out of a gap between cameras that is as wide as this and so many times wider than any other
 _WIDE_GAP: Final = np.pi / 2.0
@@ -234,8 +234,8 @@ class VideoFile:
 
     def _open(self, size: tuple[int, int]) -> cv2.VideoWriter:
         codec = _CODECS[self.path.suffix.lower()]
-        with _no_standard_error():
-            writer = cv2.VideoWriter(str(self._part), cv2.VideoWriter.fourcc(*codec), self.fps, size)
+        with _no_standard_error(), named_for_opencv(self._part) as name:
+            writer = cv2.VideoWriter(name, cv2.VideoWriter.fourcc(*codec), self.fps, size)
         if writer.isOpened():
             return writer
         # an encoder that cannot write fails in the same way: this raises where the disk is at fault
@@ -277,7 +277,8 @@ def frames_in(path: Path) -> int:
     """Play a video from its start and count the frames that can be decoded; 0 for what is no video."""
     # of a damaged file the other readers print bytes to the terminal
     reader = cv2.CAP_FFMPEG if cv2.videoio_registry.hasBackend(cv2.CAP_FFMPEG) else cv2.CAP_ANY
-    video = cv2.VideoCapture(str(path), reader)
+    with named_for_opencv(path) as name:
+        video = cv2.VideoCapture(name, reader)
     try:
         count = 0
         while video.read()[0]:
