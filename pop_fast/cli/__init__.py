@@ -327,6 +327,9 @@ def _describe_os_error(error: OSError) -> str | None:
             return f"{where}the disk is full; free some space or write elsewhere with --out"
         case errno.EACCES | errno.EPERM | errno.EROFS:
             return f"{where}permission denied; change its owner or mode, or write elsewhere with --out"
+        # without a name it is that of tempfile, which says in which folders it could not write
+        case errno.ENOENT if not where:
+            return f"{error.strerror}; let TMPDIR name a folder on a disk with room that you may write to"
         case errno.ENOENT:
             return f"{where}no such file or folder"
         case errno.EISDIR:

@@ -25,6 +25,7 @@ import numpy as np
 
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_file
+from pop_fast.io.read_back import check_memory
 
 if TYPE_CHECKING:
     import torch
@@ -240,6 +241,9 @@ def file_bytes(path: Path, what: str = "file", most: int = -1) -> bytes:
     """Return a file's bytes, or so many from its beginning; a PopError says that it is absent or cannot be read."""
     try:
         with open(path, "rb") as file:
+            if most < 0:
+                size = os.fstat(file.fileno()).st_size
+                check_memory(path, size, size, f"the {what}", "crop or thin it out first")
             return file.read(most)
     except FileNotFoundError:
         raise PopError(f"{path}: the {what} is absent; check the path") from None
@@ -263,11 +267,7 @@ def read_vertices(path: Path) -> np.ndarray:
     """
     # a file that is no splat is recognised by its beginning
     _vertex_elements(read_header(path), path)
-    try:
-        data = file_bytes(path)
-    except MemoryError as error:
-        raise PopError(f"{path}: does not fit into memory; crop or thin it out first") from error
-    return vertices_of(data, path)
+    return vertices_of(file_bytes(path), path)
 
 
 def vertices_of(data: bytes, path: Path) -> np.ndarray:

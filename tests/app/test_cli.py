@@ -393,6 +393,7 @@ def test_debug_shows_the_traceback_of_an_error(monkeypatch: pytest.MonkeyPatch) 
         (OSError(errno.ENOSPC, "x", "a.png"), "a.png: the disk is full"),
         (PermissionError(errno.EACCES, "x", "a.png"), "a.png: permission denied"),
         (FileNotFoundError(errno.ENOENT, "x", "a.png"), "a.png: no such file or folder"),
+        (FileNotFoundError(errno.ENOENT, "No usable temporary directory"), "No usable temporary directory; let TMPDIR"),
         (IsADirectoryError(errno.EISDIR, "x", "a"), "a: is a folder where a file is needed"),
         (FileExistsError(errno.EEXIST, "x", "a"), "a: a file is in the way"),
         (OSError(errno.EIO, "input/output error", "a"), "a: input/output error"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import struct
 import warnings
 from pathlib import Path
@@ -16,7 +17,7 @@ from hypothesis.extra import numpy as hnp
 from plyfile import PlyData, PlyElement
 
 from pop_fast.errors import PopError
-from pop_fast.io.formats import decoded, encoded, save_as
+from pop_fast.io.formats import decoded, encoded, load_splat_file, save_as
 from pop_fast.io.ply import asks_for_antialiasing, load_ply, read_header, read_points, save_ply
 from tests.app.captures import assert_one_line, many
 from tests.app.conftest import pop_in_a_child
@@ -205,6 +206,14 @@ def test_numbers_that_are_none_are_named_by_row_and_column(tmp_path: Path, colum
         ply["vertex"].data[column][1] = value
     ply.write(str(tmp_path / "x.ply"))
     assert_one_line(lambda: load_ply(tmp_path / "x.ply"), *words)
+
+
+@pytest.mark.parametrize("ending", ["ply", "spz"])
+def test_a_file_larger_than_memory_is_named(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"a.{ending}"
+    save_as(path, ending, many(3))
+    os.truncate(path, 2**40)
+    assert_one_line(lambda: load_splat_file(path), f"{path}: the file would take", "are free; crop or thin it out")
 
 
 def test_what_stands_behind_the_rows_is_not_read(tmp_path: Path) -> None:
