@@ -422,6 +422,9 @@ _AT_LEAST: Final = {
 }
 # photographs shrunk by 16 show little
 _MOST_COARSE_STOPS: Final = 4
+# views that a run draws: all of them, and the rates of all steps, are listed before the first step, which takes 12 s and
+# 2 GB of so many
+_MOST_DRAWN: Final = 10_000_000
 # each takes memory of its own, and beyond what the system allows the libraries end the process
 _MOST_THREADS: Final = 512
 # numbers that are divided by, or of which a logarithm is taken
@@ -458,6 +461,9 @@ def check_values(config: TrainConfig) -> None:
     for name, smallest in at_least.items():
         if values[name] is not None and values[name] < smallest:
             raise PopError(f"{name} is {values[name]}; it must be at least {smallest}")
+    drawn = values["max_steps"] * values["batch_size"]
+    if drawn > _MOST_DRAWN:
+        raise PopError(f"max_steps times batch_size is {drawn}; it must be at most {_MOST_DRAWN:,}")
     if values["threads"] > _MOST_THREADS:
         raise PopError(f"threads is {values['threads']}; it must be at most {_MOST_THREADS}; 0 takes all cores")
     if values["sh_degree"] > 3:

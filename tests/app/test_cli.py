@@ -468,6 +468,7 @@ def test_messages_keep_letters_of_all_languages_and_are_no_longer_than_can_be_re
     ("words", "told"),
     [
         ("--seed -1", "seed is -1; it must be at least 0"),
+        ("--max-steps 5000001 --batch-size 2", "max_steps times batch_size is 10000002; it must be at most 10,000,000"),
         ("--threads 100000", "threads is 100000; it must be at most 512"),
         ("--sfm.matcher exhaustive --sfm.seed -1", "seed is -1; it must be a whole number from 0"),
     ],
