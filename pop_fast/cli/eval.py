@@ -17,7 +17,7 @@ from pop_fast.errors import PopError
 from pop_fast.io.atomic import check_file, write_json
 from pop_fast.io.heartbeat import Heartbeat
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.load_result import CaptureOptions, Splat, load_splat
+from pop_fast.train.load_result import CaptureOptions, Splat, check_not_read, load_splat
 from pop_fast.train.results import ResultFolder
 
 if TYPE_CHECKING:
@@ -57,6 +57,8 @@ def run(argv: Sequence[str]) -> int:
     if args.json is not None:
         check_file(args.json)
     splat = load_splat(args.splat)
+    if args.json is not None:
+        check_not_read(args.json, splat)
     keeps = _keeps(splat, args)
     from pop_fast.train.lpips import LPIPS
 

@@ -15,7 +15,7 @@ from pop_fast.cli import parse, printable
 from pop_fast.cli.options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import check_file, check_folder, folder_atomically, write_file, write_json
-from pop_fast.train.load_result import load_splat
+from pop_fast.train.load_result import check_not_read, load_splat
 from pop_ref.constants import PROFILES
 
 if TYPE_CHECKING:
@@ -79,6 +79,8 @@ def _explain(args: Args, at: tuple[int, int] | None) -> int:
     from pop_fast.view.explain.scene import view_maps, with_objective, write_maps
 
     splat = load_splat(args.splat)
+    for file in filter(None, (args.json, args.html)):
+        check_not_read(file, splat)
     capture, config = open_with_bars(splat, args)
     view = chosen_view(capture, args.view)
     if at is not None:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 _INDEX: Final = "renders.json"
 # of a path, and of a video a second
 _FRAMES: Final = 120
+_MOST_FRAMES: Final = 1_000_000
 _FPS: Final = 30.0
 _EXAMPLES: Final = """
     pop render out/scene_pop --out views                     the held-out views, one PNG each
@@ -65,8 +66,8 @@ def run(argv: Sequence[str]) -> int:
         raise PopError(f"--frames {args.frames} is of a path, and every held-out view is drawn; give --path orbit")
     if args.fps is not None and args.video is None:
         raise PopError(f"--fps {args.fps:g} is of a video; give --video FILE")
-    if args.frames is not None and args.frames < 1:
-        raise PopError(f"frames is {args.frames}; give --frames 1 or more")
+    if args.frames is not None and not 1 <= args.frames <= _MOST_FRAMES:
+        raise PopError(f"frames is {args.frames}; give --frames 1 or more, and at most {_MOST_FRAMES:,}")
     if args.out is not None:
         keeps = [args.splat] if args.capture is None else [args.splat, args.capture]
         check_folder(args.out, args.overwrite, keeps=keeps, recognise=listed_in(args.out))

@@ -422,8 +422,7 @@ _AT_LEAST: Final = {
 }
 # photographs shrunk by 16 show little
 _MOST_COARSE_STOPS: Final = 4
-# views that a run draws: all of them, and the rates of all steps, are listed before the first step, which takes 12 s and
-# 2 GB of so many
+# views that a run draws; they and the rates of all steps are listed before the first step, so many in 12 s and 2 GB
 _MOST_DRAWN: Final = 10_000_000
 # each takes memory of its own, and beyond what the system allows the libraries end the process
 _MOST_THREADS: Final = 512

@@ -264,3 +264,11 @@ def paths_read(splat: Splat, root: Path, capture: Capture) -> list[Path]:
     # listed names may lead out of the capture, and so may its links
     listed = {(root / view.name).parent for view in capture.views}
     return [*own, root, *sorted(listed), *(entry for entry in sorted(root.iterdir()) if entry.is_symlink())]
+
+
+def check_not_read(path: Path, splat: Splat) -> None:
+    """Refuse to write in the place of a splat, or of what else was kept of its training."""
+    kept = ("cfg.json", "capture.json", "metrics.jsonl", "ckpts", "ply") if splat.folder is not None else ()
+    own = [splat.path, *((splat.folder or splat.path) / name for name in kept)]
+    if path.exists() and any(path.resolve().is_relative_to(each.resolve()) for each in own):
+        raise PopError(f"{path}: is read by this command, so it is not replaced; choose another name")

@@ -216,6 +216,16 @@ def test_eval_repeats_the_numbers_of_training(pop, shared_result, shared_capture
     assert json.loads(written.read_text())["psnr"] == pytest.approx(trained["psnr"], abs=1e-3)
 
 
+@pytest.mark.parametrize("name", ["ckpts/ckpt_29_rank0.pt", "ply/point_cloud_29.ply", "cfg.json"])
+def test_numbers_and_pages_never_replace_what_they_are_of(pop: Pop, result: Path, name: str) -> None:
+    kept = (result / name).read_bytes()
+    lone = [result / name] if name != "cfg.json" else []
+    for splat in (result, *lone):
+        for words in (("eval", splat, "--json"), ("explain", splat, "--view", 0, "--pixel", "3,3", "--html")):
+            says(pop(*words, result / name), f"{result / name}: is read by this command, so it is not replaced")
+    assert (result / name).read_bytes() == kept
+
+
 def test_a_run_that_holds_out_no_view_has_no_numbers_of_any(pop: Pop, capture: Path, tmp_path: Path) -> None:
     words = ("train", capture, "--out", tmp_path / "run", "--max-steps", "2", "--test-every", "0", "--skip-checks")
     head = next(line for line in pop.done(*words).out.splitlines() if line.startswith("format"))
