@@ -10,6 +10,7 @@ import struct
 import tracemalloc
 import unicodedata
 import zipfile
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -299,16 +300,20 @@ def test_what_is_not_read_is_named_with_the_way_to_convert_it(tmp_path: Path, mo
 
 def test_a_subfolder_that_cannot_be_looked_into_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_photograph(tmp_path / "locked" / "a.png", photograph(1))
-    scandir, denied = os.scandir, PermissionError(errno.EACCES, "Permission denied", str(tmp_path / "locked"))
+    scandir, stat, locked = os.scandir, os.stat, tmp_path / "locked"
 
-    def guarded(path: str) -> Any:
-        if Path(path) == tmp_path / "locked":
-            raise denied
-        return scandir(path)
+    def guarded(path: Any, ask: Any = scandir, **how: Any) -> Any:
+        if locked in (Path(path), Path(path).parent) and (ask is scandir or Path(path) != locked):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return ask(path, **how)
 
     monkeypatch.setattr(os, "scandir", guarded)
+    monkeypatch.setattr(os, "stat", partial(guarded, ask=stat))
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != locked)
     assert list_images(tmp_path) == []
-    assert_one_line(lambda: load_capture(tmp_path), "1 folder is left out", f"({tmp_path}/locked: Permission denied)")
+    assert_one_line(lambda: load_capture(tmp_path), "1 folder is left out", f"({locked}: Permission denied)")
+    write_photograph(tmp_path / "b.png", photograph(1))
+    assert_one_line(lambda: load_capture(tmp_path), "has 1 photographs but no cameras")
 
 
 @needs_heif
