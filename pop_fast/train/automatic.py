@@ -118,8 +118,9 @@ def expected_gaussians(method: str, first: int, pixels: float, photographs: int,
 
 # Fitted to POP on fox at scalers of 0.05 (8 to 25 photographs), 0.1 and 1, on bear_512, m360_garden_512 and
 # m360_bonsai_800 at 0.05 and 0.1, and on 11 photographs of a castle at 0.52, each of which ended within 10 % of it; and
-# to gsplat's default strategy and 3DGS on fox, bear, garden and bonsai at 0.1 and on fox at 1, within 15 %. Seven
-# videos and rooms tried afterwards ended with 0.5 to 2.7 times as many, which neither detail nor points explain
+# to gsplat's default strategy and 3DGS on the same captures. Of those that are kept, of other methods and of later
+# ones, docs/guide.md says how far off they were. Seven videos and rooms tried afterwards ended with 0.5 to 2.7 times as
+# many, which neither detail nor points explain
 _POP_GROWS: Final = 0.3
 _POP_POWER: Final = 0.57
 _GRADIENT_GROWS: Final = 0.034
