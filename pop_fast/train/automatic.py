@@ -174,10 +174,7 @@ def _trained_share(scaler: float) -> float:
     return of_short + part * (of_whole - of_short)
 
 
-# how often each of few photographs is seen. Of 9 of a castle and 15 from the air, held-out views, scaled to their
-# photographs' brightness, were 0.7 and 0.9 dB better after 1,500 steps than after 15,570 and 9,750; of 25 of a kitchen
-# 0.3 dB after 6,200 than after 12,450; of 25 of fox 0.4 dB after 5,000 than after 12,500; of 25 of a statue they had
-# 21.1, 21.5 and 21.3 dB after 1,700, 3,400 and 6,000
+# how often each of few photographs is seen; section 8 of docs/guide.md has the runs on five captures that it rests on
 LOOKS: Final = 200
 # photographs to train on up to which POP holds depth to the sparse points, and the weight; measured on three captures,
 # where the count told more than the angles did: benchmarks/results/few_photographs.json
