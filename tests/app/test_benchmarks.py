@@ -103,6 +103,13 @@ def test_the_notes_and_the_page_of_speed_tell_in_words_what_their_tables_hold() 
     assert f"takes {min(pairs):.1f} to {max(pairs):.1f} ns per pair" in notes
     assert f"with {timed['machine']['capability']}; the target was 3" in notes
     assert f"compiled stages take {min(ratios):.2f} to {max(ratios):.2f} of its time" in notes
+    targets = [case for case in timed["steps"]["cases"] if case["target_ms"] is not None]
+    missed = [100.0 * (case["ms"]["native"]["median"] / case["target_ms"] - 1.0) for case in targets]
+    assert f"the step misses all of them, by {min(missed):.0f} to {max(missed):.0f} %" in notes
+    *others, bonsai = sorted(float(time) for time in re.findall(r"^\| .* dB \(.*\| (0\.\d\d) \| 0\.\d\d", notes, re.M))
+    assert f"the time is {others[0]:.2f} to {others[-1]:.2f}, but {bonsai:.2f} on bonsai" in notes
+    *lower, _ = sorted(float(by) for by in re.findall(r"^\| .* dB \(.*\| ([+-]0\.\d{3}) \| 0\.", notes, re.M))
+    assert f"SSIM is {-lower[-1]:.3f} to {-lower[0]:.3f} lower on bear, bonsai and garden" in notes
     found = {
         name: [case["engines"][name]["of_fair_share"] for case in timed["busy"]] for name in ("native", "compiled")
     }
@@ -110,6 +117,9 @@ def test_the_notes_and_the_page_of_speed_tell_in_words_what_their_tables_hold() 
     assert f"takes {min(found['compiled']):.1f} to {max(found['compiled']):.1f} times that share" in " ".join(
         speed.split()
     )
+    engine = (path for path in (ROOT / "pop_fast" / "compiled").iterdir() if path.suffix in (".cpp", ".h"))
+    lines = sum(len(path.read_text(encoding="utf-8").splitlines()) for path in engine)
+    assert f"(`pop_fast/compiled`, {round(lines, -2):,} lines, no dependency)" in speed
     first = timed["first-step"]
     helped, doctor = (first["commands"][f"pop {name}"]["wall_s"] for name in ("train --help", "doctor"))
     said = f"on fox takes {first['first_step']['wall_s']:.1f} s; `pop train --help` takes {helped:.1f} s and"
