@@ -31,6 +31,7 @@ from pop_fast import compiled
 from pop_fast.io.heartbeat import duration
 from pop_fast.train import TrainConfig, automatic
 from pop_fast.train.automatic import Choice
+from pop_fast.train.presets import QUICK_RATES, QUICK_SCALER
 from tests.app.conftest import ROOT
 from tests.app.tiny import tiny_capture
 
@@ -569,6 +570,13 @@ def test_the_guide_says_how_far_off_the_expected_gaussians_were() -> None:
     assert f"small images of these four captures {span('pop')} as many" in guide
     assert f"gsplat's strategy and 3DGS ended {span('gsplat', '3dgs')} as many" in guide
     assert f"or have a budget {span('taming', 'speedy_splat', 'mini_splatting')}" in guide
+    until = {name: f"up to {factor * QUICK_SCALER:.1f}" for name, factor in QUICK_RATES.items()}
+    assert until["scales"] == until["quats"]
+    assert until["means"] == until["sh_rest"]
+    assert (
+        f"scales and rotations {until['scales']} of the schedule, of colours of degree 0 {until['sh0']}, and" in guide
+    )
+    assert f"of centres and other colours {until['means']}" in guide
     runs = read_json(BENCHMARKS / "results" / "quick.json")["runs"]
     ratios = [
         of[which][-1]["gaussians"] / automatic.expected_gaussians("pop", first[scene], pixels, 0, scaler)[0]
