@@ -122,8 +122,8 @@ class Given:
         preset: "paper" is the paper's 30,000 steps, for a GPU or a night; "quick" 1,500 steps at higher rates that
             fall, from coarse photographs to fine ones, with thresholds for small images; "auto" has these thresholds
             and as much of the schedule as the time allows, which `pop train` chooses (it is as "quick" is with no more
-            steps than "quick", and up to 0.6 of the schedule its rates are higher than the paper's); explicit settings
-            win over a preset's defaults.
+            steps than "quick", and up to 0.6 of the schedule some of its rates are higher than the paper's); explicit
+            settings win over a preset's defaults.
         steps_scaler: multiplies the default of every step number; None takes the preset's.
         scale_lambda_pop: divide the default of lambda_pop by the scaler, so that the push of the prior adds up to the
             same over a short schedule; it then weighs more against the photographs than in the paper.

@@ -446,7 +446,17 @@ def test_the_ratios_to_gsplat_on_a_gpu_are_those_of_the_run_that_is_kept():
     ratio = f"{both['270k_1.6MP']['ratios']['step']:.1f} times as fast as gsplat's iteration"
     assert f"takes {step['step_ms']:.2f} ms, {ratio}, and {step['step_with_pop_ms']:.2f} ms with POP's terms" in page
     assert f"The kernels of commit {kernels['commit'][:7]} have run on one NVIDIA H100" in page
+    beside = both["270k_1.6MP"]["ours"]["step_ms"]
+    assert (
+        f"the step took {beside:.2f} ms; with 1,000,000 Gaussians it is {both['1M_1.6MP']['ratios']['step']:.1f}."
+        in page
+    )
     for job in (1, 2):
         stages = json.loads((kept / f"check_{job}.json").read_text(encoding="utf-8"))["stages"]
-        for name in {"smoke", "laws"} & set(stages):
+        for name in {"smoke", "laws", "laws_of_gaussian_parallel", "steps"} & set(stages):
             assert stages[name]["tests"]["failed"] == 0 < stages[name]["tests"]["passed"]
+    # the first of these has two kinds of kernels
+    for name, kinds in (("laws", 2), ("laws_of_gaussian_parallel", 1)):
+        came = {which: stages[name]["tests"][which] // kinds for which in ("passed", "skipped")}
+        assert f"{came['passed']} of the kit's then {sum(came.values())} laws on each" in page
+    assert f"agree with the CPU's ({stages['steps']['tests']['passed']} tests)" in page

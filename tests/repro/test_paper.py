@@ -16,6 +16,8 @@ from typing import Any
 import pytest
 
 from paper_repro import status
+from paper_repro.claims import claims, noise_of
+from paper_repro.evidence import PSNR, compare, groups
 from paper_repro.paper import PAPER, Statement, checks, load, paper, places
 from paper_repro.results import RESULTS, SCALES, Result, read_all, write
 from paper_repro.status import HERE, everything, files, status_table, with_part
@@ -250,6 +252,19 @@ def test_every_open_question_is_listed_with_its_default() -> None:
 )
 def test_what_is_made_from_the_results_is_current(path: Path, text: str) -> None:
     assert path.read_text(encoding="utf-8") == text, "run 'python -m paper_repro.status --write'"
+
+
+def test_the_page_of_the_paper_says_what_four_looks_do_to_the_interval_of_garden() -> None:
+    small = [r for r in FOUND if r.scale == "small"]
+    (reset,) = (c for c in claims("small", small) if c.id == "reset")
+    scenes = reset.told.evidence
+    on_garden = compare("", groups(small)["garden_512"], noise_of(small), PSNR, {"pop": 1.0, "reset": -1.0})
+    half = on_garden.half_width(4 * len(scenes))
+    page = (HERE.parent / "docs" / "paper.md").read_text(encoding="utf-8")
+    assert f"until five decided it:{on_garden.text(len(scenes))}." in page
+    assert f"would be ± {half:.2f} dB, and the claim would still be open there" in page
+    assert on_garden.seeds == (5, 5)
+    assert on_garden.value < half
 
 
 def seeds(row: str, n: int, **more: Any) -> list[Result]:

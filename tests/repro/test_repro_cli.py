@@ -163,6 +163,9 @@ def test_the_papers_scale_begins_with_its_hours_and_what_is_lacking(capsys, tmp_
     assert "less for" not in told[4]
     total = repro_queue.hours_by_row([job_named("pup", "train", "paper")])[-1]
     assert "; less for pup, where the row that they begin from is finished" in total
+    every = repro_queue.hours_by_row(jobs_of("paper"))[-1]
+    said = f"({float(every.split()[0]):.0f} for all rows on all thirteen scenes)"
+    assert said in (Path(results.__file__).parent / "README.md").read_text(encoding="utf-8")
     assert told[5] == "lacking:"
     assert {line.split(" is ")[0] for line in told[6:9]} == {f"  data: {s}" for s in ("train", "truck", "playroom")}
     assert "it comes from https://repo-sam.inria.fr/" in told[6]
