@@ -81,6 +81,7 @@ def rendered(params: dict[str, torch.Tensor], view: ViewTensors, config: TrainCo
         (8, True, (1.0, 0.5, 0.25), "paper"),
         (3, False, (0.2, 0.2, 0.2), "gsplat_1_6"),
         (0, False, (0.0, 0.0, 0.0), "paper"),
+        (15, False, (0.0, 0.0, 0.0), "inria"),
     ],
 )
 def test_a_browser_draws_what_is_rendered(tab, tmp_path, bands, antialiased, background, profile):
@@ -246,6 +247,17 @@ def test_no_drag_leaps_over_the_pole() -> None:
     assert len(upright) > len(moves)
     assert min(upright) > 0.0
     assert max(upright) > 0.9
+
+
+def test_three_fingers_move_as_two_do_and_turn_nothing() -> None:
+    doings = "const finger = (pointerId, clientX) => ({ pointerId, clientX, clientY: 0, buttons: 1 });"
+    doings += "for (const id of [1, 2, 3]) heard.pointerdown(finger(id, 40 * id));"
+    doings += "for (const id of [1, 2, 3]) { heard.pointermove(finger(id, 40 * id + 10)); settle(); }"
+    doings += "console.log(JSON.stringify([drawn[0], drawn.at(-1)]))"
+    page = page_of(many(5), [camera_of(a_view())], TrainConfig(), 3, "x")
+    before, after = np.array(without_browser(page, doings)).reshape(2, 4, 4)
+    np.testing.assert_allclose(after[:3, :3], before[:3, :3], atol=1e-12)
+    assert np.abs(after[3] - before[3]).max() > 0.1
 
 
 @pytest.mark.parametrize(

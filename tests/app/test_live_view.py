@@ -121,6 +121,11 @@ def test_a_threshold_leaves_out_what_is_fainter_and_the_box_that_is_offered_hold
     empty = scene.draw(replace(state, min_opacity=1.0))
     assert empty.legend.startswith("0 of")
     assert np.ptp(empty.image) == 0
+    # violet is transparent, black is nobody's, grey has no depth
+    for mode, color in (("opacity", (68, 1, 84)), ("dominant", (0, 0, 0)), ("depth", (112, 112, 118))):
+        empty = scene.draw(replace(state, min_opacity=1.0, mode=mode))
+        assert (empty.image == color).all(), mode
+    assert empty.legend.endswith("nothing here is opaque enough to have a depth")
     low, high = np.array(scene.extent()).reshape(2, 3)
     means = scene._own_means().numpy()
     assert ((means >= low) & (means <= high)).all(1).mean() > 0.9

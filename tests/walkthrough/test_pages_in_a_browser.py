@@ -297,6 +297,27 @@ def test_a_globe_turns_and_a_gaussian_is_walked_around(page: Page, files: dict[s
         x, y = _middle(page, "[role=application]")
         page.drag((x, y), (x + 60, y + 20))
         assert _reading(page, reading) != turned
+        # a second finger turns nothing nor ends the first one's turn, and the menu's button turns nothing
+        steps = [
+            ("Start", (0, 0)),
+            ("Start", (0, 0), (40, 9)),
+            ("Move", (0, 0), (70, 9)),
+            ("Move", (0, 0)),
+            ("Move", (30, 0)),
+        ]
+        seen = []
+        for kind, *fingers in steps:
+            points = [{"x": x + dx, "y": y + dy, "id": i} for i, (dx, dy) in enumerate(fingers)]
+            page.call("Input.dispatchTouchEvent", type=f"touch{kind}", touchPoints=points)
+            _settle(page)
+            seen.append(_reading(page, reading))
+        assert len(set(seen[:4])) == 1
+        assert seen[4] != seen[3]
+        page.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+        before = _reading(page, reading)
+        for kind, dx in (("mousePressed", 0), ("mouseMoved", 30), ("mouseReleased", 30)):
+            page.call("Input.dispatchMouseEvent", type=kind, x=x + dx, y=y, button="right", buttons=2, clickCount=1)
+        assert _reading(page, reading) == before
         assert page.complaints == []
 
 
@@ -353,9 +374,17 @@ def test_a_page_trains_without_and_with_the_prior(page: Page, files: dict[str, P
     _settle(page)
     _wait_ms(page, 600)
     assert page.ask(drawn)[2] != photo
+    for _ in range(14):
+        page.press("ArrowRight")
+        _wait_ms(page, 120)
     _click(page, "start again")
     _wait_ms(page, 600)
     assert _trained(page, 0) == before
+    # whoever has looked around for long still sees the training go on, a few steps at a time
+    shown = "Number(document.querySelector('[role=status]').textContent.match(/step (\\d+)/)[1])"
+    _click(page, "train")
+    _trained(page, 2)
+    assert page.ask(shown) < 300
     assert page.complaints == []
 
 

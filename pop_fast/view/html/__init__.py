@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from typing import Any, Final
 
@@ -41,6 +41,12 @@ class PageCamera:
     def eye(self) -> np.ndarray:
         """Its place in the world. [3]"""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
+
+    def centred(self) -> PageCamera:
+        """Return it with its axis in the middle of the image."""
+        lens = self.K.copy()
+        lens[:2, 2] = self.width / 2.0, self.height / 2.0
+        return replace(self, K=lens)
 
     def entry(self, distance: float) -> dict[str, Any]:
         """Return what the page reads, with the distance from the eye to the point that the view turns about."""
@@ -184,6 +190,8 @@ def page_of(
 def _scene(means: Tensor, cameras: Sequence[PageCamera], config: TrainConfig) -> dict[str, Any]:
     profile = config.renderer
     chosen = list(cameras) or [camera_of_points(means)]
+    if profile.principal_point == "centred":
+        chosen = [camera.centred() for camera in chosen]
     distances = view_distances(chosen, means)
     return {
         "cameras": [camera.entry(distance) for camera, distance in zip(chosen, distances, strict=True)],
@@ -195,7 +203,8 @@ def _scene(means: Tensor, cameras: Sequence[PageCamera], config: TrainConfig) ->
         "near": profile.near_plane,
         "eps2d": profile.eps2d,
         "margin": profile.frustum_margin,
-        "sigmas": profile.extent_sigmas,
+        # a square is widened to whole tiles, which hold nearly all that is over the floor
+        "sigmas": profile.extent_sigmas if profile.extent == "opacity_aware" else 1e3,
         "floor": profile.alpha_floor,
         "ceiling": profile.alpha_ceiling,
     }

@@ -305,7 +305,7 @@
     if (!before) return;
     const dx = event.clientX - before.clientX, dy = event.clientY - before.clientY;
     pointers.set(event.pointerId, event);
-    if (pointers.size === 2) {
+    if (pointers.size > 1) {
       const [a, b] = [...pointers.values()];
       const apart = Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY);
       if (pinch > 0 && apart > 0) zoom(pinch / apart);

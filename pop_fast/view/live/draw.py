@@ -69,9 +69,6 @@ class SplatScene:
         rows, params = self._selection(state.min_opacity, state.crop)
         n, whole = len(params["means"]), len(self.params["means"])
         shown = f"{n:,} Gaussians" if n == whole else f"{n:,} of {whole:,} Gaussians"
-        if n == 0:
-            background = np.round(np.clip(self.config.background, 0.0, 1.0) * np.float64(255.0)).astype(np.uint8)
-            return Drawing(np.tile(background, (state.height, state.width, 1)), shown)
         ids = state.mode == "dominant"
         layers = render_layers(self._backend, params, state.camera(), self.config, self.sh_degree, dominance=ids)
         image, legend = self._coloured(state, layers, rows)
@@ -99,7 +96,10 @@ class SplatScene:
         if state.mode == "depth":
             depth = np.where(layers.alpha >= _SEEN, layers.depth / self._unit, np.nan)
             near, far = depth_range([depth])
-            return depth_picture(depth, near, far), f"; depth {near:.3g} (yellow) to {far:.3g} units of the capture"
+            if not np.isfinite(depth).any():
+                return depth_picture(depth, near, far), "; nothing here is opaque enough to have a depth"
+            ends = f"{near:.3g} (yellow) to {far:.3g} (violet) units of the capture"
+            return depth_picture(depth, near, far), f"; depth {ends}, logarithmic, grey where nothing is"
         return to_uint8(layers.image), ""
 
     def _selection(self, min_opacity: float, crop: Box | None) -> tuple[Tensor | None, dict[str, Tensor]]:

@@ -128,17 +128,20 @@ const kit = {
       const view = frame.viewBox ? frame.viewBox.baseVal : frame;
       return [((event.clientX - box.left) / box.width) * view.width, ((event.clientY - box.top) / box.height) * view.height];
     };
-    let down = false;
+    let down = null;
     node.addEventListener("pointerdown", (event) => {
-      down = true;
+      // a second finger drags nothing, and a button that opens a menu may never come up here
+      if (event.button || ![null, event.pointerId].includes(down)) return;
+      down = event.pointerId;
       node.setPointerCapture(event.pointerId);
       started(place(event));
       if (node.tabIndex >= 0) node.focus({ preventScroll: true });
       event.stopPropagation();
       event.preventDefault();
     });
-    node.addEventListener("pointermove", (event) => { if (down) moved(place(event)); });
-    for (const end of ["pointerup", "pointercancel"]) node.addEventListener(end, () => { down = false; });
+    const isDown = (event) => event.pointerId === down;
+    node.addEventListener("pointermove", (event) => { if (isDown(event)) moved(place(event)); });
+    for (const end of ["pointerup", "pointercancel"]) node.addEventListener(end, (event) => { if (isDown(event)) down = null; });
   },
 
   arrows(node, step, moved) {

@@ -56,6 +56,7 @@ function stack(root) {
 
   function dragRow(grip, box, i) {
     grip.addEventListener("pointerdown", (event) => {
+      if (event.button) return;
       grip.setPointerCapture(event.pointerId);
       box.classList.add("pw-held");
       event.preventDefault();

@@ -5,7 +5,7 @@ function train(root) {
   const RATES = { means: 4e-3, quats: 1e-2, scales: 1.5e-2, opacities: 5e-2, sh0: 2e-2 };
   const settings = { steps: STEPS, rates: { ...RATES }, lambda_pop: 0.01, theta_blur: 0.01, densify_every: 100, densify_until: STEPS / 2, grow_grad2d: 2e-4, prune_opa: 0.005 };
   const titles = ["without the prior", "with the prior"];
-  let [seed, run, playing, waiting, queued, batch] = [1, 0, false, 0, null, 1];
+  let [seed, run, playing, waiting, queued, batch, asked] = [1, 0, false, 0, null, 1, 0];
   let [angle, shape] = [7.5, "the picture"];
   let history = [[], []];
 
@@ -124,7 +124,8 @@ function train(root) {
 
   function receive(side, data) {
     waiting -= 1;
-    batch = kit.clamp(Math.round((batch * 60) / Math.max(data.took, 5)), 1, 2 * batch);
+    // a picture about every 60 ms, by what the last steps took
+    if (asked) batch = kit.clamp(Math.round((asked * 60) / Math.max(data.took, 5)), 1, 2 * batch);
     if (data.run === run) {
       const { canvas, bars, psnr, n, faint, between } = panels[side];
       canvas.putImageData(new ImageData(data.picture, SIZE), 0, 0);
@@ -150,7 +151,7 @@ function train(root) {
   // both take the same number of steps, so that they can be compared; what is asked while they work waits
   function ask(steps) {
     if (waiting) { queued = Math.max(queued ?? 0, steps); return; }
-    [queued, waiting] = [null, workers.length];
+    [queued, waiting, asked] = [null, workers.length, steps];
     workers.forEach((worker, side) => {
       worker.postMessage({ run, seed, steps, angle, shape, settings: { ...settings, lambda_pop: side ? settings.lambda_pop : 0 } });
     });
