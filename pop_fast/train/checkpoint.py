@@ -62,10 +62,11 @@ def list_checkpoints(result_dir: Path) -> list[tuple[int, Path]]:
 
 
 def prune_checkpoints(result_dir: Path, keep_last: int, keep_steps: set[int]) -> None:
-    """Remove all but the latest `keep_last` checkpoints and those of `keep_steps`."""
+    """Remove all but the latest `keep_last` checkpoints, those of `keep_steps`, and those that a PLY was kept with."""
     found = list_checkpoints(result_dir)
     for step, path in found[: max(len(found) - keep_last, 0)]:
-        if step not in keep_steps:
+        # a resumed run need not be told the steps again after which something is kept
+        if step not in keep_steps and not (result_dir / "ply" / f"point_cloud_{step}.ply").exists():
             path.unlink()
 
 

@@ -101,8 +101,7 @@ class ResultFolder:
         if os.path.lexists(self.path) and not self.path.is_dir():
             what = "a file" if self.path.exists() else "a link to nothing"
             raise PopError(f"{self.path}: is {what}; choose another result folder")
-        if not self.path.exists():
-            check_place(self.path)
+        check_place(self.path / "cfg.json" if self.path.exists() else self.path)
         if self._lock.held:
             return self._check(resume, overwrite)
         self.hold()

@@ -192,8 +192,11 @@ def test_the_last_few_and_the_milestones_are_kept(tmp_path):
     for step in (4, 9, 11, 14, 19):
         ckpt.save_checkpoint(ckpt.checkpoint_path(tmp_path, step), {})
     (tmp_path / "ckpts" / "notes.txt").write_text("")
+    # as a run that was resumed without its --save-steps had kept one
+    (tmp_path / "ply").mkdir()
+    (tmp_path / "ply" / "point_cloud_4.ply").write_text("")
     ckpt.prune_checkpoints(tmp_path, keep_last=2, keep_steps={11})
-    assert [step for step, _ in ckpt.list_checkpoints(tmp_path)] == [11, 14, 19]
+    assert [step for step, _ in ckpt.list_checkpoints(tmp_path)] == [4, 11, 14, 19]
     assert (tmp_path / "ckpts" / "notes.txt").exists()
 
 

@@ -26,7 +26,7 @@ from pop_fast.errors import PopError
 from pop_fast.io import formats
 from pop_fast.io.formats import format_names, load_splat_file
 from pop_fast.io.ply import load_ply
-from pop_fast.train import TrainingRun
+from pop_fast.train import TrainConfig, TrainingRun
 from pop_fast.train.results import ResultFolder
 from tests.app.captures import photograph, write_photograph
 from tests.app.conftest import TRAIN, Outcome, Pop, done
@@ -365,10 +365,20 @@ def test_it_is_said_before_the_long_work(pop: Pop, place: Path, what: str) -> No
 
 
 @pytest.mark.usefixtures("nothing_long")
-@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="a folder that this user may not write to")
-@pytest.mark.parametrize("command", ["render splat.ply --out locked/o", "sfm photos --out locked/o"])
-def test_a_folder_that_may_not_be_written_to_is_said_before_the_long_work(pop: Pop, place: Path, command: str) -> None:
-    (place / "locked").mkdir(mode=0o500)
+@pytest.mark.parametrize(
+    "command",
+    [
+        *("render splat.ply --out locked/o", "sfm photos --out locked/o", "train photos --out locked/o"),
+        *("train photos --out locked --overwrite", "train photos --out locked --resume"),
+    ],
+)
+def test_a_folder_that_may_not_be_written_to_is_said_before_the_long_work(
+    pop: Pop, place: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    (place / "locked").mkdir()
+    (place / "locked" / "cfg.json").write_text(TrainConfig().to_json())
+    # root may write anywhere
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "locked")
     says(pop(*command.split()), "locked", "permission denied")
 
 
