@@ -21,7 +21,8 @@ pytest --pyargs pop_ref.conformance --rasterizer my.module:rasterization --profi
 
 ## Who is judged
 
-One option says what is judged. What is not installed is skipped with the reason.
+One option says what is judged. A `--backend` that is not installed is skipped with the reason; what another option
+names must be there, or the session ends with one line.
 
 - `--rasterizer` names a function with gsplat's signature.
 - `--stages` names a package whose modules have the oracle's function names.
