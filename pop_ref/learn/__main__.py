@@ -42,6 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "train": lambda: train_work(given.folder, the_toy(), given.steps, given.out),
     }
     try:
+        if given.action == "check":
+            refuse_unread(given.all, given.json, given.answer)
         return actions[given.action]()
     except (ValueError, OSError) as error:
         print(f"pop-learn: error: {error}", file=sys.stderr)
@@ -70,6 +72,14 @@ def _parser() -> argparse.ArgumentParser:
     for action in (mapping, training):
         action.add_argument("--out", type=Path, help="the picture; a file in the folder if not given")
     return parser
+
+
+def refuse_unread(every: bool, as_json: bool, wants_answer: bool) -> None:
+    """Raise ValueError for an option of `check` that nothing would read."""
+    if as_json and not every:
+        raise ValueError("--json belongs to --all: check --all --json")
+    if wants_answer and every:
+        raise ValueError("--answer is of one stage: check STAGE --answer, without --all")
 
 
 def write_stubs(folder: Path) -> int:
