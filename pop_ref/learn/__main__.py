@@ -29,7 +29,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit status: 0; 1 for a stage that has not passed yet; 2, with one line on stderr, for what cannot be done,
         and so 130 after Ctrl-C.
     """
-    given = _parser().parse_args(arguments)
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words[:1] == ["check"]:
+        # its options have no values, and argparse reads a stage and a folder only where they stand together
+        words[1:] = sorted(words[1:], key=lambda word: not word.startswith("-"))
+    given = _parser().parse_args(words)
     if given.action == "check" and given.all:
         # the only name is the folder's
         given.folder = Path(given.stage or given.folder)

@@ -449,7 +449,7 @@ def test_bad_input_gets_one_line(
     told_to = capsys.readouterr().err
     assert message in told_to
     assert told_to.count("\n") == 1
-    assert words[0] != "check" or alone.main(["check", *sorted(words[1:]), str(folder)]) == 2
+    assert words[0] != "check" or alone.main([*words, str(folder)]) == 2
 
 
 def test_ctrl_c_ends_a_check_with_a_line(mine, capsys, monkeypatch):
