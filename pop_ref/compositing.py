@@ -98,7 +98,7 @@ def composite_vjp(
         The cotangents, summed over pixels; rows that no pixel blended are exactly zero.
 
     Raises:
-        ValueError: the lists or the background do not fit.
+        ValueError: the lists, the background or a cotangent do not fit.
 
     Example:
         >>> a = np.array
@@ -109,6 +109,10 @@ def composite_vjp(
     rows = rows_from_splats(splats)
     n_channels = splats.colors.shape[1]
     behind = background_or_black(background, n_channels)
+    shapes = {"v_image": (height, width, n_channels), "v_T_final": (height, width)}
+    for (name, shape), v in zip(shapes.items(), (v_image, v_T_final), strict=True):
+        if v is not None and v.shape != shape:
+            raise ValueError(f"{name} has shape {list(v.shape)}; it must be {list(shape)}")
     totals = zero_gradients(len(rows.opacities), n_channels)
     for x, y, ids in listed_pixels(lists, width, height, tile_size):
         px, py = x + 0.5, y + 0.5

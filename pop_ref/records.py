@@ -1,4 +1,4 @@
-"""The values that pass between stages: frozen, validated when made, printed as code that makes them again.
+"""The values that pass between stages, frozen. Gaussians and cameras are validated when made, and print as code.
 
 All arrays are float64 (ids and extents int64). Shapes are in `notation`.
 """

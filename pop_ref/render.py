@@ -74,6 +74,9 @@ def render(
     Returns:
         The image, with the channels of the mode, and everything that was decided on the way.
 
+    Raises:
+        ValueError: the background, the colours, the degree, the tile size or the mode do not fit.
+
     Example:
         >>> g = Gaussians([[0, 0, 4]], [[1, 0, 0, 0]], [[1, 1, 1]], [0.5], [[[0, 0, 0]]])
         >>> K = np.array([[8.0, 0.0, 0.5], [0.0, 8.0, 0.5], [0.0, 0.0, 1.0]])
@@ -127,6 +130,9 @@ def render_vjp(
 
     Returns:
         The cotangents.
+
+    Raises:
+        ValueError: as `render`, or a cotangent has another shape than what it is of.
 
     Example:
         >>> g = Gaussians([[0, 0, 4]], [[1, 0, 0, 0]], [[1, 1, 1]], [0.5], [[[0, 0, 0]]])

@@ -126,6 +126,9 @@ def project(
     Returns:
         The splats, one row per Gaussian; a culled row is zero but for its depth.
 
+    Raises:
+        ValueError: the degree does not fit the coefficients, or `colors` are not of N Gaussians.
+
     Example:
         >>> g = Gaussians([[0, 0, 4]], [[1, 0, 0, 0]], [[1, 1, 1]], [0.5], [[[0, 0, 0]]])
         >>> K = np.array([[8.0, 0.0, 4.0], [0.0, 8.0, 4.0], [0.0, 0.0, 1.0]])
@@ -133,6 +136,8 @@ def project(
         [[7, 7]]
     """
     n, width, height = len(gaussians), camera.width, camera.height
+    if colors is not None and (colors.ndim != 2 or len(colors) != n):
+        raise ValueError(f"colors has shape {list(colors.shape)}; it must be [{n}, D], a row a Gaussian")
     depths = means_cam_from_means(gaussians.means, camera.viewmat)[:, 2]
     front = np.flatnonzero(in_front(depths, profile))
     shape = geometry(_take(gaussians, front), camera, profile, antialiased)

@@ -118,7 +118,8 @@ def rasterization(
         covars: covariances instead of quats and scales. [..., N, 3, 3]
         radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs, viewmats_rs: only None.
         rolling_shutter: only None, or gsplat's `RollingShutterType.GLOBAL`.
-        profile: constants and strictness: "paper", "gsplat_1_5", "gsplat_1_6", "inria", or a `Profile`.
+        profile: constants and strictness: "paper", "gsplat_1_5", "gsplat_1_6", "inria", "speedy_splat", the
+            name of one that is registered, or a `Profile`.
         dominance: compute the dominance keys of meta in the same pass; otherwise reading them costs a second pass.
         counts: the same for n_contrib and n_traversed.
         backend: a backend, or the name of one. "fast" renders on the CPU with torch, "compiled" on the CPU with kernels
@@ -128,12 +129,12 @@ def rasterization(
     Returns:
         Images [..., C, H, W, X], not clamped; alphas [..., C, H, W, 1]; meta with gsplat's keys and `dominant_ids`
         (-1 none), `dominant_weights`, `n_contrib` (blended), `n_traversed`, `final_T` [..., C, H, W], and
-        `dominant_counts` [..., C, N].
+        `dominant_counts` [..., C, N]; `n_pairs`, evaluated pairs of entry and pixel, where a backend counts them.
 
     Raises:
         ValueError: an input's shape, type or value is wrong; the message names it and its index.
-        NotImplementedError: an argument is not supported.
-        PopError: the backend is unknown, cannot run here, or does not offer an argument; says why and what to do.
+        NotImplementedError: an argument is not supported, or not by this backend; says why.
+        PopError: the backend is unknown or cannot run here; says why and what to do.
     """
     given = dict(locals())
     check_given(means=means, opacities=opacities, colors=colors, viewmats=viewmats, Ks=Ks)

@@ -113,11 +113,10 @@ def run(argv: Sequence[str]) -> int:
         return course.show_map(action.folder, action.out)
     if isinstance(action, Train):
         return course.train_work(action.folder, _subject(action), action.steps, action.out)
+    course.refuse_unread(action.all, action.json, action.answer)
     if action.all:
         # what stands first is the folder, as no stage is named
         return course.check_all(Path(action.stage) if action.stage else action.folder, action.json)
-    if action.json:
-        raise ValueError("--json belongs to --all: pop learn check --all --json")
     return course.check(action.stage, action.folder, action.answer)
 
 

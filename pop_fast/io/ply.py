@@ -64,7 +64,8 @@ def save_ply(
         The number of Gaussians before and after that filter.
 
     Raises:
-        PopError: a parameter is absent, of the wrong shape, NaN or Inf; or the file cannot be written.
+        PopError: a parameter is absent, of the wrong shape, NaN or Inf, a quaternion is zero, or the file cannot be
+            written.
     """
     arrays = checked_params(params)
     before = len(arrays["means"])

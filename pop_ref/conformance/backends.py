@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import os
 import sys
 from collections.abc import Callable
 from functools import partial, reduce
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from pop_ref.conformance.adapter import Adapter, OracleAdapter
+from pop_ref.conformance.adapter import STAGE_MODULES, Adapter, OracleAdapter
 from pop_ref.conformance.capabilities import RENDER
 from pop_ref.constants import PAPER, Profile
 
@@ -41,17 +43,28 @@ def function_named(path: str) -> Callable[..., Any]:
     module_name, _, attribute = path.partition(":")
     if not attribute:
         raise ValueError(f"{path!r} must be written module:name, as my.module:rasterization")
-    if "" not in sys.path and os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        raise Unavailable(f"{path} needs {error.name}, which is not installed and not in {os.getcwd()}") from error
+    module = _imported(module_name, path)
     # also of a backend or renderer that is a value of the module, as my.module:renderer.rasterization
     function: Any = reduce(lambda found, name: getattr(found, name, None), attribute.split("."), module)
     if not callable(function):
         raise ValueError(f"module {module_name} has no function {attribute}")
     return function
+
+
+def _imported(module_name: str, path: str) -> ModuleType:
+    if "" not in sys.path and os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    try:
+        return importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise Unavailable(f"{path} needs {error.name}, which is not installed and not in {os.getcwd()}") from error
+
+
+def _require_stages(package: str) -> None:
+    """Raise Unavailable or ValueError, in one line, where a package cannot be imported or has no stage modules."""
+    places = getattr(_imported(package, package), "__path__", None)
+    if not places or not any(importlib.util.find_spec(f"{package}.{name}") for name in STAGE_MODULES):
+        raise ValueError(f"{package} has no stage modules, which carry the oracle's names, as {package}.compositing")
 
 
 def usual(path: str, dtype: str = "float32") -> tuple[str, str]:
@@ -227,6 +240,8 @@ def adapter_for(
         from pop_ref.conformance.torch_adapter import TorchAdapter
 
         function = function_named(path) if path else None
+        if package:
+            _require_stages(package)
         return TorchAdapter(name, function, package, dtype, device, profile, deterministic=deterministic)
     except ModuleNotFoundError as error:
         raise Unavailable(f"{name} needs {error.name}, which is not installed") from error

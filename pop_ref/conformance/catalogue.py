@@ -15,13 +15,14 @@ HEAD = """# What the kit asks of a rasterizer
 Made by `python docs/tables.py --write`; a test holds it to the code.
 
 ```sh
-pip install 'pop-ref[conformance]'
+pip install './pop_ref[conformance]'   # from a clone of pop-splatting
 pytest --pyargs pop_ref.conformance --rasterizer my.module:rasterization --profile gsplat_1_6 --scorecard card.html
 ```
 
 ## Who is judged
 
-One option says what is judged. What is not installed is skipped with the reason.
+One option says what is judged. A `--backend` that is not installed is skipped with the reason; what another option
+names must be there, or the session ends with one line.
 
 - `--rasterizer` names a function with gsplat's signature.
 - `--stages` names a package whose modules have the oracle's function names.
@@ -53,11 +54,11 @@ The kit first tries every argument of gsplat's signature once: several cameras, 
 plain colours of any number of channels, colours of each camera, covariances, radius_clip, planes, no background,
 sparse_grad. A refused argument is skipped by name, with the words of the refusal. A refusal is an argument that the
 signature lacks, a NotImplementedError, a ValueError or TypeError raised by Python code, or a RuntimeError that says
-"unsupported" or "not implemented". Any other error, including an assertion, is a defect: the laws of that argument
-report it, and the scorecard counts it as crashed. For accepted arguments every frame is compared with the oracle's
-render of that frame alone. The gradients of a rasterizer without a backward pass are not judged. A rasterizer that
-refuses harmonics of the third degree gets scenes with the bands that it has. An adapter states them by its attribute
-`sh_degree`, a program by a word of its greeting.
+"unsupported", "not supported", "only supports" or "not implemented". Any other error, including an assertion, is a
+defect: the laws of that argument report it, and the scorecard counts it as crashed. For accepted arguments every frame
+is compared with the oracle's render of that frame alone. The gradients of a rasterizer without a backward pass are not
+judged. A rasterizer that refuses harmonics of the third degree gets scenes with the bands that it has. An adapter
+states them by its attribute `sh_degree`, a program by a word of its greeting.
 
 Every two values of two accepted arguments occur together in some call of a covering array (`pairs.py`), which compares
 images, gradients and meta of every camera. Refusing a combination of two accepted arguments is a defect, too.

@@ -29,7 +29,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit status: 0; 1 for a stage that has not passed yet; 2, with one line on stderr, for what cannot be done,
         and so 130 after Ctrl-C.
     """
-    given = _parser().parse_args(arguments)
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words[:1] == ["check"]:
+        # its options have no values, and argparse reads a stage and a folder only where they stand together
+        words[1:] = sorted(words[1:], key=lambda word: not word.startswith("-"))
+    given = _parser().parse_args(words)
     if given.action == "check" and given.all:
         # the only name is the folder's
         given.folder = Path(given.stage or given.folder)
@@ -42,6 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "train": lambda: train_work(given.folder, the_toy(), given.steps, given.out),
     }
     try:
+        if given.action == "check":
+            refuse_unread(given.all, given.json, given.answer)
         return actions[given.action]()
     except (ValueError, OSError) as error:
         print(f"pop-learn: error: {error}", file=sys.stderr)
@@ -70,6 +76,14 @@ def _parser() -> argparse.ArgumentParser:
     for action in (mapping, training):
         action.add_argument("--out", type=Path, help="the picture; a file in the folder if not given")
     return parser
+
+
+def refuse_unread(every: bool, as_json: bool, wants_answer: bool) -> None:
+    """Raise ValueError for an option of `check` that nothing would read."""
+    if as_json and not every:
+        raise ValueError("--json belongs to --all: check --all --json")
+    if wants_answer and every:
+        raise ValueError("--answer is of one stage: check STAGE --answer, without --all")
 
 
 def write_stubs(folder: Path) -> int:

@@ -283,6 +283,8 @@ REFUSED = {
     ("--strategy", "nowhere.at_all:Strategy"): "needs nowhere, which is not installed",
     ("--strategy", "math:Strategy"): "module math has no function Strategy",
     ("--strategy", "math"): "must be written module:name",
+    ("--stages", "nowhere.at_all"): "nowhere.at_all needs nowhere, which is not installed and not in",
+    ("--stages", "json"): "json has no stage modules",
 }
 
 

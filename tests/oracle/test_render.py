@@ -36,6 +36,7 @@ from pop_ref import (
     margins,
     projection,
     render,
+    render_vjp,
     tiles,
 )
 from pop_ref.chord import chord_midpoint, dominant_points
@@ -256,6 +257,16 @@ def test_lists_and_backgrounds_that_do_not_fit_are_refused() -> None:
         composite(one_splat(), [[0], []], 4, 2, 2, np.zeros(3))
     with pytest.raises(ValueError, match="lists has 1 tiles"):
         composite_vjp(one_splat(), [[0]], 4, 2, 2, np.zeros((2, 4, 2)))
+
+
+@pytest.mark.parametrize("shape", [(9, 7, 3), (11, 9, 3), (7, 9, 5), (7, 9, 1)])
+def test_cotangents_and_colours_of_another_shape_are_refused(shape: tuple[int, int, int]) -> None:
+    gaussians, view = random_gaussians(0), tilted_camera(9, 7)
+    with pytest.raises(ValueError, match=rf"v_image has shape \[{shape[0]}, {shape[1]}, \d\]; it must be \[7, 9, 3\]"):
+        render_vjp(gaussians, view, np.ones(shape))
+    for n in (len(gaussians) + 1, len(gaussians) - 1):
+        with pytest.raises(ValueError, match=rf"colors has shape \[{n}, 3\]; it must be \[{len(gaussians)}, D\]"):
+            render(gaussians, view, colors=np.ones((n, 3)))
 
 
 # The depth modes: by hand for one splat, and as a colour channel that holds depths.

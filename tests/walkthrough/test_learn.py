@@ -431,6 +431,7 @@ def test_the_answer_is_shown_when_asked_twice_or_after_a_pass(mine: Path, capsys
         ({}, ["train"], "not all is written yet: activations"),
         ({}, ["train", "--steps", "-5"], "--steps is -5; give 0, for the start alone, or more"),
         ({}, ["check", "alpha", "--json"], "--json belongs to --all"),
+        ({}, ["check", "--all", "--answer"], "--answer is of one stage"),
         ({}, ["train", "--picture", "a.png", "--scene", "b"], "exclude each other"),
         (None, ["check", "alpha"], "has no stubs; 'pop-learn start"),
         (None, ["map"], "has no stubs; 'pop-learn start"),
@@ -448,6 +449,7 @@ def test_bad_input_gets_one_line(
     told_to = capsys.readouterr().err
     assert message in told_to
     assert told_to.count("\n") == 1
+    assert words[0] != "check" or alone.main([*words, str(folder)]) == 2
 
 
 def test_ctrl_c_ends_a_check_with_a_line(mine, capsys, monkeypatch):
