@@ -428,6 +428,8 @@ def test_a_request_must_name_what_is_listened_on(host: str, arrived_at: str, nam
         headers = Headers({"Host": f"{named}:{port}", "Origin": f"http://{named}:{port}", "Upgrade": "websocket"})
         refused = guard.refusal(Request(f"/{guard.token}", headers), arrived_at)
         assert (refused and refused[0]) == status
+        # a path with a byte that is no text
+        assert (guard.refusal(Request("/\udce9", headers), arrived_at) or [0])[0] == 403
         headers["Host"] = f"{named}:{port}"
         # a second one, which others on the way may read instead of the first
         assert guard.refusal(Request(f"/{guard.token}", headers), arrived_at)

@@ -250,7 +250,7 @@ class Guard:
         if (origins or socket_asked) and [origin.lower() for origin in origins] != [f"http://{hosts[0].lower()}"]:
             return HTTPStatus.FORBIDDEN, "Only the viewer's own page may connect.\n"
         word = request.path.partition("?")[0].split("/")[1:2]
-        if not word or not hmac.compare_digest(word[0].encode(), self.token.encode()):
+        if not word or not hmac.compare_digest(word[0].encode(errors="surrogateescape"), self.token.encode()):
             return HTTPStatus.FORBIDDEN, "Open the whole address that was printed, with the word after the port.\n"
         if socket_asked and self._views >= MOST_VIEWS:
             return HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_VIEWS} browsers are already connected.\n"
