@@ -284,7 +284,8 @@ def refuse_several(root: Path, besides: Path | None = None) -> None:
     found: list[Path] = []
     for path in sorted(root.iterdir()):
         written = besides is not None and path.resolve() == besides.resolve()
-        closed = not os.access(path, os.R_OK | os.X_OK)  # as lost+found is, at the top of a disk
+        # as lost+found is, at the top of a disk
+        closed = not os.access(path, os.R_OK | os.X_OK)
         if written or closed or path.name[0] == "." or not path.is_dir() or not _lists(path):
             continue
         own = {image.name for image in list_images(path)}
