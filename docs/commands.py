@@ -253,7 +253,10 @@ def sections(folder: Path, runs: tuple[Run, ...], program: str, commands: dict[s
             yield f"## {program} {run.of}\n\n{sentence(commands[run.of])}"
             before = run.of
         print(run.words, file=sys.stderr, flush=True)
-        yield f"```console\n$ {run.words}\n{shown(ran(run, folder), folder)}\n```"
+        text = shown(ran(run, folder), folder)
+        # longer than any fence within, as of what `pop-repro claims` prints
+        fence = "`" * max([3, *(len(inner) + 1 for inner in re.findall(r"^`{3,}", text, re.MULTILINE))])
+        yield f"{fence}console\n$ {run.words}\n{text}\n{fence}"
         png = drawn(run, folder)
         if png is not None:
             yield f"![{run.caption or run.of}]({PICTURES.name}/{png.name})"
@@ -312,7 +315,8 @@ def lacking(text: str) -> list[str]:
         f"{program} {name}"
         for program, commands in wanted.items()
         for name, summary in commands.items()
-        if f"## {program} {name}\n\n{sentence(summary)}\n\n```console\n$ {program} {name}" not in text
+        if f"## {program} {name}\n\n{sentence(summary)}\n\n```console\n$ {program} {name}"
+        not in text.replace("````", "```")
     ]
 
 

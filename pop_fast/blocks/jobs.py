@@ -204,7 +204,8 @@ def run_workflow(
         The exit status: Snakemake's, or 130 after Ctrl-C or SIGTERM.
     """
     more = ["--quiet", "all"] if quiet else []
-    return _run(workflow_words(folder, job, jobs, threads, backend, profile, *more), quiet)
+    # after Ctrl-C Snakemake cancels a cluster's jobs, for which it waits after SIGTERM
+    return _run(workflow_words(folder, job, jobs, threads, backend, profile, *more), quiet, signal.SIGINT)
 
 
 def workflow_words(
@@ -223,8 +224,11 @@ def workflow_words(
     return [*command, *where, *more, "--config", *(f"{name}={value}" for name, value in settings.items())]
 
 
-def _run(words: Sequence[str], quiet: bool) -> int:
-    """Run a process and wait; the first Ctrl-C, SIGTERM or SIGHUP is passed on once to it and its children."""
+def _run(words: Sequence[str], quiet: bool, passed: signal.Signals = signal.SIGTERM) -> int:
+    """Run a process and wait; the first Ctrl-C, SIGTERM or SIGHUP is passed on once to it and its children.
+
+    It is passed on as SIGTERM, which ends a Python that is still being loaded without a traceback.
+    """
     alone = os.name == "posix"
     with stop_requests() as stop:
         shown = subprocess.DEVNULL if quiet else None
@@ -233,7 +237,7 @@ def _run(words: Sequence[str], quiet: bool) -> int:
         try:
             while process.poll() is None:
                 if stop.asked:
-                    _interrupt(process, alone)
+                    _interrupt(process, alone, passed)
                     process.wait()
                     return 128 + signal.SIGINT
                 time.sleep(_PAUSE)
@@ -244,8 +248,8 @@ def _run(words: Sequence[str], quiet: bool) -> int:
     return process.returncode if process.returncode >= 0 else 128 - process.returncode
 
 
-def _interrupt(process: subprocess.Popen[bytes], alone: bool) -> None:
+def _interrupt(process: subprocess.Popen[bytes], alone: bool, number: signal.Signals) -> None:
     if alone:
-        os.killpg(process.pid, signal.SIGINT)
+        os.killpg(process.pid, number)
     else:
         process.terminate()

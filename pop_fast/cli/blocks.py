@@ -211,8 +211,8 @@ def _merge(folder: Path, config: TrainConfig, record: CaptureRecord, job: Job, p
     for line in merged_lines(stats):
         print(line)
     print(summary(stats), flush=True)
-    status = finish_and_report(folder, capture, options)
+    status = finish_and_report(folder, capture, options, config.progress)
     if status == 0:
         write_file(part.marker(folder), b"")
-        print(f"pop report {quote(str(folder))} --check adds the parts that need all photographs", file=sys.stderr)
+        print(f"pop report {quote(str(folder))} --check adds the parts that need all photographs", flush=True)
     return status

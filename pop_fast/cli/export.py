@@ -266,11 +266,13 @@ class FinishOptions(LimitOptions):
     skip_checks: bool = False
 
 
-def finish(folder: Path, capture: Capture, options: Any) -> int:
+def finish(folder: Path, capture: Capture, options: Any, progress: bool = True) -> int:
     """Write what surrounds a run whose results are complete; see `after_results`."""
     own = FinishOptions(**{f.name: getattr(options, f.name) for f in fields(FinishOptions)})
     left = f"the results in {folder} are complete; the same command writes the rest, pop train with --resume"
-    return after_results(lambda: _finish(folder, capture, own), "writing what surrounds the results", "", left)
+    return after_results(
+        lambda: _finish(folder, capture, own, progress), "writing what surrounds the results", "", left
+    )
 
 
 def after_results(write: Callable[[], object], doing: str, failed: str, left: str) -> int:
@@ -292,7 +294,7 @@ def after_results(write: Callable[[], object], doing: str, failed: str, left: st
     return 0
 
 
-def _finish(folder: Path, capture: Capture, options: FinishOptions) -> None:
+def _finish(folder: Path, capture: Capture, options: FinishOptions, progress: bool) -> None:
     splat = load_splat(folder)
     shown = Shown(
         params=splat.params,
@@ -301,6 +303,7 @@ def _finish(folder: Path, capture: Capture, options: FinishOptions) -> None:
         world_transform=capture.world_transform,
         photographed=lambda: (capture, splat.config),
         checkpoint=splat.path,
+        progress=progress,
     )
     page = page_output(capture.train_views(splat.config.test_every), splat.config, splat.sh_degree, folder)
     # what the page and the table of sizes show, and every file whose size is not limited
@@ -314,19 +317,21 @@ def _finish(folder: Path, capture: Capture, options: FinishOptions) -> None:
         left.write(folder / EXPORTS / file_name(folder.resolve().name, name), output)
     write_file(folder / VIEWER, page.write(kept.params))
     if not options.skip_sizes:
-        _sizes(folder, splat, capture, kept.params)
+        with Heartbeat(progress) as beat:
+            beat.say("measuring the splat in every file format")
+            _sizes(folder, splat, capture, kept.params)
     if not options.skip_checks:
-        checked(folder, splat, capture, splat.config)
+        checked(folder, splat, capture, splat.config, progress)
 
 
-def checked(folder: Path, splat: Splat, capture: Capture, config: TrainConfig) -> None:
+def checked(folder: Path, splat: Splat, capture: Capture, config: TrainConfig, progress: bool = True) -> None:
     """Render and measure what the report shows besides the results; see `pop_fast.view.report.checks`."""
     from pop_fast.train.engines import renderer
     from pop_fast.train.environment import reproducible
     from pop_fast.view.report.checks import write_checks
 
     backend, _ = renderer(config.backend)
-    with reproducible(config.threads), Heartbeat() as beat:
+    with reproducible(config.threads), Heartbeat(progress) as beat:
         beat.say("rendering depth and the orbit for the report")
         step = config.max_steps - 1 if splat.step is None else splat.step
         write_checks(folder, capture, splat.params, config, splat.sh_degree, backend, step)

@@ -107,6 +107,7 @@ class Shown:
     # opens its capture, and gives the settings to look at it with; None where none is known
     photographed: Callable[[], tuple[Capture, TrainConfig]] | None
     checkpoint: Path | None = None  # that it was read from, if any
+    progress: bool = True  # whether to show how far long work is
 
 
 @dataclass(frozen=True)
@@ -228,7 +229,7 @@ def _fit_seen(left: Limited, limits: LimitOptions, output: Output, shown: Shown,
     if learned is None:
         left.said.append(_NOT_TUNED)
         steps = 0
-    with _told() as report:
+    with _told(shown.progress) as report:
         tuner = compact.Tuner(left.params, shown.sh_degree, config, capture, learned or {}, steps, report)
         if limits.target_mb is None:
             left.params = compact.tuned_to_the_end(tuner) if steps else left.params
@@ -252,17 +253,17 @@ _NOT_TUNED: Final = "not fine-tuned: only the checkpoints hold what the run lear
 
 
 @contextmanager
-def _told() -> Iterator[Callable[[int, int, float | None], None]]:
+def _told(progress: bool) -> Iterator[Callable[[int, int, float | None], None]]:
     """Show how far fine-tuning is, and say once how long it takes."""
     told = False
-    with bars() as progress:
+    with bars(progress) as bar:
 
         def report(done: int, planned: int, seconds: float | None) -> None:
             nonlocal told
             if seconds is not None and not told:
                 told = True
                 print(f"fine-tuning: about {duration(seconds)}; --fine-tune-steps 0 skips it", flush=True)
-            progress("fine-tuning", done, planned)
+            bar("fine-tuning", done, planned)
 
         yield report
 
@@ -292,7 +293,7 @@ def _leave_out_floaters(left: Limited, limits: LimitOptions, shown: Shown) -> No
     if not veils.any():
         return
     left.keep(~veils, "without veils")
-    with _told() as report:
+    with _told(shown.progress) as report:
         tuner = compact.Tuner(left.params, degree, config, capture, learned, steps, report)
         left.params = compact.tuned_to_the_end(tuner)
     grown = are_floaters(left.params["means"], capture, config.test_every)

@@ -290,12 +290,12 @@ def _trained(training: TrainingRun, folder: Path, capture: Capture, options: Any
     if not _writes(ranks):
         return 0
     print(summary(stats), flush=True)
-    return finish_and_report(folder, capture, options)
+    return finish_and_report(folder, capture, options, training.config.progress)
 
 
-def finish_and_report(folder: Path, capture: Capture, options: Any) -> int:
+def finish_and_report(folder: Path, capture: Capture, options: Any, progress: bool) -> int:
     """Write what surrounds a run whose results are complete; a file that cannot be written costs no report."""
-    status = finish(folder, capture, options)
+    status = finish(folder, capture, options, progress)
     return status if status == EXIT_INTERRUPTED else report(folder) or status
 
 
@@ -315,7 +315,7 @@ def arguments(argv: Sequence[str]) -> tuple[TrainConfig, Any]:
     """Read the words after `pop train` into settings of the run and of what surrounds it."""
     words = rename_aliases(argv)
     short_help = "--help" in words or "-h" in words
-    words = ["--help" if word == "--help-all" else word for word in words]
+    words = ["--help" if word in ("--help-all", "--help_all") else word for word in words]
     # method, preset and scaler first: they decide the defaults of the rest, which --help shows
     plan = plan_of(words)
     base = TrainConfig.of(**plan, result_dir="")

@@ -329,7 +329,7 @@ def test_processes_use_as_many_gpus_as_they_are(tmp_path: Path, monkeypatch: pyt
 def test_each_block_is_trained_on_a_gpu_of_its_own(pop, shared_capture, tmp_path, eight_gpus, monkeypatch):
     begun: list[list[str]] = []
     monkeypatch.setattr(jobs, "has_snakemake", lambda: True)
-    monkeypatch.setattr(jobs, "_run", lambda words, quiet: begun.append(list(words)) or 0)
+    monkeypatch.setattr(jobs, "_run", lambda words, quiet, *_: begun.append(list(words)) or 0)
     folder = tmp_path / "blocks"
     words = ("train", shared_capture, "--out", folder, *TRAIN, "--skip-sizes", "--threads", "3", "--blocks", "2x1")
     pop.done(*words)

@@ -13,6 +13,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -30,7 +31,7 @@ from pop_fast.blocks.jobs import block_folder, parts_of
 from pop_fast.blocks.plan import Job, Partition, Plan, divide, grid_of, make_plan, read_job, read_plan
 from pop_fast.blocks.rounds import write_round_block
 from pop_fast.blocks.run import TAKEN
-from pop_fast.children import module_command
+from pop_fast.children import module_command, python_command
 from pop_fast.cli import main
 from pop_fast.data.capture import Capture, View
 from pop_fast.data.load import in_picture, list_capture, load_capture, write_block
@@ -702,6 +703,14 @@ TRAININGS = {"block_0_0": 1, "block_1_0": 1}
 def begun(shared_capture: Path, made_once: Callable[..., Path]) -> Path:
     """A run whose capture is divided, and whose blocks are not trained."""
     return trained(made_once, "workflow", [shared_capture, *BLOCKS], lambda words, quiet: 0)
+
+
+@pytest.mark.processes
+@pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
+def test_a_part_that_is_still_being_loaded_is_stopped_without_a_traceback(capfd):
+    threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+    assert jobs._run(python_command("-c", "import time; time.sleep(60)"), False) == 130
+    assert capfd.readouterr().err == ""
 
 
 @pytest.fixture

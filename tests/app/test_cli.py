@@ -123,7 +123,7 @@ def test_help_shows_what_matters_first_and_help_all_all(pop: Pop) -> None:
     ]
     assert [text.count("(default: chosen)") for text in whole] == [3, 0]
     assert ["training steps, of `batch_size` views each. (default: chosen)" in text for text in whole] == [True, False]
-    assert "--pop.theta-blur" in pop("train", "--help-all").out
+    assert "--pop.theta-blur" in pop("train", "--help_all").out
     # it begins with what is trained and ends with blocks
     names = ("method {", "factor INT", "resume,", "export [", "crop {", "blocks {")
     places = [shown.index(f"--{name}") for name in names]

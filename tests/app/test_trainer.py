@@ -29,7 +29,7 @@ from pop_fast.train.torch_stepper import PhotoLoss
 from pop_fast.train.views import ViewTensors
 from pop_ref.settings import Objective
 from tests.app.captures import assert_one_line, cloud, photograph, ring
-from tests.app.conftest import TRAIN, wait_until
+from tests.app.conftest import TRAIN, TRAIN_AND_CHECK, wait_until
 from tests.app.tiny import HEIGHT, WIDTH, records, tiny_capture, tiny_config
 
 
@@ -415,7 +415,9 @@ def test_training_tells_how_far_it_is(pop, shared_capture, tmp_path, monkeypatch
     steps = [line for line in told.err.splitlines() if line.startswith("pop: step ")]
     assert steps
     assert all(" of 30, " in line and " Gaussians" in line and line.endswith(" s)") for line in steps)
-    assert pop("train", shared_capture, "--out", tmp_path / "q", *TRAIN).err == ""
+    # also of what comes after the last step
+    words = (*TRAIN_AND_CHECK, "--max-gaussians", "50", "--fine-tune-steps", "2", "--quiet")
+    assert pop("train", shared_capture, "--out", tmp_path / "q", *words).err == ""
 
 
 def test_times_are_written_as_people_say_them() -> None:

@@ -121,6 +121,12 @@ def test_the_rooms_share_most_of_their_functions_and_documented_differences_are_
     assert set(OTHER_PARAMETERS) <= {name for name, _, _ in BOTH_ROOMS}
 
 
+def anchors(page: Path) -> set[str]:
+    """Name the headings of a page as links do."""
+    heads = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", head.lower()).replace(" ", "-") for head in heads}
+
+
 REPRODUCTION = [ROOT / "paper_repro" / name for name in ("README.md", "protocol.md", "claims.md")]
 
 
@@ -132,6 +138,8 @@ def test_every_link_leads_somewhere_and_no_conflict_of_a_merge_is_left(page):
     assert not re.search(r"^(<<<<<<<|>>>>>>>) ", text, re.MULTILINE)
     targets = re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text)
     assert [target for target in targets if "://" in target or not (page.parent / target).exists()] == []
+    places = re.findall(r"\]\(((?:[^)#]+\.md)?)#([^)]+)\)", text)
+    assert [place for file, place in places if place not in anchors(page.parent / file if file else page)] == []
 
 
 def test_what_contributors_are_led_to_is_there() -> None:
@@ -241,6 +249,8 @@ def test_every_command_was_run_and_is_shown_and_none_failed() -> None:
     assert SCRIPT["lacking"](PAGE.replace("## pop eval", "## pop evaluate")) == ["pop eval"]
     typed = [run.words for run in (*SCRIPT["RUNS"], *SCRIPT["REPRO"])]
     assert re.findall(r"^\$ (.*)$", PAGE, flags=re.MULTILINE) == typed
+    outside = re.sub(r"^(`{3,})\w*\n.*?^\1$", "", PAGE, flags=re.MULTILINE | re.DOTALL)
+    assert re.findall(r"^## (.*)$", outside, re.MULTILINE) == re.findall(r"^## (pop\b.*)$", PAGE, re.MULTILINE)
     assert "Traceback" not in PAGE
     assert "error:" not in PAGE
     assert not re.search(r"(^|[\s\"'(])/(tmp|home|root|work|Users)\b", PAGE)
