@@ -469,4 +469,6 @@ def test_the_ratios_to_gsplat_on_a_gpu_are_those_of_the_run_that_is_kept():
     for name, kinds in (("laws", 2), ("laws_of_gaussian_parallel", 1)):
         came = {which: stages[name]["tests"][which] // kinds for which in ("passed", "skipped")}
         assert f"{came['passed']} of the kit's then {sum(came.values())} laws on each" in page
+        said = f"passed those {came['passed']} of {sum(came.values())} laws that they can be asked"
+        assert said in (ROOT / "README.md").read_text(encoding="utf-8")
     assert f"agree with the CPU's ({stages['steps']['tests']['passed']} tests)" in page
