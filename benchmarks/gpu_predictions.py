@@ -11,8 +11,8 @@ of each kernel, for one case on an H200:
 
 Beside it stands what `gpu_check` has measured (`results/gpu/kernels.json`), with the floor on that card. The third
 compares with gsplat (`results/gpu/gsplat.json`), the fourth is what the hardware's counters say of every kernel
-(`results/gpu/counters.json`). The last is `cuda_ext.training.batch_step.step_bytes`, which a test holds to what
-emulated ranks count.
+(`results/gpu/counters.json`). The last two are `step_bytes` and `held_bytes` of `cuda_ext.training.batch_step`, which
+tests hold to what emulated ranks count.
 
 The instructions of the blend and of the tiles that are tried are counted in the machine code for sm_90, the loss's are
 estimated from its loops there. A floor is the largest of five times: for the bytes, at the bandwidth that this card
@@ -35,7 +35,7 @@ import torch
 from record import read_json, with_table
 
 from cuda_ext.machine_code.count_sass import sources
-from cuda_ext.training.batch_step import step_bytes
+from cuda_ext.training.batch_step import held_bytes, step_bytes
 
 NOTES = Path(__file__).resolve().parent / "NOTES.md"
 MEASURED = NOTES.parent / "results" / "gpu"
@@ -210,10 +210,22 @@ def exchanged() -> str:
     return "\n".join(lines)
 
 
+def held() -> str:
+    """Make the table of bytes that a rank holds for Gaussians."""
+    lines = ["| Gaussians, ranks | before, GB | every view shows all, GB | a tenth, GB |", "|---|---|---|---|"]
+    for n, size in TOGETHER:
+        shown_all, tenth = (held_bytes(n, size, size, shown) for shown in (1.0, 0.1))
+        # there was room for all splats, and the others' moments were held too
+        before = sum(shown_all.values()) + 2 * 4 * 59 * n * (size - 1) / size
+        cells = [before, *(sum(of.values()) for of in (shown_all, tenth))]
+        lines.append(f"| {n:,}, {size} | {' | '.join(f'{bytes_ / 1e9:,.2f}' for bytes_ in cells)} |")
+    return "\n".join(lines)
+
+
 def tables() -> dict[str, str]:
     """Make the tables, by their marks in NOTES.md."""
     of_kernels = {"machine code": machine_code(SASS), "predictions": predictions(), "beside gsplat": beside_gsplat()}
-    return {**of_kernels, "counters": counters(), "ranks": exchanged()}
+    return {**of_kernels, "counters": counters(), "ranks": exchanged(), "held": held()}
 
 
 def with_tables(text: str) -> str:

@@ -1,21 +1,23 @@
 """Steps of several views on GPUs, each with Gaussians of its own, as Grendel (arXiv 2406.18533) shares a training out.
 
 A process owns a stretch of the Gaussians: it projects them for every view of a step, and sends the splats that a view
-shows to the process that draws it. What draws a view has all its splats in the order of their rows, so that lists and
-sums are those of one process. Gradient sums and dominated pixels go back; the owner adds up the gradients of the views
-in the order of the batch, moves its Gaussians by the mean, and keeps their statistics. Bits do not depend on how many
-processes there are, since no two of them add to one number.
+shows to the process that draws it. That has them in the order of their rows, so that lists and sums are those of one
+process. Gradient sums and dominated pixels go back; the owner adds up the gradients of the views in the order of the
+batch, moves its Gaussians by the mean, and keeps their statistics. Bits do not depend on how many processes there are,
+since no two of them add to one number.
 
-    for each view:      project own rows -> the splats that it shows                        68 bytes a splat, sent
+    for each view:      project own rows -> the splats that it shows                        64 bytes a splat, sent
     for own views:      lists, blend, loss, blend back
     for each view:      sums and dominated pixels, back                                     40 bytes a splat, sent
                         gradients of own rows, added up; with the last view Adam
 
-A process holds the others' rows as these were when `synchronize` was last called.
+A process holds the others' rows as these were when `synchronize` was last called, and nobody else's moments. Where the
+Gaussians have changed, moments go to those that own their rows now: 472 bytes each, sent.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
@@ -57,9 +59,15 @@ STRETCH: Final = 32
 # floats of a record, and of a row of sums, that three channels fill
 _RECORD: Final = 10
 _SUMS: Final = 9
-# what is sent of a splat, and what comes back of it, floats: a record, depth, conic, extents and row; sums and a count
-SENT: Final = _RECORD + 1 + 3 + 2 + 1
+# what is sent of a splat, and what comes back of it, floats: a record, depth, conic and extents; sums and a count
+SENT: Final = _RECORD + 1 + 3 + 2
 RETURNED: Final = _SUMS + 1
+# of the splats that a view shows, the room for more than it had: a fourth
+_SPARE: Final = 4
+# floats of a packed splat and of its row of sums, `RECORD` of csrc/launch.h
+_ROW: Final = 12
+# bytes of a Gaussian's statistics: gradient sum, views, dominated pixels, blur
+_STATISTICS: Final = 13
 # the POP term and the regularizers are told as sums of whole numbers, which no order changes; scales have no bound
 _POP_UNIT: Final = 2.0**30
 _OWN_UNIT: Final = 2.0**20
@@ -85,13 +93,46 @@ def step_bytes(n: int, size: int, n_views: int, shown: float, steps: int, n_rest
         n_rest: coefficients of colour above the first, three channels each.
 
     Returns:
-        Bytes by the names of `BatchTrainer.received`.
+        Bytes by the names of `BatchTrainer.received`; those of moments are what a change that moves every row to
+        another process would send.
     """
     of_others = (size - 1) / size
-    # parameters and both moments; gradient sum, views, dominated pixels, blur
-    row = 4 * 3 * (3 + 4 + 3 + 1 + 3 + 3 * n_rest) + 13
+    numbers = _numbers(n_rest)
+    row, moments = 4 * numbers + _STATISTICS, 2 * 4 * numbers
     crossing = shown * n * n_views / size * of_others
-    return {"splats": 4 * SENT * crossing, "sums": 4 * RETURNED * crossing, "rows": row * n * of_others / steps}
+    return {
+        "splats": 4 * SENT * crossing,
+        "sums": 4 * RETURNED * crossing,
+        "rows": row * n * of_others / steps,
+        "moments": moments * n / size * (size > 1) / steps,
+    }
+
+
+def held_bytes(n: int, size: int, n_views: int, shown: float, n_rest: int = 15) -> dict[str, float]:
+    """Return how many bytes a process holds for Gaussians, where all is spread evenly; lists by tile come on top.
+
+    Args:
+        n, size, n_views, shown, n_rest: as `step_bytes` takes them.
+
+    Returns:
+        "whole": of all Gaussians, their parameters and statistics. "drawn": of the splats of a view that it draws.
+        "own": of its own Gaussians, both moments, gradients, and what each view makes of them.
+    """
+    numbers = _numbers(n_rest)
+    # packed splats and sums; means, depths, conics, opacities, extents
+    splat = 2 * 4 * _ROW + 36
+    # a view keeps conics, opacities, extents and the side of the POP term; dominated pixels are counted
+    own = 3 * 4 * numbers + splat + n_views * 25 + 1 + 4
+    return {
+        "whole": n * (4 * numbers + _STATISTICS),
+        "drawn": min(1.0, shown * (1.0 + 1.0 / _SPARE)) * n * splat,
+        "own": own * n / size,
+    }
+
+
+def _numbers(n_rest: int) -> int:
+    """Return how many numbers a Gaussian has."""
+    return 3 + 4 + 3 + 1 + 3 + 3 * n_rest
 
 
 @dataclass(frozen=True)
@@ -113,7 +154,8 @@ class BatchTrainer:
     """Owns the device's side of training between two densification steps; see `train_step.FusedTrainer`.
 
     Args:
-        params, m, v: raw parameters and Adam's moments, of all Gaussians; updated in place.
+        params: raw parameters of all Gaussians; updated in place.
+        m, v: Adam's moments of all Gaussians, on any device, of which own ones are copied.
         views: the resident photographs and cameras.
         order: the views of every step of the schedule, `n_views` each.
         settings: objective and update.
@@ -139,31 +181,50 @@ class BatchTrainer:
         self._order, self._ranks, self._capacity = list(order), ranks, Capacity(views.sizes)
         self._history: dict[int, list[float]] = {}
         # bytes that other processes have sent here, by what they are
-        self.received = {"splats": 0, "sums": 0, "rows": 0}
+        self.received = {"splats": 0, "sums": 0, "rows": 0, "moments": 0}
         with torch.cuda.device_of(params["means"]):
             self._shared = Shared.make(settings, views, self._order, step, self.device)
         self._schedule = schedule(self._shared, n_views)
         self.rebind(params, m, v)
 
     def rebind(self, params: Rows, m: Rows, v: Rows) -> None:
-        """Take new rows after a densification step: buffers and statistics start anew."""
-        n = len(params["means"])
+        """Take new rows, and own ones of their moments: buffers and statistics start anew."""
         self._programs: dict[tuple[Size, Phase], DrawProgram] = {}
         self._frames: dict[Size, FrameBuffers] = {}
+        self._drawn: SplatBuffers | None = None
+        own = self._own(stretches(len(params["means"]), self._ranks.size))
+        self._bind(params, *({key: of[key][own].to(self.device, copy=True) for key in of} for of in (m, v)))
+
+    def regroup(self, params: Rows, origins: Rows) -> None:
+        """Take new rows after a densification step, and own ones' moments from those that had the rows before it.
+
+        Args:
+            params: raw parameters of all Gaussians.
+            origins: for each parameter the former place of each row, from 1, or 0 for moments of zero. int32 [N]
+        """
+        # what the old number of Gaussians needed goes first; moments of one parameter at a time are there twice
+        self._of_place, self._programs, self._frames, self._drawn = [], {}, {}, None
+        moved = {key: self._moved(key, origins[key]) for key in params}
+        self._bind(params, *({key: of[place] for key, of in moved.items()} for place in (0, 1)))
+
+    def _own(self, bounds: Sequence[int]) -> slice:
+        return slice(*bounds[self._ranks.rank : self._ranks.rank + 2])
+
+    def _bind(self, params: Rows, m: Rows, v: Rows) -> None:
+        n = len(params["means"])
         self._capacity.settle(n)
         self._bounds = stretches(n, self._ranks.size)
-        self._first, last = self._bounds[self._ranks.rank : self._ranks.rank + 2]
-        own = slice(self._first, last)
+        own = self._own(self._bounds)
+        self._first = own.start
         with torch.cuda.device_of(params["means"]):
             waits = params["shN"].shape[1] if self.settings.updates.sh_rest_every > 1 else None
             self.statistics = KernelStatistics.zeros(n, self.device, waits)
-            self._whole = [dict(group) for group in (params, m, v)]
-            own_params, own_m, own_v = ({key: tensor[own] for key, tensor in group.items()} for group in self._whole)
-            own_rows = RowBuffers.make(own_params, own_m, own_v, self.statistics.rows(own))
+            self._whole, self._moments = dict(params), (dict(m), dict(v))
+            own_params = {key: tensor[own] for key, tensor in params.items()}
+            own_rows = RowBuffers.make(own_params, *self._moments, self.statistics.rows(own))
             self._of_place = [self._seen_by_a_view(own_rows) for _ in range(self.n_views)]
             self._counts = torch.zeros(len(own_rows), dtype=torch.int32, device=self.device)
             self._gradients = {key: torch.zeros_like(tensor) for key, tensor in own_params.items()}
-            self._drawn = SplatBuffers.make(n, self.device)
         self._gaussians = gaussians(own_rows)
 
     def _seen_by_a_view(self, rows: RowBuffers) -> RowBuffers:
@@ -197,11 +258,54 @@ class BatchTrainer:
         return {**told, **self.views.facts()}
 
     def synchronize(self) -> None:
-        """Give every process what the others have moved and counted."""
-        tensors = [tensor for group in self._whole for tensor in group.values()]
-        for tensor in (*tensors, *(found for found in vars(self.statistics).values() if found is not None)):
+        """Give every process what the others have moved and counted, but for moments."""
+        found = (*self._whole.values(), *vars(self.statistics).values())
+        for tensor in (tensor for tensor in found if tensor is not None):
             self._ranks.share(tensor, self._bounds)
             self.received["rows"] += tensor.nbytes - tensor[: len(self._of_place[0])].nbytes
+
+    def moments(self) -> dict[str, dict[str, Tensor]]:
+        """Return all Gaussians' moments by parameter and torch's names, on the CPU, at process 0; empty ones elsewhere.
+
+        One tensor after the other passes through the GPU of process 0.
+        """
+        ranks = self._ranks
+        lengths = [high - low for low, high in itertools.pairwise(self._bounds)]
+
+        def whole(own: Tensor) -> Tensor:
+            sent = [own, *[own[:0]] * (ranks.size - 1)]
+            return torch.cat(ranks.exchange(sent, lengths if ranks.writes else [0] * ranks.size)).cpu()
+
+        m, v = self._moments
+        return {key: {"exp_avg": whole(m[key]), "exp_avg_sq": whole(v[key])} for key in m}
+
+    def _moved(self, key: str, origins: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the moments of one parameter's own rows as they will be, having sent the others theirs.
+
+        Args:
+            origins: as `regroup` takes them.
+        """
+        ranks, former = self._ranks, self._bounds
+        m, v = (of.pop(key) for of in self._moments)
+        bounds = stretches(len(origins), ranks.size)
+        wanted = [origins[first:last] for first, last in itertools.pairwise(bounds)]
+
+        def held_by(rank: int, rows: Tensor) -> Tensor:
+            return (rows > former[rank]) & (rows <= former[rank + 1])
+
+        places = [(rows[held_by(ranks.rank, rows)] - 1 - former[ranks.rank]).long() for rows in wanted]
+        own = wanted[ranks.rank]
+        comes = [held_by(rank, own) for rank in range(ranks.size)]
+        lengths = [int(mask.sum()) for mask in comes]
+        moved = []
+        for moments in (m, v):
+            received = ranks.exchange([moments[rows] for rows in places], lengths)
+            self._note("moments", received)
+            there = moments.new_zeros((len(own), *moments.shape[1:]))
+            for mask, rows in zip(comes, received, strict=True):
+                there[mask] = rows
+            moved.append(there)
+        return moved[0], moved[1]
 
     def _step(self, phase: Phase) -> int | None:
         """Take a step, or return the row that is not finite."""
@@ -242,9 +346,8 @@ class BatchTrainer:
             load().project(self._gaussians, camera, how, rows.drawn.struct(), state, stream_of(self.device))
         s, records = rows.drawn.splats, rows.drawn.records
         seen = s["radii"][:, 0].gt(0).nonzero()[:, 0]
-        numbers = (seen + self._first).to(torch.int32)
-        whole = [number.view(torch.float32) for number in (s["radii"][seen], numbers[:, None])]
-        parts = (records[seen, :_RECORD], s["depths"][seen, None], s["conics"][seen], *whole)
+        extents = s["radii"][seen].view(torch.float32)
+        parts = (records[seen, :_RECORD], s["depths"][seen, None], s["conics"][seen], extents)
         return _Place(rows, torch.cat(parts, 1), seen)
 
     def _sent_to_who_draws(self, packed: Sequence[Tensor], counts: Sequence[Sequence[int]]) -> dict[int, Tensor]:
@@ -273,29 +376,36 @@ class BatchTrainer:
 
     def _draw(self, place: int, view: int, rows: Tensor, phase: Phase) -> tuple[Tensor, Tensor]:
         """Draw a view and go back to sums; return what it measures and, in the order of the rows, what goes back."""
-        at = rows[:, SENT - 1].contiguous().view(torch.int32).long()
-        drawn, splats = self._drawn, self._drawn.splats
-        drawn.records[at, :_RECORD] = rows[:, :_RECORD]
-        splats["means2d"][at], splats["opacities"][at] = rows[:, :2], rows[:, 5]
-        splats["depths"][at], splats["conics"][at] = rows[:, _RECORD], rows[:, _RECORD + 1 : _RECORD + 4]
-        splats["radii"].zero_()
-        splats["radii"][at] = rows[:, _RECORD + 4 : _RECORD + 6].contiguous().view(torch.int32)
+        k, drawn = len(rows), self._room(len(rows))
+        splats = drawn.splats
+        drawn.records[:k, :_RECORD] = rows[:, :_RECORD]
+        splats["means2d"][:k], splats["opacities"][:k] = rows[:, :2], rows[:, 5]
+        splats["depths"][:k], splats["conics"][:k] = rows[:, _RECORD], rows[:, _RECORD + 1 : _RECORD + 4]
+        splats["radii"][:k] = rows[:, _RECORD + 4 : SENT].contiguous().view(torch.int32)
+        splats["radii"][k:] = 0
         self.views.fetch(view)
-        program = self._launched(place, self.views.sizes[view], phase)
-        counts = torch.zeros(len(rows), device=self.device)
+        program = self._launched(place, self.views.sizes[view], phase, drawn)
+        counts = torch.zeros(k, device=self.device)
         if program.counts is not None:
-            counts = program.counts[at].view(torch.float32)
-        return self._shared.values.cpu().clone(), torch.cat((drawn.sums[at, :_SUMS], counts[:, None]), 1)
+            counts = program.counts[:k].view(torch.float32)
+        return self._shared.values.cpu().clone(), torch.cat((drawn.sums[:k, :_SUMS], counts[:, None]), 1)
 
-    def _launched(self, place: int, size: Size, phase: Phase) -> DrawProgram:
+    def _room(self, k: int) -> SplatBuffers:
+        """Return room for the splats of a view; what was made for fewer goes, with all that holds its addresses."""
+        if self._drawn is None or k > len(self._drawn.splats["radii"]):
+            self._programs, self._frames, self._drawn = {}, {}, None
+            self._drawn = SplatBuffers.make(min(k + k // _SPARE, self._bounds[-1]), self.device)
+        return self._drawn
+
+    def _launched(self, place: int, size: Size, phase: Phase, drawn: SplatBuffers) -> DrawProgram:
         """Launch a view's drawing, again where its instances did not fit."""
         state = self._shared.state
         while True:
             if size not in self._frames:
-                room = self._capacity.room(size)
-                self._frames[size] = FrameBuffers.make(self._shared, self._bounds[-1], size, room)
+                n, room = len(drawn.splats["radii"]), self._capacity.room(size)
+                self._frames[size] = FrameBuffers.make(self._shared, n, size, room)
             if (size, phase) not in self._programs:
-                self._programs[size, phase] = DrawProgram(self._shared, self._drawn, self._frames[size], phase)
+                self._programs[size, phase] = DrawProgram(self._shared, drawn, self._frames[size], phase)
             self._begin(place)
             self._programs[size, phase].launch()
             flags = state.tolist()

@@ -262,6 +262,9 @@ class HoldingStepper:
     def synchronize(self) -> None:
         self._stepper.synchronize()
 
+    def moments(self) -> dict[str, dict[str, Tensor]]:
+        return self._stepper.moments()
+
     def facts(self) -> dict[str, Any]:
         """See `Stepper.facts`; `fixed_gaussians` says how many are held."""
         return {**self._stepper.facts(), "fixed_gaussians": len(self._rows["means"])}

@@ -2,7 +2,8 @@
 
 Every edit is one call of `edit_rows`: keep some rows, append others. Rows that are kept keep their bits and their
 order, in every parameter, in every moment and in every per-Gaussian tensor of the state. Rows that are appended start
-with zero moments; an optimizer's scalar step counter is never touched.
+with zero moments; an optimizer's scalar step counter is never touched. What an optimizer holds may also be a number a
+row in place of moments, where processes share the Gaussians out (`pop_fast.train.stepper.OwnRows`).
 """
 
 from __future__ import annotations
@@ -53,8 +54,8 @@ def edit_rows(
         optimizer = optimizers[key]
         moments = optimizer.state.pop(old, {})
         for name, value in moments.items():
-            if isinstance(value, Tensor) and value.shape == old.shape:
-                moments[name] = edited(value, None if tail is None else torch.zeros_like(tail))
+            if isinstance(value, Tensor) and value.shape[:1] == old.shape[:1]:
+                moments[name] = edited(value, None if tail is None else value.new_zeros((len(tail), *value.shape[1:])))
         if moments:
             optimizer.state[new] = moments
         optimizer.param_groups[0]["params"] = [new]

@@ -36,7 +36,7 @@ from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically
 from pop_fast.io.read_back import read_torch_file
 from pop_fast.train.config import TrainConfig, first_difference, is_of_another_version
-from pop_fast.train.model import KEYS, first_non_finite, first_unusable, make_optimizers
+from pop_fast.train.model import KEYS, MOMENTS, first_non_finite, first_unusable, make_optimizers
 
 FORMAT = 1
 _NAME = re.compile(r"ckpt_(\d+)_rank0\.pt")
@@ -234,12 +234,6 @@ def pack_optimizers(optimizers: Mapping[str, Optimizer]) -> dict[str, dict[str, 
     return packed
 
 
-def unpack_optimizers(optimizers: Mapping[str, Optimizer], packed: Mapping[str, Mapping[str, Tensor]]) -> None:
-    """Put back what `pack_optimizers` took."""
-    for key, optimizer in optimizers.items():
-        optimizer.state[optimizer.param_groups[0]["params"][0]] = dict(packed[key])
-
-
 def pack_strategy(state: State) -> dict[str, Any]:
     """Return a strategy's state with its random generators as their states."""
     return {k: v.get_state() if isinstance(v, torch.Generator) else v for k, v in state.items()}
@@ -255,18 +249,25 @@ def unpack_strategy(state: State, packed: Mapping[str, Any]) -> None:
 
 
 def moved_to(
-    device: torch.device, params: Mapping[str, Parameter], optimizers: Mapping[str, Adam], state: State
+    device: torch.device,
+    params: Mapping[str, Parameter],
+    optimizers: Mapping[str, Adam],
+    state: State,
+    moves_moments: bool = True,
 ) -> tuple[dict[str, Parameter], dict[str, Adam]]:
-    """Return parameters and their optimizers on a device; the statistics in `state` are replaced by theirs there."""
+    """Return parameters and their optimizers on a device; the statistics in `state` are replaced by theirs there.
+
+    Args:
+        moves_moments: put the optimizers' moments there, too; otherwise they stay where they are.
+    """
     moments = pack_optimizers(optimizers)
     placed = {key: Parameter(params[key].detach().to(device)) for key in KEYS}
-    made = make_optimizers(placed)
-    for key, found in moments.items():
-        there = {name: value if name == "step" else value.to(device) for name, value in found.items()}
-        made[key].state[placed[key]] = there
+    if moves_moments:
+        for of in moments.values():
+            of.update({name: of[name].to(device) for name in MOMENTS})
     for key, value in state.items():
         state[key] = value.to(device) if isinstance(value, Tensor) else value
-    return placed, made
+    return placed, make_optimizers(placed, moments)
 
 
 def on_cpu(content: Any) -> Any:
@@ -280,7 +281,7 @@ _TAILS: Final = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), 
 _FLOATS: Final = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 # one row a photograph: exposures, corrections of cameras
 _OF_PHOTOGRAPHS: Final = {"exposures": (3, 4), "cameras": (6,)}
-_MOMENTS: Final = ("step", "exp_avg", "exp_avg_sq")
+_MOMENTS: Final = ("step", *MOMENTS)
 _LONGEST: Final = 40  # letters of a value that a message shows
 # a strategy's numbers with one row a Gaussian, and their types; None is that of the parameters
 _ROWS: Final[Mapping[str, torch.dtype | None]] = {

@@ -17,6 +17,7 @@ from pop_fast.train.steps import Updates
 from pop_ref.settings import BETAS, EPS, PARAMETERS
 
 KEYS: Final = PARAMETERS
+MOMENTS: Final = ("exp_avg", "exp_avg_sq")  # of Adam, by torch's names
 
 
 class _Moments(Adam):
@@ -29,16 +30,25 @@ class _Moments(Adam):
     add_param_group = getattr(Optimizer.add_param_group, "__wrapped__", Optimizer.add_param_group)
 
 
-def make_optimizers(params: Mapping[str, Parameter]) -> dict[str, Adam]:
-    """Make one dense Adam a parameter, its moments zero, the counter of updates on the CPU.
+def make_optimizers(
+    params: Mapping[str, Parameter], packed: Mapping[str, Mapping[str, Tensor]] | None = None
+) -> dict[str, Adam]:
+    """Make one dense Adam a parameter, the counter of updates on the CPU.
 
     `adam_step` sets its rate and the decay of its moments.
+
+    Args:
+        packed: moments and counters by parameter, as `pop_fast.train.checkpoint.pack_optimizers` gives them; without
+            them there were no updates.
     """
     made: dict[str, Adam] = {
         key: _Moments([param], lr=0.0, betas=BETAS, eps=EPS, fused=True) for key, param in params.items()
     }
     for key, optimizer in made.items():
-        moments = {name: torch.zeros_like(params[key].detach()) for name in ("exp_avg", "exp_avg_sq")}
+        if packed is not None:
+            optimizer.state[params[key]] = dict(packed[key])
+            continue
+        moments = {name: torch.zeros_like(params[key].detach()) for name in MOMENTS}
         optimizer.state[params[key]] = {"step": torch.zeros((), dtype=torch.float32), **moments}
     return made
 

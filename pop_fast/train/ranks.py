@@ -1,7 +1,8 @@
 """Processes that train one model together: whose views are whose, and how what each has found is put together.
 
-Every process holds all parameters, moments and statistics and takes every decision itself. On CPUs only the drawing of
-a step's views is shared out; on GPUs (`cuda_ext.training.batch_step`) within a block of steps the Gaussians are too.
+Every process holds all parameters and statistics and takes every decision itself. On CPUs only the drawing of a step's
+views is shared out; on GPUs (`cuda_ext.training.batch_step`) the Gaussians are too within a block of steps, and Adam's
+moments always are.
 What is added up is added view by view in the order of the batch, wherever a view was drawn, so that the bits do not
 depend on the number of processes. torch carries it: gloo between CPUs, NCCL between GPUs.
 """

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -22,8 +22,9 @@ from pop_fast.density.control import DensityControl
 from pop_fast.density.protocol import ForeignStrategy, State
 from pop_fast.stages.density import blur_set
 from pop_fast.train.appearance import Appearance
+from pop_fast.train.checkpoint import on_cpu, pack_optimizers
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.model import KEYS
+from pop_fast.train.model import KEYS, MOMENTS
 from pop_fast.train.ranks import ALONE, Ranks
 from pop_fast.train.signals import StopRequest
 from pop_fast.train.steps import Collected, Phase, StepSettings, StepStats, Updates
@@ -33,9 +34,9 @@ from pop_fast.train.views import ViewTensors
 class Stepper(Protocol):
     """Takes training steps: render, objective, backward pass, Adam, the statistics of density control.
 
-    It works on what it is bound to and owns nothing that a checkpoint needs: after `steps` the parameters, the
-    optimizers' state and the strategy's statistics in `state` are those of the last step; where several processes train
-    together, after `synchronize`.
+    It works on what it is bound to: after `steps` the parameters, the optimizers' state and the strategy's statistics
+    in `state` are those of the last step; where several processes train together, after `synchronize`. What shares the
+    Gaussians out keeps the optimizers' moments itself; see `OwnRows`.
     """
 
     name: str  # of the engine, for the statistics of a run
@@ -63,6 +64,14 @@ class Stepper(Protocol):
 
     def synchronize(self) -> None:
         """Take over what other processes moved and counted since the last time; all of them do so together."""
+        ...
+
+    def moments(self) -> dict[str, dict[str, Tensor]]:
+        """Return Adam's moments and counters by parameter on the CPU, as a checkpoint holds them.
+
+        Processes that train together call it together. The moments are those of all Gaussians at the process that
+        writes, and perhaps nobody's at the others.
+        """
         ...
 
     def facts(self) -> dict[str, Any]:
@@ -140,6 +149,32 @@ class Fused(Protocol):
         ...
 
 
+@runtime_checkable
+class OwnRows(Protocol):
+    """A `Fused` that keeps the moments of its own Gaussians itself, where processes share the Gaussians out.
+
+    In place of their moments the optimizers hold, under `ORIGINS` and from `synchronize` to the next `rebind`, a number
+    for each row: its place, from 1, which stays with the row when others are removed; 0 is a row without moments.
+    """
+
+    def regroup(self, params: Rows, origins: Rows) -> None:
+        """Take new rows after a density step, as `Fused.rebind`; moments go to those that own the rows now.
+
+        Args:
+            origins: for each parameter the former place of each row, from 1, or 0 for moments of zero. int32 [N]
+        """
+        ...
+
+    def moments(self) -> dict[str, dict[str, Tensor]]:
+        """Return the moments of all Gaussians by parameter and torch's names, on the CPU, at the process that writes.
+
+        All processes call it together; the others get empty tensors.
+        """
+        ...
+
+
+# the rows of an optimizer's parameter before a density step, in its state
+ORIGINS: Final = "origins"
 # parameters, first and second moments, the views, the view of every step, settings, the step to begin at
 MakeFused = Callable[[Rows, Rows, Rows, Sequence[ViewTensors], Sequence[int], StepSettings, int], Fused]
 
@@ -166,16 +201,30 @@ class FusedStepper:
 
     def rebind(self, params: dict[str, Parameter], optimizers: Mapping[str, Adam], state: State) -> None:
         self._params, self._optimizers, self._state = params, optimizers, state
-        rows = {key: params[key].detach() for key in KEYS}
-        moments = {key: optimizers[key].state[params[key]] for key in KEYS}
-        m, v = ({key: moments[key][name] for key in KEYS} for name in ("exp_avg", "exp_avg_sq"))
-        if self.fused is None:
-            task = self.task
-            settings = step_settings(task.config, task.updates, task.scene_scale)
-            self.fused = self.make(rows, m, v, task.views, task.order, settings, self.step)
+        rows, of_adam = {key: params[key].detach() for key in KEYS}, self._of_adam()
+        if isinstance(self.fused, OwnRows):
+            self.fused.regroup(rows, {key: of_adam[key].pop(ORIGINS) for key in KEYS})
         else:
-            self.fused.rebind(rows, m, v)
+            moments = [{key: of_adam[key][name] for key in KEYS} for name in MOMENTS]
+            if self.fused is None:
+                self.fused = self._made(rows, *moments)
+            else:
+                self.fused.rebind(rows, *moments)
         self._give_statistics(self.fused.statistics)
+
+    def _of_adam(self) -> dict[str, dict[str, Tensor]]:
+        """Return what the optimizers hold, by parameter."""
+        return {key: self._optimizers[key].state[self._params[key]] for key in KEYS}
+
+    def _made(self, rows: Rows, m: Rows, v: Rows) -> Fused:
+        task = self.task
+        settings = step_settings(task.config, task.updates, task.scene_scale)
+        fused = self.make(rows, m, v, task.views, task.order, settings, self.step)
+        if isinstance(fused, OwnRows):
+            for found in self._of_adam().values():
+                for name in MOMENTS:
+                    del found[name]
+        return fused
 
     @property
     def longest(self) -> int:
@@ -225,6 +274,16 @@ class FusedStepper:
             self.fused.synchronize()
             self._take_statistics(self.fused.statistics, *self._collected)
             self._collected = None
+            if isinstance(self.fused, OwnRows):
+                for key, found in self._of_adam().items():
+                    rows = self._params[key]
+                    found[ORIGINS] = torch.arange(1, len(rows) + 1, dtype=torch.int32, device=rows.device)
+
+    def moments(self) -> dict[str, dict[str, Tensor]]:
+        packed = pack_optimizers(self._optimizers)
+        if isinstance(self.fused, OwnRows):
+            packed = {key: {"step": packed[key]["step"], **found} for key, found in self.fused.moments().items()}
+        return on_cpu(packed)
 
     def facts(self) -> dict[str, Any]:
         return {} if self.fused is None else dict(self.fused.facts())

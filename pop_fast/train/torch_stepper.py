@@ -32,6 +32,7 @@ from pop_fast.errors import PopError
 from pop_fast.stages.covariance import scales_from_log_scales
 from pop_fast.stages.losses import TargetMoments, l2, photometric, target_moments
 from pop_fast.stages.regularizers import mean_activation, sparse_depth_loss
+from pop_fast.train.checkpoint import on_cpu, pack_optimizers
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.evaluate import gaussians_per_pixel
 from pop_fast.train.model import adam_step
@@ -139,6 +140,9 @@ class TorchStepper:
                     param.grad = None
                 break
         return found
+
+    def moments(self) -> dict[str, dict[str, Tensor]]:
+        return on_cpu(pack_optimizers(self._optimizers))
 
     def facts(self) -> dict[str, Any]:
         return {}

@@ -308,7 +308,8 @@ class TrainingRun:
         if self._stepper is None:
             if self._engine.device.type != "cpu":
                 with translate_oom():
-                    given = (self.params, self.optimizers, self.state)
+                    # what shares the Gaussians out takes the moments of its own from wherever all of them lie
+                    given = (self.params, self.optimizers, self.state, self.config.batch_size == 1)
                     self.params, self.optimizers = moved_to(self._engine.device, *given)
             config, size, done = self.config, self.config.batch_size, self.step
             # views of steps that were taken are not known any more
@@ -392,12 +393,13 @@ class TrainingRun:
         self.stepper.synchronize()
         self._require_finite()
         self._ranks.require_same(self._detached(), self.step)
+        optimizers = self.stepper.moments()
         if not self._ranks.writes:
             return
         content = {
             "step": self.step - 1,
             "splats": self._detached(),
-            "optimizers": on_cpu(ckpt.pack_optimizers(self.optimizers)),
+            "optimizers": optimizers,
             "strategy": on_cpu(ckpt.pack_strategy(self.state)),
             "view_order": self._order.state_dict(),
             "appearance": self.appearance.state_dict(),
@@ -418,8 +420,7 @@ class TrainingRun:
         given = (self.config, self._fingerprint, threads, len(self._train), self.state.keys())
         ckpt.check_fits(path, content, *given)
         self.params = {key: Parameter(content["splats"][key]) for key in KEYS}
-        self.optimizers = make_optimizers(self.params)
-        ckpt.unpack_optimizers(self.optimizers, content["optimizers"])
+        self.optimizers = make_optimizers(self.params, content["optimizers"])
         ckpt.unpack_strategy(self.state, content["strategy"])
         self._order.load_state_dict(content["view_order"])
         self.appearance.load_state_dict(content["appearance"])

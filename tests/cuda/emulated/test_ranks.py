@@ -7,8 +7,9 @@ import itertools
 import json
 import shutil
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,8 @@ import torch
 
 from cuda_ext.host import emulate
 from cuda_ext.render import lists
-from cuda_ext.training.batch_step import RETURNED, SENT, STRETCH, BatchTrainer, step_bytes, stretches
+from cuda_ext.training.batch_step import RETURNED, SENT, STRETCH, BatchTrainer, held_bytes, step_bytes, stretches
+from cuda_ext.training.step_buffers import Rows
 from pop_fast.cli import main
 from pop_fast.density import POPStrategy
 from pop_fast.errors import PopError
@@ -66,10 +68,15 @@ def train_all(folder: Path) -> None:
     torch.set_num_threads(1)
     ranks = join()
     synchronize, exchanged = BatchTrainer.synchronize, []
+    regroup, regrouped = BatchTrainer.regroup, []
 
     def noted(trainer: BatchTrainer) -> None:
         exchanged.append((trainer.step, trainer._bounds[-1]))
         synchronize(trainer)
+
+    def changed(trainer: BatchTrainer, params: Rows, origins: Rows) -> None:
+        regrouped.append((trainer._bounds[-1], dict(origins)))
+        regroup(trainer, params, origins)
 
     looked = []
 
@@ -77,15 +84,47 @@ def train_all(folder: Path) -> None:
         looked.append((run.step, float(run.params["means"].detach().double().sum())))
 
     patch.setattr(BatchTrainer, "synchronize", noted)
+    patch.setattr(BatchTrainer, "regroup", changed)
     for name in RUNS:
         exchanged.clear()
+        regrouped.clear()
         # one of the processes shows its run, for which all take fewer steps at a time
         run = train(folder, name, ranks, watch=look if name == "gsplat" and ranks.writes else None)
         trainer = run.stepper.fused
-        told = trainer.received, len(trainer._of_place[0]), list(exchanged)
+        told = trainer.received, len(trainer._of_place[0]), list(exchanged), list(regrouped), held(trainer)
         torch.save(told, folder / f"{name}_{ranks.rank}.pt")
     torch.save(looked, folder / f"looked_{ranks.rank}.pt")
     ranks.leave()
+
+
+def held(trainer: BatchTrainer) -> dict[str, int]:
+    """Count the bytes of the tensors that a process holds for Gaussians, each memory once."""
+    found: dict[int, int] = {}
+
+    def look(thing: object) -> None:
+        if isinstance(thing, torch.Tensor):
+            storage = thing.untyped_storage()
+            found[storage.data_ptr()] = storage.nbytes()
+        elif isinstance(thing, Mapping):
+            look(list(thing.values()))
+        elif isinstance(thing, (list, tuple)):
+            for part in thing:
+                look(part)
+        elif is_dataclass(thing):
+            look([getattr(thing, part.name) for part in fields(thing)])
+
+    counted = {}
+    parts = {
+        "whole": (trainer._whole, trainer.statistics),
+        "drawn": trainer._drawn,
+        "own": (trainer._moments, trainer._gradients, trainer._counts, trainer._of_place),
+    }
+    for name, of in parts.items():
+        before = len(found), sum(found.values())
+        look(of)
+        counted[name] = sum(found.values()) - before[1]
+        assert len(found) > before[0]
+    return counted
 
 
 @pytest.fixture(scope="module")
@@ -143,9 +182,10 @@ def test_two_gpus_train_to_the_bits_of_one(gpu, together: Path, alone, name: str
     # density control had something to decide, and both owned Gaussians
     assert len(last_checkpoint(together / name)[".splats.means"]) > 70
     for rank in (0, 1):
-        received, own, _ = torch.load(together / f"{name}_{rank}.pt")
+        received, own, _, regrouped, _ = torch.load(together / f"{name}_{rank}.pt")
         assert own >= STRETCH
-        assert min(received.values()) > 0
+        assert min(received[what] for what in ("splats", "sums", "rows")) > 0
+        assert regrouped
 
 
 @pytest.mark.slow  # two processes that train
@@ -161,8 +201,8 @@ def test_two_gpus_exchange_the_bytes_that_the_model_says(gpu, together: Path, al
         crossing = int(((rows >= border) if drawer == 0 else (rows < border)).sum())
         splats[drawer] += 4 * SENT * crossing
         sums[1 - drawer] += 4 * RETURNED * crossing
-    assert [received["splats"] for received, _, _ in told] == splats
-    assert [received["sums"] for received, _, _ in told] == sums
+    assert [received["splats"] for received, *_ in told] == splats
+    assert [received["sums"] for received, *_ in told] == sums
     steps, shown = run.config.max_steps, sum(len(rows) for _, _, rows in seen) / sum(n for n, _, _ in seen)
     assert 0.1 < shown <= 1.0
     exchanges = told[0][2]
@@ -172,9 +212,30 @@ def test_two_gpus_exchange_the_bytes_that_the_model_says(gpu, together: Path, al
     n = round(sum(n for n, _, _ in seen) / len(seen))
     model = step_bytes(n, 2, SIZE, shown, 1, n_rest=run.params["shN"].shape[1])
     for what in ("splats", "sums"):
-        assert sum(received[what] for received, _, _ in told) == pytest.approx(2 * steps * model[what], rel=0.1), what
+        assert sum(received[what] for received, *_ in told) == pytest.approx(2 * steps * model[what], rel=0.1), what
     rows = sum(2 * step_bytes(n, 2, SIZE, shown, 1)["rows"] for _, n in exchanges)
-    assert sum(received["rows"] for received, _, _ in told) == pytest.approx(rows, rel=1e-9)
+    assert sum(received["rows"] for received, *_ in told) == pytest.approx(rows, rel=1e-9)
+
+
+@pytest.mark.slow  # two processes that train
+@needs_gloo
+@pytest.mark.parametrize("name", RUNS)
+def test_moments_go_to_who_owns_their_rows_after_a_change(gpu, together: Path, alone, name: str) -> None:
+    numbers = {key: value[0].numel() for key, value in alone(name).run.params.items()}
+    told = [torch.load(together / f"{name}_{rank}.pt") for rank in (0, 1)]
+    crossing = [0, 0]
+    for n, origins in told[0][3]:
+        former = stretches(n, 2)[1]
+        for key, rows in origins.items():
+            border = stretches(len(rows), 2)[1]
+            crossing[0] += 2 * 4 * numbers[key] * int((rows[:border] > former).sum())
+            crossing[1] += 2 * 4 * numbers[key] * int(((rows[border:] > 0) & (rows[border:] <= former)).sum())
+    assert [received["moments"] for received, *_ in told] == crossing
+    # the model tells the most: every row goes to another process
+    most = sum(2 * step_bytes(len(origins["means"]), 2, SIZE, 1.0, 1)["moments"] for _, origins in told[0][3])
+    assert sum(crossing) <= most
+    if name == "gsplat":
+        assert sum(crossing) > 0
 
 
 @pytest.mark.slow  # two processes that train
@@ -229,8 +290,8 @@ def test_a_step_of_several_views_has_the_cpus_gradients_and_statistics(gpu, tmp_
         run.params["scales"].data += 0.3 * torch.randn((60, 3), generator=torch.Generator().manual_seed(4))
         run.take_steps(1)
         run.take_steps(2)
-        moments = {key: run.optimizers[key].state[run.params[key]] for key in run.params}
-        found.append((moments, run.state))
+        run.stepper.synchronize()
+        found.append((run.stepper.moments(), run.state))
     (moments, state), (wanted, of_cpu) = found[1], found[0]
     for key, group in wanted.items():
         for name in ("exp_avg", "exp_avg_sq"):
@@ -251,6 +312,78 @@ def test_a_number_that_is_not_finite_is_found_in_a_step_of_several_views(gpu, tm
     run.params["quats"].data[47, 2] = float("nan")
     with pytest.raises(PopError, match=r"quats\[47, 2\] is nan after 2 steps"):
         run.take_steps(3)
+
+
+@pytest.mark.slow  # two processes that train
+@needs_gloo
+@pytest.mark.parametrize("name", RUNS)
+def test_two_gpus_hold_the_bytes_that_the_model_says(gpu, together: Path, alone, name: str) -> None:
+    run = alone(name).run
+    n, n_rest = len(run.params["means"]), run.params["shN"].shape[1]
+    told = [torch.load(together / f"{name}_{rank}.pt")[-1] for rank in (0, 1)]
+    model = held_bytes(n, 2, SIZE, 1.0, n_rest)
+    for of in told:
+        assert of["whole"] == model["whole"]
+        assert 0 < of["drawn"] <= model["drawn"]
+    # a block's sums of the regularizers are not in the model
+    assert sum(of["own"] for of in told) == pytest.approx(2 * model["own"], rel=0.01)
+
+
+class _Together:
+    """What threads that play processes exchange."""
+
+    def __init__(self, size: int) -> None:
+        self.barrier, self.sent = threading.Barrier(size, timeout=60), [[torch.empty(0)]] * size
+
+
+class _ThreadRanks(Ranks):
+    """A thread that plays one of several processes."""
+
+    def __init__(self, rank: int, size: int, together: _Together) -> None:
+        self.rank, self.size, self._together = rank, size, together
+
+    def exchange(self, sent: Sequence[torch.Tensor], received: Sequence[int]) -> list[torch.Tensor]:
+        self._together.sent[self.rank] = list(sent)
+        self._together.barrier.wait()
+        found = [of[self.rank].clone() for of in self._together.sent]
+        self._together.barrier.wait()
+        assert [len(rows) for rows in found] == list(received)
+        return found
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 5])
+@pytest.mark.parametrize(("n", "after"), [(0, 70), (40, 300), (300, 40), (300, 0), (1000, 1100)])
+def test_moments_follow_their_rows_to_any_owner(size: int, n: int, after: int) -> None:
+    generator = torch.Generator().manual_seed(after)
+    tails = {"means": (3,), "opacities": (), "shN": (2, 3)}
+    m, v = ({key: torch.rand((n, *tail), generator=generator) for key, tail in tails.items()} for _ in range(2))
+    # rows in any order, some several times, some new; each parameter has its own, as after a reset of opacities
+    origins = {key: torch.randint(0, n + 1, (after,), generator=generator, dtype=torch.int32) for key in tails}
+    together, found = _Together(size), [{} for _ in range(size)]
+
+    def play(rank: int) -> None:
+        trainer = object.__new__(BatchTrainer)
+        trainer._ranks, trainer._bounds = _ThreadRanks(rank, size, together), stretches(n, size)
+        trainer.received = {"moments": 0}
+        own = slice(*trainer._bounds[rank : rank + 2])
+        trainer._moments = tuple({key: rows[own].clone() for key, rows in of.items()} for of in (m, v))
+        moved = {key: trainer._moved(key, origins[key]) for key in tails}
+        trainer._moments, trainer._bounds = (
+            tuple({key: moved[key][i] for key in tails} for i in (0, 1)),
+            stretches(after, size),
+        )
+        found[rank] = trainer.moments()
+
+    threads = [threading.Thread(target=play, args=(rank,)) for rank in range(size)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for key in tails:
+        for name, of in (("exp_avg", m), ("exp_avg_sq", v)):
+            padded = torch.cat((of[key].new_zeros((1, *of[key].shape[1:])), of[key]))
+            assert torch.equal(found[0][key][name], padded[origins[key].long()]), (key, name)
+            assert all(len(other[key][name]) == 0 for other in found[1:])
 
 
 def test_a_warps_rows_have_one_owner() -> None:
