@@ -6,6 +6,7 @@ All arrays are float64 (ids and extents int64). Shapes are in `notation`.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -118,8 +119,9 @@ class Camera(_PrintsAsCode):
         off = np.array([K[0, 1], K[1, 0], K[2, 0], K[2, 1], K[2, 2] - 1.0])
         if np.any(off != 0.0):
             raise ValueError("K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; skew is not supported")
-        if self.width < 1 or self.height < 1:
-            raise ValueError(f"width x height is {self.width} x {self.height}; both must be >= 1")
+        for name, size in (("width", self.width), ("height", self.height)):
+            if isinstance(size, bool) or not isinstance(size, Integral) or size < 1:
+                raise ValueError(f"{name} is {size!r}; it must be a whole number of px, >= 1")
         object.__setattr__(self, "viewmat", viewmat)
         object.__setattr__(self, "K", K)
 

@@ -279,7 +279,7 @@ def check_numbers(**numbers: Any) -> None:
 def check_sizes(width: int, height: int, tile_size: int) -> None:
     """Raise ValueError, which names the size, for an image or a tile that is none."""
     for name, value in {"width": width, "height": height, "tile_size": tile_size}.items():
-        if not isinstance(value, Integral) or value < 1:
+        if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
             raise ValueError(f"{name} is {value!r}; it must be a whole number >= 1")
     if tile_size > LARGEST_TILE:
         raise ValueError(f"tile_size is {tile_size}; it must be <= {LARGEST_TILE}")

@@ -46,7 +46,7 @@ _COLUMNS = (
 
 def save_ply(
     path: str | os.PathLike[str],
-    params: dict[str, torch.Tensor],
+    params: Mapping[str, torch.Tensor | np.ndarray],
     antialiased: bool = False,
     drop_transparent: bool = False,
     frame: Frame | None = None,
@@ -55,7 +55,8 @@ def save_ply(
 
     Args:
         path: the file to write.
-        params: means [N, 3], scales [N, 3], quats [N, 4], opacities [N], sh0 [N, 1, 3], shN [N, 0|3|8|15, 3], raw.
+        params: means [N, 3], scales [N, 3], quats [N, 4], opacities [N], sh0 [N, 1, 3], shN [N, 0|3|8|15, 3], raw;
+            tensors or arrays.
         antialiased: the splats were trained with antialiasing, and are to be drawn so.
         drop_transparent: leave out Gaussians with an opacity under 1/255, which no renderer shows.
         frame: the world that they are in, where it is known; written as a comment.
@@ -76,7 +77,9 @@ def save_ply(
     return before, len(arrays["means"])
 
 
-def ply_bytes(params: dict[str, torch.Tensor], antialiased: bool = False, frame: Frame | None = None) -> bytes:
+def ply_bytes(
+    params: Mapping[str, torch.Tensor | np.ndarray], antialiased: bool = False, frame: Frame | None = None
+) -> bytes:
     return _file(checked_params(params), antialiased, frame)
 
 
@@ -177,7 +180,7 @@ def frame_of(path: str | os.PathLike[str]) -> Frame | None:
     return Frame.of_comments(read_header(Path(path)).comments, Path(path))
 
 
-def checked_params(params: dict[str, torch.Tensor]) -> dict[str, np.ndarray]:
+def checked_params(params: Mapping[str, torch.Tensor | np.ndarray]) -> dict[str, np.ndarray]:
     """Return raw parameters as float32 arrays.
 
     Raises:
@@ -187,7 +190,9 @@ def checked_params(params: dict[str, torch.Tensor]) -> dict[str, np.ndarray]:
     for name in (*_SHAPES, "shN"):
         if name not in params:
             raise PopError(f"params has no {name!r}; a splat needs {', '.join(_SHAPES)} and shN")
-        arrays[name] = params[name].detach().cpu().numpy().astype(np.float32, copy=False)
+        values = params[name]
+        found = values if isinstance(values, np.ndarray) else values.detach().cpu().numpy()
+        arrays[name] = found.astype(np.float32, copy=False)
     n = len(arrays["means"])
     for name, array in arrays.items():
         bands = array.shape[1] if name == "shN" and array.ndim == 3 and array.shape[1] in (0, 3, 8, 15) else 15

@@ -59,6 +59,13 @@ def test_a_round_trip_keeps_every_bit(table: np.ndarray, tmp_path_factory: pytes
     assert_same_bits(load_ply(path), params)
 
 
+def test_numpy_arrays_are_written_as_tensors_are(tmp_path: Path) -> None:
+    params = many(3)
+    save_ply(tmp_path / "tensors.ply", params)
+    save_ply(tmp_path / "arrays.ply", {name: value.numpy() for name, value in params.items()})
+    assert (tmp_path / "arrays.ply").read_bytes() == (tmp_path / "tensors.ply").read_bytes()
+
+
 def test_the_file_is_laid_out_as_the_reference_code_lays_it_out(tmp_path: Path) -> None:
     params = many(2)
     save_ply(tmp_path / "x.ply", params)

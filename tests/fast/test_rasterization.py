@@ -483,6 +483,7 @@ WRONG = {
     "Ks is of type ndarray; it must be a torch.Tensor": {"Ks": lambda t: t.numpy()},
     "width is None; it must be a whole number": {"width": lambda _: None},
     "height is 2.5; it must be a whole number": {"height": lambda _: 2.5},
+    "width is True; it must be a whole number": {"width": lambda _: True},
     "tile_size is '16'; it must be a whole number": {"tile_size": lambda _: "16"},
     "viewmats has shape [0, 4, 4]; there must be at least one camera": {"viewmats": lambda t: t[:0]},
     "means has shape [0, 24, 3]; a batch must hold at least one scene": {"means": lambda t: t[None][:0]},

@@ -132,6 +132,25 @@ def test_a_degree_beyond_the_coefficients_is_refused() -> None:
         render(random_gaussians(0), tilted_camera(), sh_degree=3)
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"width": 0}, "width is 0; it must be a whole number of px, >= 1"),
+        ({"height": 2.5}, "height is 2.5; it must be a whole number"),
+        ({"width": True}, "width is True; it must be a whole number"),
+        ({"K": np.diag([1.0, 0.0, 1.0])}, "both must be > 0"),
+        ({"K": np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])}, "skew is not supported"),
+        ({"viewmat": 2.0 * np.eye(4)}, "viewmat is not rigid"),
+        ({"viewmat": np.eye(4) + np.eye(4)[[3, 0, 1, 2]] * np.eye(4)[3][:, None] * 0.5}, "the last row must be"),
+    ],
+)
+def test_a_camera_that_is_none_is_refused_by_what_is_wrong(change: dict, words: str) -> None:
+    given = {"viewmat": np.eye(4), "K": np.eye(3), "width": np.int64(4), "height": 3}
+    Camera(**given)
+    with pytest.raises(ValueError, match=words):
+        Camera(**{**given, **change})
+
+
 def test_a_render_leaves_its_arguments_alone() -> None:
     gaussians, view = random_gaussians(6, 8), tilted_camera()
     before = {name: array.copy() for name, array in vars(gaussians).items()}
