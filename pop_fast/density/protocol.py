@@ -59,7 +59,7 @@ class DensificationContext:
     """The Gaussians at a step after which they may change, and what a change may ask for."""
 
     params: Params  # raw parameters, replaced under their keys
-    optimizers: Optimizers  # one per key
+    optimizers: Optimizers  # one per key; `rows` says what they hold where several GPUs train
     state: State  # the strategy's
     step: int  # just taken, from 0
     draws: Draws  # random numbers
