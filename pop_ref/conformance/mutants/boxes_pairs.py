@@ -166,6 +166,10 @@ def _gradients_of_the_usual_low_pass(sound: Rasterization, given: Given) -> Any:
     return usual + (images - usual).detach(), usual_alphas + (alphas - usual_alphas).detach(), meta
 
 
+# arguments of which every entry of a batch is given the first one's, as stories call them
+_OF_ENTRIES: Final = {"viewmats": "viewmats", "Ks": "Ks", "backgrounds": "backgrounds", "opacities": "opacities",
+                      "colors": "colors", "covars": "covariances"}  # fmt: skip
+
 _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("viewmats_of_the_first_camera", "all cameras of a call see from the first one's place",
      when(several, viewmats=of_first_camera("viewmats", 2)), _IMAGES),
@@ -206,18 +210,8 @@ _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
      told(several, final_T=_first_told("final_T", 2)), _DOMINANT),
     ("cameras_by_a_mirrored_principal_point", "from the second camera on, cx is taken from the right",
      when(several, Ks=_mirrored), _IMAGES),
-    ("viewmats_of_the_first_entry", "every batch entry has the first one's viewmats",
-     when(batched, viewmats=of_first_entry("viewmats")), _IMAGES),
-    ("Ks_of_the_first_entry", "every batch entry has the first one's Ks",
-     when(batched, Ks=of_first_entry("Ks")), _IMAGES),
-    ("backgrounds_of_the_first_entry", "every batch entry has the first one's backgrounds",
-     when(batched, backgrounds=of_first_entry("backgrounds")), _IMAGES),
-    ("opacities_of_the_first_entry", "every batch entry has the first one's opacities",
-     when(batched, opacities=of_first_entry("opacities")), _IMAGES),
-    ("colors_of_the_first_entry", "every batch entry has the first one's colors",
-     when(batched, colors=of_first_entry("colors")), _IMAGES),
-    ("covariances_of_the_first_entry", "every batch entry has the first one's covariances",
-     when(batched, covars=of_first_entry("covars")), _IMAGES),
+    *((f"{told}_of_the_first_entry", f"every batch entry has the first one's {told}",
+       when(batched, **{name: of_first_entry(name)}), _IMAGES) for name, told in _OF_ENTRIES.items()),
     ("entries_exchanged_where_packed", "packed images of batch entries come out in reverse order",
      then(both(batched, packed), lambda g, i, a, m: (*(x.flip(g["means"].dim() - 3) for x in (i, a)), m)), _IMAGES),
     ("entries_exchanged_under_two_dimensions", "with two batch dimensions the inner one runs backwards",
