@@ -343,7 +343,8 @@ class ScreenErrorBounds:
     e_covars2d: np.ndarray
 
 
-def _t(matrices: np.ndarray) -> np.ndarray:
+def swapped(matrices: np.ndarray) -> np.ndarray:
+    """Return transposed matrices of a stack."""
     return np.swapaxes(matrices, -1, -2)
 
 
@@ -361,7 +362,7 @@ def _camera_error_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     e_means_cam = np.where(exact, 0.0, 2.0 * np.sum(np.abs(terms), axis=2))
     A = np.abs(rotmats_from_quats(g.quats))
     variances = g.scales[:, None, :] ** 2
-    e_covars = 4.0 * (A * variances) @ _t(A) + 2.0 * (
+    e_covars = 4.0 * (A * variances) @ swapped(A) + 2.0 * (
         np.sum(A * variances, 2)[:, :, None] + np.sum(A * variances, 2)[:, None, :]
     )
     covars = np.abs(covars_from_quats_scales(g.quats, g.scales))
@@ -445,7 +446,7 @@ def screen_error_bounds(scene: Scene, reach: float) -> ScreenErrorBounds:
     J = projection_jacobians(p, camera.K, camera.width, camera.height, profile)
     e_J = _jacobian_error_bounds(p, e_p, J)
     A = np.abs(J)
-    e_2d = A @ (e_S + 4.0 * np.abs(S)) @ _t(A) + e_J @ np.abs(S) @ _t(A) + A @ np.abs(S) @ _t(e_J)
+    e_2d = A @ (e_S + 4.0 * np.abs(S)) @ swapped(A) + e_J @ np.abs(S) @ swapped(A) + A @ np.abs(S) @ swapped(e_J)
     raw = project_covars(S, J)
     covars2d = low_pass(raw, profile.eps2d)
     e_2d = e_2d + np.abs(covars2d)

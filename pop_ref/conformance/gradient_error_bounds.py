@@ -20,7 +20,7 @@ import numpy as np
 from pop_ref.camera import camera_center
 from pop_ref.conformance.adapter import projected
 from pop_ref.conformance.assertions import with_error_bounds
-from pop_ref.conformance.error_bounds import TINY, Layer, PixelErrorBounds, ScreenErrorBounds
+from pop_ref.conformance.error_bounds import TINY, Layer, PixelErrorBounds, ScreenErrorBounds, swapped
 from pop_ref.conformance.scenes import Scene, rounded
 from pop_ref.covariance import covars_from_quats_scales, rotmats_from_quats
 from pop_ref.records import Splats
@@ -110,25 +110,19 @@ def error_bounds_of_sums(
     with_depth: bool = False,
 ) -> dict[str, np.ndarray]:
     """Return the error bound of every gradient by name from what `sums_over_pixels` found."""
-    N, rows = len(scene.gaussians), dict(rows)
-    given, nothing = rows["colors"], np.zeros((N, 3))
+    rows = dict(rows)
+    given, nothing = rows["colors"], np.zeros((len(scene.gaussians), 3))
     if with_depth:
         rows["depths"] = Bound(given.m[:, -1], given.e[:, -1])
     if plain or given.m.shape[1] - with_depth == 0:
         rows["colors"] = Bound(nothing, nothing)
     elif with_depth:
         rows["colors"] = Bound(given.m[:, :-1], given.e[:, :-1])
-    found = _world_bounds(scene, screen, rows) if N else _no_bounds(scene)
+    found = _world_bounds(scene, screen, rows)
     found["colors"] = given.error_bound[:, :plain]
     found["background"] = background
     found["means2d"] = found["means2d_abs"] = rows["means2d"].error_bound
     return found
-
-
-def _no_bounds(scene: Scene) -> dict[str, np.ndarray]:
-    g = scene.gaussians
-    arrays = {"means": g.means, "quats": g.quats, "scales": g.scales, "opacities": g.opacities, "sh": g.sh}
-    return {name: np.zeros_like(value) for name, value in arrays.items()} | {"viewmat": np.zeros((4, 4))}
 
 
 def _gather(values: dict[int, Bound], shape: tuple[int, ...]) -> Bound:
@@ -149,7 +143,7 @@ def _pixel_bounds(
     for layer in reversed(error_bounds.layers):
         i, shown = layer.id, layer.blended.astype(np.float64)
         T, T_error, alpha, e_alpha = (layer.T, layer.T_error, layer.alpha, layer.e_alpha)
-        weight = Bound(T * alpha * shown, (T_error * alpha + T * e_alpha) * shown)
+        weight = _weight(layer)
         out["colors"][i] = Bound(weight.m[..., None] * v, (weight.e + weight.m)[..., None] * v).summed((0, 1))
         color_dot_grad = Bound(v @ np.abs(s.colors[i]), v @ s.e_colors[i] + 2.0 * v @ np.abs(s.colors[i]))
         v_alpha = (color_dot_grad + suffix_dot_grad).times(T * shown, T_error * shown)
@@ -201,10 +195,6 @@ def _stack(*bounds: Bound) -> Bound:
     return Bound(np.array([b.m for b in bounds]), np.array([b.e for b in bounds]))
 
 
-def _t(stack: np.ndarray) -> np.ndarray:
-    return np.swapaxes(stack, -1, -2)
-
-
 def _matrix(conics: np.ndarray, half: float = 1.0) -> np.ndarray:
     xx, xy, yy = conics[:, 0], half * conics[:, 1], conics[:, 2]
     return np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -2)
@@ -221,7 +211,7 @@ def _world_bounds(scene: Scene, s: ScreenErrorBounds, rows: dict[str, Bound]) ->
     if scene.antialiased:
         V = V + _antialiasing(rows["opacities"], s)
     A, e_A, S, e_S = np.abs(s.jacobians), s.e_jacobians, np.abs(s.covars_cam), s.e_covars_cam
-    v_S = V.between(_t(A), A, _t(e_A), e_A)
+    v_S = V.between(swapped(A), A, swapped(e_A), e_A)
     AS, e_AS = A @ S, e_A @ S + A @ e_S
     v_J = Bound(2.0 * V.m @ AS, 2.0 * (V.e @ AS + V.m @ e_AS + 4.0 * V.m @ AS))
     v_p = _point_bound(s, camera.K, rows["means2d"], v_J)
@@ -230,7 +220,7 @@ def _world_bounds(scene: Scene, s: ScreenErrorBounds, rows: dict[str, Bound]) ->
         v_p.e[:, 2] += rows["depths"].e
     v_dirs, sh = _color_bounds(scene, rows["colors"])
     v_means = Bound(v_p.m @ R + v_dirs.m, v_p.e @ R + 4.0 * v_p.m @ R + v_dirs.e)
-    v_covars = v_S.between(_t(R)[None], R[None], np.zeros((1, 3, 3)), np.zeros((1, 3, 3)))
+    v_covars = v_S.between(swapped(R)[None], R[None], np.zeros((1, 3, 3)), np.zeros((1, 3, 3)))
     quats, scales = _shape_bounds(scene, v_covars)
     viewmat = _viewmat_bound(scene, v_p, v_S, v_dirs)
     return {

@@ -19,7 +19,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from pop_ref.activations import opacities_from_logits, scales_from_log_scales
 from pop_ref.conformance import tolerances
 from pop_ref.conformance.adapter import error_bounds_of
 from pop_ref.conformance.assertions import assert_close
@@ -37,7 +36,7 @@ from pop_ref.losses import photometric_pop_vjp
 from pop_ref.methods import KEYS
 from pop_ref.optimizer import learning_rates, sh_degree_at
 from pop_ref.recipes import Recipe
-from pop_ref.records import Camera, Gaussians
+from pop_ref.records import Camera
 from pop_ref.render import Render, render, render_vjp
 from pop_ref.settings import BETAS, EPS
 from pop_ref.short_training import Trained
@@ -221,11 +220,7 @@ class Watch:
 
     def scene(self, view: int, step: int) -> Scene:
         """Return what a step draws of a view."""
-        p = self.params
-        sh = np.concatenate((p["sh0"], p["shN"]), axis=1)
-        scales, opacities = scales_from_log_scales(p["scales"]), opacities_from_logits(p["opacities"])
-        g = Gaussians(p["means"], p["quats"], scales, opacities, sh)
-        degree = sh_degree_at(step, self.sh_interval, 2)
+        g, degree = gaussians_from_params(self.params), sh_degree_at(step, self.sh_interval, 2)
         return Scene(g, self.cameras[view], BACKGROUND, PAPER, None, degree, self.antialiased)
 
 
@@ -493,11 +488,8 @@ class _Bounds:
 
     def __post_init__(self) -> None:
         short, recipe = self.trained.short, self.trained.recipe
-        params = self.trained.driven.rows.params
-        self.gaussians = gaussians_from_params(params)
-        degree = sh_degree_at(
-            self.trained.step, recipe.sh_interval, _degree_of(params), recipe.updates.sh_start_iter
-        )  # fmt: skip
+        self.gaussians = gaussians_from_params(self.trained.driven.rows.params)
+        degree = self.trained.driven.script.sh_degree(self.trained.step)
         camera, behind = short.cameras[self.view], np.array(short.background)
         self.scene = Scene(self.gaussians, camera, behind, recipe.profile, None, degree, short.antialiased)
         self.pixels: PixelErrorBounds = error_bounds_of(self.scene, self.dtype)
@@ -549,10 +541,6 @@ class _Bounds:
         expected.v_image, expected.v_T_final = v + e_image, none
         bounds = expected.gradients[1]
         return {**bounds, "sh": bounds["colors"]}
-
-
-def _degree_of(params: Mapping[str, np.ndarray]) -> int:
-    return round(np.sqrt(params["shN"].shape[1] + 1)) - 1
 
 
 def _with_errors(trained: Trained, before: Rows, errors: Mapping[str, np.ndarray], dtype: Any) -> Rows:

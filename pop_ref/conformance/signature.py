@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -295,7 +295,6 @@ def assert_gradients_without_that_of_means(backend: Any, of: Made) -> None:
 
 
 ROWS = ("means2d", "depths", "conics", "opacities")
-TILES = ("tiles_per_gauss", "flatten_ids", "isect_offsets", "isect_ids")
 
 
 def assert_sizes(of: Made) -> None:
@@ -326,8 +325,8 @@ def assert_rows(backend: Any, of: Made) -> None:
         s, clear, visible = e.error_bounds.screen, e.clear, e.render.splats.visible
         frame = in_frame(of, b, c)
 
-        def gaussian(at: tuple[int, ...], frame: str = frame) -> str:
-            return f"{frame}Gaussian {at[0]}" + "".join(f", entry {k}" for k in at[1:])
+        def gaussian(at: tuple[int, ...], what: str = "", frame: str = frame) -> str:
+            return f"{what}{frame}Gaussian {at[0]}" + "".join(f", entry {k}" for k in at[1:])
 
         if index is not None:
             assert_same_bits("packed rows of it", present[b, c], visible.astype(np.int64), clear, gaussian)
@@ -338,13 +337,9 @@ def assert_rows(backend: Any, of: Made) -> None:
         drawn, splats = clear & visible, e.render.splats
         for name in (name for name in ROWS if name in rows):
             size = units[name] + np.abs(getattr(splats, name))
-            place = functools.partial(_of, name, gaussian)
+            place = functools.partial(gaussian, what=f"{name} of ")
             values = (rows[name][b, c], getattr(splats, name), size)
             assert_close("meta.rows", *values, backend.dtype, True, drawn, place)
-
-
-def _of(name: str, gaussian: Callable[[tuple[int, ...]], str], at: tuple[int, ...]) -> str:
-    return f"{name} of {gaussian(at)}"
 
 
 def assert_dominance(backend: Any, of: Made) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from pop_ref.conformance.short_training import BACKGROUND, VIEWS, ShortTraining, Watch
+from pop_ref.conformance.torch_strategy import arrays_of
 from pop_ref.methods import KEYS
 from pop_ref.settings import AppearanceRates, LearningRates
 
@@ -116,7 +117,7 @@ class Trainee:
         found: list[np.ndarray] = []
         for step in range(short.steps):
             self._step(run, step)
-            found.append(_array(run.appearance.params["exposures"]))
+            found.append(arrays_of(run.appearance.params["exposures"]))
         return found
 
     def foreign_steps(self, short: ShortTraining) -> list[dict[str, Any]]:
@@ -148,7 +149,7 @@ class Trainee:
             run.appearance.params["cameras"].copy_(self._torch.as_tensor(corrections))
         taken = [self._taken(run, step) for step in range(short.steps)]
         seen = run.appearance.seen(self._views_of(run))
-        return taken, np.stack([_array(view.viewmat[0]) for view in seen])
+        return taken, np.stack([arrays_of(view.viewmat[0]) for view in seen])
 
     def coarse_losses(self, short: ShortTraining, stops: tuple[int, ...]) -> list[float]:
         """Return the loss of every step where the first ones see their photographs shrunk: `coarse_stop_iters`."""
@@ -160,21 +161,20 @@ class Trainee:
 
         Its opacity is the photograph's first channel.
         """
-        tensor, of = self._torch.as_tensor, importlib.import_module(f"{self._package}.train.views")
-        view = importlib.import_module(f"{self._package}.train.views").ViewTensors(
+        tensor, of = self._torch.as_tensor, self._module("train.views")
+        view = of.ViewTensors(
             name="0", photo=tensor(photo), mask=None if mask is None else tensor(mask),
             alpha=tensor(photo)[..., 0].contiguous(),
             viewmat=self._torch.eye(4, dtype=self._float)[None], K=tensor(K).to(self._float)[None],
         )  # fmt: skip
         small = of.shrunk(view, factor)
-        kept = None if small.mask is None else _array(small.mask)
-        return {"photo": _array(small.photo), "mask": kept, "K": _array(small.K[0]), "alpha": _array(small.alpha)}
+        return arrays_of({"photo": small.photo, "mask": small.mask, "K": small.K[0], "alpha": small.alpha})
 
     def whole_run(self, short: ShortTraining, folder: str) -> list[np.ndarray]:
         """Run to the end, with all that a run writes, and return the parameters."""
         run = self._run(short, folder)
         run.run()
-        return [_array(run.params[key]) for key in KEYS]
+        return arrays_of([run.params[key] for key in KEYS])
 
     def resumed_run(self, short: ShortTraining, folder: str, after: int, **more: Any) -> list[dict[str, np.ndarray]]:
         """Return what a run leaves by name that goes to its end at once, and one that is interrupted and resumed.
@@ -222,9 +222,9 @@ class Trainee:
         return {
             "view": views[0] if len(views) == 1 else views,
             "loss": float(stats.objective + stats.pop),
-            "params": {key: _array(run.params[key]) for key in KEYS},
-            "m": {key: _array(moments[key]["exp_avg"]) for key in KEYS},
-            "v": {key: _array(moments[key]["exp_avg_sq"]) for key in KEYS},
+            "params": arrays_of({key: run.params[key] for key in KEYS}),
+            "m": arrays_of({key: moments[key]["exp_avg"] for key in KEYS}),
+            "v": arrays_of({key: moments[key]["exp_avg_sq"] for key in KEYS}),
         }
 
     def _run(
@@ -300,8 +300,8 @@ class Trainee:
             stepper.steps(step, step + 1, schedule.phase_at(config, strategy, step))
             stepper.synchronize()
             moments = {name: each.state[params[name]]["exp_avg"] for name, each in optimizers.items()}
-            kept = {name: _array(state.get(name)) for name in KEPT}
-            found.append(kept | {"params": _arrays(params), "first_moments": _arrays(moments)})
+            kept = {name: state.get(name) for name in KEPT}
+            found.append(arrays_of({**kept, "params": params, "first_moments": moments}))
         return found
 
     def view_passes(self, watch: Watch, view: int, divisor: int) -> dict[str, Any]:
@@ -316,14 +316,15 @@ class Trainee:
         found = passes.contributions(params, view, 2, weights)
         points, ids, T_final = passes.dominant_points(params, view, 2)
         sums = ("weight_sum", "n_pixels", "map_sum", "distance_sum", "dominant_counts", "image", "radii", "depths")
-        return {name: _array(getattr(found, name)) for name in sums} | {
-            "sensitivities": _array(passes.sensitivities(params, view, 2)),
+        return arrays_of({
+            **{name: getattr(found, name) for name in sums},
+            "sensitivities": passes.sensitivities(params, view, 2),
             # which leave out how antialiased opacities depend on scales, and say so
-            "blocks": None if watch.antialiased else _array(passes.fisher(params, view, 2, divisor)),
-            "points": _array(points),
-            "ids": _array(ids),
-            "T_final": _array(T_final),
-        }
+            "blocks": None if watch.antialiased else passes.fisher(params, view, 2, divisor),
+            "points": points,
+            "ids": ids,
+            "T_final": T_final,
+        })  # fmt: skip
 
     def written_meta(self, watch: Watch) -> list[str]:
         """Write to every key of a view's meta before it is read, and return those that forget it."""
@@ -420,13 +421,6 @@ def photograph_stages(package: str, backend: str, dtype: str) -> dict[str, Calla
     return {name: getattr(trainee, name) for name in vars(Trainee) if not name.startswith("_")}
 
 
-def _array(value: Any) -> Any:
-    if not hasattr(value, "detach"):
-        return value
-    array = value.detach().cpu().numpy().copy()
-    return array.astype(np.float64) if array.dtype.kind == "f" else array
-
-
 def _left_by(run: Any) -> dict[str, np.ndarray]:
     """Return all numbers that a run would go on from, by name."""
     found: dict[str, Any] = {name: run.state.get(name) for name in KEPT}
@@ -436,8 +430,4 @@ def _left_by(run: Any) -> dict[str, np.ndarray]:
         found |= {key: run.params[key], **{f"{name} of {key}": value for name, value in moments.items()}}
     for key, learned in run.appearance.state_dict().items():
         found |= {f"{name} of {key}": value for name, value in learned.items()}
-    return {name: np.asarray(_array(value)) for name, value in found.items() if value is not None}
-
-
-def _arrays(params: dict[str, Any]) -> dict[str, np.ndarray]:
-    return {name: _array(value) for name, value in params.items()}
+    return {name: np.asarray(arrays_of(value)) for name, value in found.items() if value is not None}

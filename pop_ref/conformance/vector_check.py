@@ -417,6 +417,11 @@ def entry(role: str, shape: str, meaning: str, dtype: str = "float64", compare: 
     return said if compare is None else {**said, "compare": compare}
 
 
+def axes(rows: str, rest: str) -> str:
+    """Return the shape of an array of rows, as the index writes it."""
+    return f"[{rows}, {rest}]" if rest else f"[{rows}]"
+
+
 def close(key: str, error_bound: str, where: str | None = None, **more: str) -> Rule:
     """Return the rule that a result differs by rounding at most, with the tolerance of that key."""
     limit = {name: tolerances.agreement(key, getattr(np, name)) for name in ("float32", "float64")}

@@ -18,7 +18,7 @@ import numpy as np
 from pop_ref.conformance import tolerances
 from pop_ref.conformance.scenes import in_precision
 from pop_ref.conformance.short_training import PLACE, OracleSteps, ShortTraining, WantedStep
-from pop_ref.conformance.vector_check import close, entry, equal, output
+from pop_ref.conformance.vector_check import axes, close, entry, equal, output
 from pop_ref.conformance.vector_training import HeldDraws, KeptDraws, Vector
 from pop_ref.conformance.views import gaussians, raw_params
 from pop_ref.constants import Profile
@@ -454,16 +454,13 @@ def steps_kind() -> dict[str, Any]:
         arrays[name]["dtype"] = "bool"
     for kind, what in _STATES.items():
         for key, rest in _REST.items():
-            arrays[f"{kind}_{key}"] = entry(
-                "input", f"[R, {rest}]".replace(", ]", "]"), f"{what} before the step: {key}"
-            )
-            name, shape = f"new_{kind}_{key}", f"[A, {rest}]".replace(", ]", "]")
+            arrays[f"{kind}_{key}"] = entry("input", axes("R", rest), f"{what} before the step: {key}")
             rule = f"steps.{'params' if kind == 'params' else key if kind == 'm' else 'squares'}"
             where = f"decided_{key}" if kind == "params" else "judged_rows"
-            arrays |= output(name, shape, f"{what} after the step: {key}", rule, where)
+            arrays |= output(f"new_{kind}_{key}", axes("A", rest), f"{what} after the step: {key}", rule, where)
     for key, rest in _REST.items():
         said = f"rounding cannot move the update of {key} by a quarter of its rate"
-        arrays[f"decided_{key}"] = entry("mask", _shape("A", rest), said, "bool")
+        arrays[f"decided_{key}"] = entry("mask", axes("A", rest), said, "bool")
     arrays |= output("losses", "[S]", "the loss before the step, with all its terms", "steps.loss", "clear_steps")
     arrays["rows"] = entry("output", "[S]", "Gaussians after the step", "int64", [equal()])
     said = "new_params_means once more, compared coarsely at every step: whose row a row is"
@@ -484,10 +481,6 @@ def steps_kind() -> dict[str, Any]:
         "Photographs are compared as 0 to 1. pop_ref/settings.py says what every setting does"
     )
     return {"about": about, "arrays": arrays}
-
-
-def _shape(rows: str, rest: str) -> str:
-    return f"[{rows}, {rest}]" if rest else f"[{rows}]"
 
 
 _SHOWN: Final = {

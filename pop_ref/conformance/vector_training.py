@@ -17,7 +17,7 @@ from pop_ref import losses, methods, ssim
 from pop_ref.activations import opacities_from_logits, scales_from_log_scales
 from pop_ref.conformance.scenes import in_precision, pattern
 from pop_ref.conformance.strategy_script import METHODS, READINGS, Draws, Script, script_of, trainings_of
-from pop_ref.conformance.vector_check import entry, equal, output
+from pop_ref.conformance.vector_check import axes, entry, equal, output
 from pop_ref.contributions import Contributions
 from pop_ref.density import Statistics, densify_and_prune, grow_masks, rows_from_params
 from pop_ref.density_rows import Rows
@@ -206,11 +206,7 @@ _KEYS = {"log_scales": "scales", "logit_opacities": "opacities"}
 
 def density_kind() -> dict[str, Any]:
     """Return what the index says of density steps."""
-
-    def shape(rows: str, rest: str) -> str:
-        return f"[{rows}, {rest}]" if rest else f"[{rows}]"
-
-    arrays = {name: entry("input", shape("N", rest), said) for name, (rest, said) in _RAW.items()}
+    arrays = {name: entry("input", axes("N", rest), said) for name, (rest, said) in _RAW.items()}
     arrays |= {
         "grad_sum": entry("input", "[N]", "sum of screen-gradient norms over the window, NDC"),
         "n_visible": entry("input", "[N]", "views of the window that showed the Gaussian", "int64"),
@@ -222,7 +218,7 @@ def density_kind() -> dict[str, Any]:
         "split": entry("output", "[N]", "1 where a row is split", "int64", [equal()]),
     }
     for name, (rest, said) in _RAW.items():
-        arrays |= output(f"new_{name}", shape("M", rest), f"{said}, after the step", "density.split")
+        arrays |= output(f"new_{name}", axes("M", rest), f"{said}, after the step", "density.split")
     about = (
         "one step of density control: clones are appended; then split rows make way for two children each, appended, "
         "with mean + R(q) (scale * normal) and scale / 1.6; then rows are pruned. 'config' names the thresholds"
@@ -466,12 +462,12 @@ class Replay:
         return slice(self._ends[at] - n, self._ends[at])
 
 
-def training_vectors() -> dict[str, tuple[dict[str, np.ndarray], dict[str, Any]]]:
+def training_vectors() -> dict[str, Vector]:
     """Return what the oracle makes of every training."""
     return {name: _training(script) for name, script in scripts().items()}
 
 
-def _training(script: Script) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def _training(script: Script) -> Vector:
     shown = Recorder(script)
     rows = shown.rows()
     arrays: dict[str, Any] = {key: rows.params[key] for key in KEYS}
@@ -530,15 +526,11 @@ def _weighted(values: np.ndarray) -> np.ndarray:
 
 def training_kind() -> dict[str, Any]:
     """Return what the index says of trainings."""
-
-    def shape(axis: str, rest: str) -> str:
-        return f"[{axis}, {rest}]" if rest else f"[{axis}]"
-
     arrays: dict[str, Any] = {}
     for key, rest in _OF_PARAMS.items():
-        arrays[key] = entry("input", shape("N", rest), f"raw {key} at the start: logarithms, logits")
-        arrays |= {f"{k}_{key}": entry("input", shape("N", rest), f"Adam's moments {k} of {key}") for k in ("m", "v")}
-        arrays[f"grad_{key}"] = entry("input", shape("R", rest), f"gradients of raw {key}, step after step; no prior's")
+        arrays[key] = entry("input", axes("N", rest), f"raw {key} at the start: logarithms, logits")
+        arrays |= {f"{k}_{key}": entry("input", axes("N", rest), f"Adam's moments {k} of {key}") for k in ("m", "v")}
+        arrays[f"grad_{key}"] = entry("input", axes("R", rest), f"gradients of raw {key}, step after step; no prior's")
     arrays |= {name: entry("input", *about) for name, about in _SHOWN.items()}
     arrays["masks"]["dtype"] = "bool"
     whole = ("steps", "sh_degrees", "step_rows", "kept_pixels", "radii", "dominant_counts", "passes", "pass_n_pixels",
@@ -555,7 +547,7 @@ def training_kind() -> dict[str, Any]:
     for kind, what in (("params", "raw"), ("m", "first moments of"), ("v", "second moments of")):
         for key, rest in _OF_PARAMS.items():
             said = f"{what} {key} after the step: rows i, each times 1 + 7 i mod 16, summed"
-            arrays |= output(f"sums_{kind}_{key}", shape("S", rest), said, "training.rows")
+            arrays |= output(f"sums_{kind}_{key}", axes("S", rest), said, "training.rows")
     about = (
         "a training by 'method' under 'settings': at every step Adam, then statistics, then what the method does to "
         "the Gaussians. Views and gradients are given, so that nothing is drawn; 'passes' says which view, of how many "

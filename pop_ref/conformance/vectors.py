@@ -38,6 +38,7 @@ from pop_ref.conformance.vector_check import (
     IMAGES,
     INPUTS,
     WHERE,
+    axes,
     close,
     entry,
     equal,
@@ -163,7 +164,7 @@ def call_kind(kind: str) -> dict[str, Any]:
     arrays |= {name: entry("mask", *about, "bool") for name, about in _MASKS.items()}
     if batches:
         for about in arrays.values():
-            about["shape"] = f"[E, {about['shape'][1:]}".replace("[E, ]", "[E]")
+            about["shape"] = axes("E", about["shape"][1:-1])
     return {"about": _ABOUT, "modes": MODES, "arrays": arrays}
 
 

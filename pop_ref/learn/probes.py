@@ -74,6 +74,14 @@ def _plain(make: Callable[[np.random.Generator, int], tuple[Any, ...]], *sizes: 
     return lambda rng: (("", make(rng, n)) for n in sizes)
 
 
+def _pulled(draw: Draw, at: int, *cotangents: float) -> Draw:
+    """Draw the same inputs with cotangents among them, in turns."""
+    return lambda rng: (
+        (words, (*given[:at], cotangents[k % len(cotangents)], *given[at:]))
+        for k, (words, given) in enumerate(draw(rng))
+    )
+
+
 def _logits(rng: np.random.Generator) -> Iterator[Probe]:
     for n in (1, 3, 4):
         yield "", (rng.uniform(-3.0, 3.0, n),)
@@ -277,11 +285,6 @@ def _alphas(rng: np.random.Generator) -> Iterator[Probe]:
     yield "alpha is exactly the ceiling of 0.999, which is not over it", (0.0, 0.999)
 
 
-def _alphas_back(rng: np.random.Generator) -> Iterator[Probe]:
-    for k, (words, given) in enumerate(_alphas(rng)):
-        yield words, (*given, (1.0, -2.0, 0.5)[k % 3])
-
-
 def _stops(rng: np.random.Generator) -> Iterator[Probe]:
     for next_T in (0.5, 0.01, 2e-4, 5e-5, 1e-9):
         yield "", (next_T,)
@@ -348,11 +351,6 @@ def _pictures(rng: np.random.Generator) -> Iterator[Probe]:
     yield "a mask leaves all pixels out", (*pair, np.zeros((2, 3), dtype=bool))
 
 
-def _pictures_back(rng: np.random.Generator) -> Iterator[Probe]:
-    for k, (words, given) in enumerate(_pictures(rng)):
-        yield words, (*given[:2], (1.0, 2.0, 0.5, 1.0, 1.5, 1.0)[k], *given[2:])
-
-
 def _counts(rng: np.random.Generator) -> Iterator[Probe]:
     yield "", (np.array([3, 0, 1]),)
     yield "", (rng.integers(0, 3, 7),)
@@ -366,11 +364,6 @@ def _poles(rng: np.random.Generator) -> Iterator[Probe]:
     some = np.array([True, False, True, False, True])
     visible = np.array([True, True, False, False, True])
     yield "only the visible Gaussians take part", (rng.uniform(0.0, 1.0, 5), some, visible)
-
-
-def _poles_back(rng: np.random.Generator) -> Iterator[Probe]:
-    for k, (words, given) in enumerate(_poles(rng)):
-        yield words, (*given[:2], (1.0, 0.25, 1.0, 1.0, 2.0)[k], *given[2:])
 
 
 def _adam(rng: np.random.Generator) -> Iterator[Probe]:
@@ -540,19 +533,19 @@ _PROBES: Final[dict[str, Draw]] = {
     "sigma_at_pixel": _at_pixel,
     "falloff": _sigmas,
     "alpha_from_sigma": _alphas,
-    "alpha_from_sigma_vjp": _alphas_back,
+    "alpha_from_sigma_vjp": _pulled(_alphas, 2, 1.0, -2.0, 0.5),
     "stops": _stops,
     "composite_pixel": _pixels,
     "composite_pixel_vjp": _pixels_back,
     "dominant_id": _weights,
     "dominant_counts": _winners,
     "l1": _pictures,
-    "l1_vjp": _pictures_back,
+    "l1_vjp": _pulled(_pictures, 2, 1.0, 2.0, 0.5, 1.0, 1.5, 1.0),
     "l2": _pictures,
-    "l2_vjp": _pictures_back,
+    "l2_vjp": _pulled(_pictures, 2, 1.0, 2.0, 0.5, 1.0, 1.5, 1.0),
     "importance_mask": _counts,
     "pop_loss": _poles,
-    "pop_loss_vjp": _poles_back,
+    "pop_loss_vjp": _pulled(_poles, 2, 1.0, 0.25, 1.0, 1.0, 2.0),
     "adam_step": _adam,
     "clone_rows": _masked_rows,
     "split_rows": _split,

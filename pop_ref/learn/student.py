@@ -9,24 +9,21 @@ from __future__ import annotations
 
 import ast
 import copy
-import functools
 import importlib
-import importlib.abc
-import importlib.util
 import inspect
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from importlib.machinery import ModuleSpec
 from pathlib import Path
-from types import CodeType, ModuleType
+from types import ModuleType
 from typing import Any, Final
 
 import numpy as np
 
 import pop_ref
+from pop_ref.conformance.copied import copied
 from pop_ref.learn.course import COURSE, Stage
 
 PACKAGE: Final = "pop_yours"
@@ -187,11 +184,8 @@ def borrowing(work: Work, stages: Sequence[Stage] = COURSE) -> Iterator[Borrowed
     for stage in stages:
         if stage.name in work.unreadable:
             raise ValueError(work.unreadable[stage.name])
-    finder = _Copies()
-    _forget()
-    sys.meta_path.insert(0, finder)
     borrowed = Borrowed()
-    try:
+    with copied("pop_ref", PACKAGE, {}):
         modules = [borrowed.module(path.stem) for path in sorted(_ORACLE.glob("[a-z]*.py"))]
         theirs = {stage.name: _run(work.folder / stage.file) for stage in stages if work.written[stage.name]}
         modules += theirs.values()
@@ -207,9 +201,6 @@ def borrowing(work: Work, stages: Sequence[Stage] = COURSE) -> Iterator[Borrowed
                     # a stub that the student's own functions call
                     setattr(theirs[stage.name], name, borrowed.oracle[name])
         yield borrowed
-    finally:
-        sys.meta_path.remove(finder)
-        _forget()
 
 
 def _with_settings(function: Callable[..., Any], before: Callable[..., Any]) -> Callable[..., Any]:
@@ -334,40 +325,6 @@ def said(error: BaseException) -> str:
     """Say an exception in one line."""
     text = " ".join(str(error).split())
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
-
-
-class _Copies(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Imports the oracle's files under the copy's name."""
-
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
-        """Answer for the copy's names only."""
-        if fullname == PACKAGE:
-            return importlib.util.spec_from_loader(fullname, self, is_package=True)
-        known = fullname.startswith(f"{PACKAGE}.") and _file(fullname).exists()
-        return importlib.util.spec_from_loader(fullname, self) if known else None
-
-    def exec_module(self, module: ModuleType) -> None:
-        """Run the oracle's text; the package itself is empty."""
-        if module.__name__ != PACKAGE:
-            exec(_code(module.__name__), module.__dict__)
-
-
-@functools.cache
-def _code(fullname: str) -> CodeType:
-    # a copy is made of every module for every stage that is judged
-    text = _file(fullname).read_text(encoding="utf-8").replace("pop_ref", PACKAGE)
-    return compile(text, f"<{fullname}>", "exec")
-
-
-def _file(fullname: str) -> Path:
-    return _ORACLE / f"{fullname.removeprefix(f'{PACKAGE}.')}.py"
-
-
-def _forget() -> None:
-    for name in [n for n in sys.modules if n == PACKAGE or n.startswith(f"{PACKAGE}.")]:
-        del sys.modules[name]
 
 
 def numbers(value: Any) -> np.ndarray:

@@ -15,46 +15,27 @@ def test_arguments_that_are_taken_alone_are_taken_together(backend):
     assert_no_pair_fails(backend)
 
 
-@law("signature", SIGNATURE)
-def test_every_pair_of_arguments_draws_what_the_oracle_draws(backend):
-    assert_every_pair(backend, "images")
+# by what is asked of every call: the rest of the law's name, and what it needs beside the signature
+LAWS = {
+    "images": ("draws_what_the_oracle_draws",),
+    "gradients": ("has_the_oracles_gradients", GRADIENTS),
+    "rows": ("shows_the_oracles_splats",),
+    "dominance": ("tells_the_dominant_gaussians_of_every_camera",),
+    "tiles": ("lists_tiles_front_to_back",),
+    "no gradients": ("draws_the_same_without_gradients", GRADIENTS),
+    "frozen means": ("has_the_oracles_gradients_where_means_have_none", GRADIENTS, "differentiate"),
+    "arguments": ("leaves_the_arguments_as_they_are",),
+    "types": ("is_answered_in_gsplats_shapes_and_types",),
+}
 
 
-@law("signature", SIGNATURE, GRADIENTS)
-def test_every_pair_of_arguments_has_the_oracles_gradients(backend):
-    assert_every_pair(backend, "gradients")
+def _of_every_pair(asked, name, *needs):
+    def sentence(backend):
+        assert_every_pair(backend, asked)
+
+    sentence.__name__ = f"test_every_pair_of_arguments_{name}"
+    return law("signature", SIGNATURE, *needs)(sentence)
 
 
-@law("signature", SIGNATURE)
-def test_every_pair_of_arguments_shows_the_oracles_splats(backend):
-    assert_every_pair(backend, "rows")
-
-
-@law("signature", SIGNATURE)
-def test_every_pair_of_arguments_tells_the_dominant_gaussians_of_every_camera(backend):
-    assert_every_pair(backend, "dominance")
-
-
-@law("signature", SIGNATURE)
-def test_every_pair_of_arguments_lists_tiles_front_to_back(backend):
-    assert_every_pair(backend, "tiles")
-
-
-@law("signature", SIGNATURE, GRADIENTS)
-def test_every_pair_of_arguments_draws_the_same_without_gradients(backend):
-    assert_every_pair(backend, "no gradients")
-
-
-@law("signature", SIGNATURE, GRADIENTS, "differentiate")
-def test_every_pair_of_arguments_has_the_oracles_gradients_where_means_have_none(backend):
-    assert_every_pair(backend, "frozen means")
-
-
-@law("signature", SIGNATURE)
-def test_every_pair_of_arguments_leaves_the_arguments_as_they_are(backend):
-    assert_every_pair(backend, "arguments")
-
-
-@law("signature", SIGNATURE)
-def test_every_pair_of_arguments_is_answered_in_gsplats_shapes_and_types(backend):
-    assert_every_pair(backend, "types")
+for _asked, _of in LAWS.items():
+    globals()[f"test_every_pair_of_arguments_{_of[0]}"] = _of_every_pair(_asked, *_of)

@@ -111,6 +111,10 @@ def antialiased(given: Given) -> bool:
     return bool(given["rasterize_mode"] == "antialiased")
 
 
+def empty(given: Given) -> bool:
+    return bool(given["means"].shape[-2] == 0)
+
+
 def deep(given: Given) -> bool:
     return bool(given["render_mode"] != "RGB")
 
@@ -127,8 +131,18 @@ def depth_beside_colors(given: Given) -> bool:
     return bool(given["render_mode"].startswith("RGB+"))
 
 
+def evaluated(given: Given) -> bool:
+    """Hold of calls that are made without gradients."""
+    return not import_torch().is_grad_enabled()
+
+
 def both(*conditions: Condition) -> Condition:
     return lambda given: all(condition(given) for condition in conditions)
+
+
+def frozen(*names: str) -> Condition:
+    """Hold unless all of these arguments require a gradient."""
+    return lambda given: not all(given[name].requires_grad for name in names)
 
 
 def breaking(change: Callable[[Given], Given]) -> Breaks:
@@ -143,9 +157,16 @@ def when(condition: Condition, **changed: Any) -> Breaks:
     )
 
 
-def passing(change: Callable[[Any], Any], *names: str) -> Breaks:
-    """Break some arguments, each by itself."""
-    return breaking(lambda given: {name: change(given[name]) for name in names if given[name] is not None})
+def passing(change: Callable[[Any], Any], *names: str, condition: Condition = always) -> Breaks:
+    """Break some arguments, each by itself, where a condition holds."""
+    return breaking(
+        lambda given: {name: change(given[name]) for name in names if condition(given) and given[name] is not None}
+    )
+
+
+def unfollowed(condition: Condition, *names: str) -> Breaks:
+    """Have arguments without a gradient where a condition holds."""
+    return passing(lambda x: x.detach(), *names, condition=condition)
 
 
 def pulled(condition: Condition, change: Callable[[Given, Any], Any], *names: str) -> Breaks:
@@ -183,6 +204,17 @@ def then(condition: Condition, change: Callable[[Given, Any, Any, Any], Told]) -
         return change(given, images, alphas, meta) if condition(given) else (images, alphas, meta)
 
     return breaks
+
+
+def failing_after(seen: Callable[[Given, Any, Any], bool], words: str) -> Breaks:
+    """Break calls that end in an error by the opacity that they draw and by meta."""
+
+    def change(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
+        if seen(given, alphas.detach(), meta):
+            raise RuntimeError(words)
+        return images, alphas, meta
+
+    return then(always, change)
 
 
 def drawn(condition: Condition, change: Callable[[Given, Any, Any], Any]) -> Breaks:
@@ -251,6 +283,13 @@ def detached(value: Any, wrong: Any) -> Any:
 
 def numbers(count: int, like: Any) -> Any:
     return import_torch().arange(count, device=like.device)
+
+
+def read_densely(x: Any) -> Any:
+    """Read memory from a tensor's beginning as if its numbers lay one after the other."""
+    enough = x.untyped_storage().nbytes() // x.element_size() - x.storage_offset() >= x.numel()
+    strides = import_torch().empty(x.shape, device="meta").stride()
+    return x.as_strided(x.shape, strides, x.storage_offset()) if enough else x.contiguous()
 
 
 def first_channels(value: Any, count: int) -> Any:

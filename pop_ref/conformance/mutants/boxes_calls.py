@@ -6,52 +6,38 @@ Each wraps this program's rasterizer and does what a kernel, an extension or a p
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any, Final
 
 from pop_ref.conformance.mutants.black_box import (
     BlackBox,
     Breaks,
-    Condition,
     Given,
     Rasterization,
     Told,
+    accumulated_mode,
     always,
     backwards,
+    both,
     breaking,
+    deep,
+    drawn,
+    empty,
+    evaluated,
+    failing,
+    failing_after,
+    frozen,
     import_torch,
     packed,
+    passing,
     plain,
+    read_densely,
     several,
     then,
+    unfollowed,
+    when,
 )
 
-
-def _read_densely(x: Any) -> Any:
-    """Read memory from a tensor's beginning as if its numbers lay one after the other."""
-    dense = import_torch().empty(x.shape, device="meta").stride()
-    enough = x.untyped_storage().nbytes() // x.element_size() - x.storage_offset() >= x.numel()
-    return x.as_strided(x.shape, dense, x.storage_offset()) if enough else x.contiguous()
-
-
-def _densely(name: str, condition: Condition) -> Breaks:
-    return breaking(
-        lambda given: {name: _read_densely(given[name])} if condition(given) and given[name] is not None else {}
-    )
-
-
-def _follow_the_means(name: str, condition: Condition) -> Breaks:
-    """Have an argument without a gradient where the means need none."""
-
-    def change(given: Given) -> Given:
-        asked = condition(given) and given[name] is not None and not given["means"].requires_grad
-        return {name: given[name].detach()} if asked else {}
-
-    return breaking(change)
-
-
-def _without_gradients(change: Callable[[Given], Given]) -> Breaks:
-    return breaking(lambda given: {} if import_torch().is_grad_enabled() else change(given))
+_LAUNCH: Final = "invalid configuration argument"
 
 
 def _shifted_in_place(sound: Rasterization, given: Given) -> Any:
@@ -112,19 +98,10 @@ def _seen(meta: Any) -> bool:
     return bool((meta["radii"] > 0).any())
 
 
-def _fails(when: Callable[[Given, Any], bool]) -> Breaks:
-    def change(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
-        if when(given, meta):
-            raise RuntimeError("invalid configuration argument")
-        return images, alphas, meta
-
-    return then(always, change)
-
-
 def _way_back_of_nothing_fails(given: Given, images: Any, alphas: Any, meta: Any) -> Told:
     def change(v: Any) -> Any:
         if not _seen(meta):
-            raise RuntimeError("invalid configuration argument")
+            raise RuntimeError(_LAUNCH)
         return v
 
     return backwards(images, change), alphas, meta
@@ -156,41 +133,42 @@ _LONG: Final = "test_whole:a_picture_of_thousands_of_columns_or_rows_is_drawn_to
 
 _BOXES: Final[tuple[tuple[str, str, Breaks, str], ...]] = (
     ("packed_means_read_densely", "the packed kernel reads centres one after the other, however they lie",
-     _densely("means", packed), _CONTRACT),
+     passing(read_densely, "means", condition=packed), _CONTRACT),
     ("packed_colours_follow_the_means", "packed colours have gradients only where means have some",
-     _follow_the_means("colors", packed), _CONTRACT),
+     unfollowed(both(packed, frozen("means")), "colors"), _CONTRACT),
     ("cameras_follow_the_means_where_there_are_several", "with frozen means several cameras have no gradients",
-     _follow_the_means("viewmats", several), _FROZEN),
+     unfollowed(both(several, frozen("means")), "viewmats"), _FROZEN),
     ("covariances_follow_the_means", "covariances have gradients only where means have some",
-     _follow_the_means("covars", lambda given: True), _FROZEN),
+     unfollowed(frozen("means"), "covars"), _FROZEN),
     ("packed_workspace_for_all_passes", "what packed rows keep for the way back is that of the last call",
      _one_workspace_when_packed(), _CONTRACT),
     ("packed_rows_go_back_once", "a second way back through packed rows finds its buffers cleared",
      then(packed, _packed_goes_back_once), _CONTRACT),
     ("lenses_read_densely", "intrinsics are read row by row, however they lie (a transposed K has cx for 0)",
-     _densely("Ks", lambda given: True), "test_autograd:how_arguments_lie_in_memory_changes_no_gradient"),
+     passing(read_densely, "Ks"), "test_autograd:how_arguments_lie_in_memory_changes_no_gradient"),
     ("lens_kept_with_its_tensor", "intrinsics are kept with their tensor, and a zoom written into it changes nothing",
      _lens_kept(), "test_autograd:tensors_that_have_been_drawn_before_are_drawn_with_the_numbers_that_they_have_now"),
     ("lenses_shifted_in_place", "the principal point of the caller's K is shifted by half a pixel at every call",
      _shifted_in_place, "test_autograd:a_render_leaves_its_arguments_as_they_are"),
     ("covariances_read_densely", "covariances are read one after the other, however they lie",
-     _densely("covars", lambda given: True), _DRAWN),
+     passing(read_densely, "covars"), _DRAWN),
     ("plain_colours_read_densely", "plain colours are read one after the other, as harmonics are not",
-     _densely("colors", plain), _DRAWN),
+     passing(read_densely, "colors", condition=plain), _DRAWN),
     ("poses_of_several_cameras_read_densely", "view matrices of several cameras are read one after the other",
-     _densely("viewmats", several), "test_signature_pairs:arguments_that_are_taken_alone_are_taken_together"),
+     passing(read_densely, "viewmats", condition=several),
+     "test_signature_pairs:arguments_that_are_taken_alone_are_taken_together"),
     ("backgrounds_of_several_cameras_read_densely", "backgrounds of several cameras are read one after the other",
-     _densely("backgrounds", several), _DRAWN),
+     passing(read_densely, "backgrounds", condition=several), _DRAWN),
     ("packed_evaluation_is_black_behind", "without gradients packed rows are drawn over black",
-     _without_gradients(lambda given: {"backgrounds": None} if given["packed"] else {}), _STILL),
+     when(both(evaluated, packed), backgrounds=None), _STILL),
     ("cameras_evaluation_is_black_behind", "without gradients several cameras are drawn over black",
-     _without_gradients(lambda given: {"backgrounds": None} if several(given) else {}), _STILL),
+     when(both(evaluated, several), backgrounds=None), _STILL),
     ("evaluation_is_classic", "without gradients antialiasing is left out",
-     _without_gradients(lambda given: {"rasterize_mode": "classic"}), _STILL),
+     when(evaluated, rasterize_mode="classic"), _STILL),
     ("evaluation_does_not_divide", "without gradients the expected depth is the accumulated one",
-     _without_gradients(lambda given: {"render_mode": given["render_mode"].replace("ED", "D")}), _STILL),
+     when(evaluated, render_mode=accumulated_mode), _STILL),
     ("images_of_another_type", "images are of float64 where the Gaussians are of float32, and the other way round",
-     then(always, lambda given, images, alphas, meta: (_of_another_type(images), alphas, meta)), _TYPES),
+     drawn(always, lambda given, images, alphas: _of_another_type(images)), _TYPES),
     ("alphas_of_another_type", "alphas are of float64 where the Gaussians are of float32, and the other way round",
      then(always, lambda given, images, alphas, meta: (images, _of_another_type(alphas), meta)), _TYPES),
     ("alphas_without_a_channel", "alphas have no axis of one channel",
@@ -201,13 +179,13 @@ _BOXES: Final[tuple[tuple[str, str, Breaks, str], ...]] = (
      then(always, lambda given, images, alphas, meta: (images if _seen(meta) else images.detach(), alphas, meta)),
      _NOTHING),
     ("packed_nothing_fails", "a packed call of Gaussians that nobody sees launches a grid of no blocks",
-     _fails(lambda given, meta: given["packed"] and not _seen(meta)), _NOTHING),
+     failing_after(lambda given, alphas, meta: packed(given) and not _seen(meta), _LAUNCH), _NOTHING),
     ("packed_empty_scene_fails", "a packed call without Gaussians ends in an error",
-     _fails(lambda given, meta: given["packed"] and given["means"].shape[-2] == 0), _NOTHING),
+     failing(both(packed, empty), _LAUNCH), _NOTHING),
     ("depth_of_an_empty_scene_fails", "the depth of no Gaussians ends in an error",
-     _fails(lambda given, meta: given["render_mode"] != "RGB" and given["means"].shape[-2] == 0), _NOTHING),
+     failing(both(deep, empty), _LAUNCH), _NOTHING),
     ("cameras_of_an_empty_scene_fail", "several cameras that look at no Gaussians end in an error",
-     _fails(lambda given, meta: several(given) and given["means"].shape[-2] == 0), _NOTHING),
+     failing(both(several, empty), _LAUNCH), _NOTHING),
     ("way_back_of_nothing_fails", "the way back from a picture that shows nothing launches a grid of no blocks",
      then(always, _way_back_of_nothing_fails), _NOTHING),
     ("columns_up_to_2048", "columns from number 2,048 on are not drawn (a texture's width)", _up_to(2048, -2), _LONG),

@@ -23,15 +23,18 @@ from pop_ref.conformance.mutants.black_box import (
     backwards,
     batched,
     behind,
+    both,
     breaking,
     covars,
     deep,
     detached,
     drawn,
     drawn_in_order,
+    evaluated,
     expected_depth,
     factor_is_constant,
     failing,
+    frozen,
     hidden,
     import_torch,
     in_camera,
@@ -40,11 +43,13 @@ from pop_ref.conformance.mutants.black_box import (
     one_view,
     passing,
     pulled,
+    read_densely,
     seen_opacities,
     shown,
     then,
     tile_numbers,
     told,
+    unfollowed,
     when,
 )
 
@@ -71,24 +76,6 @@ def _function(forward: Callable[..., Any], backward: Callable[..., Any]) -> Call
 
 def _copy_going_back(x: Any, backward: Callable[[Any, Any], Any]) -> Any:
     return _function(lambda ctx, x: x.clone(), backward)(x)
-
-
-def _nowhere_unless(all_of: tuple[str, ...], dropped: tuple[str, ...]) -> Callable[[Given], Given]:
-    """Return a change by which some arguments have no gradient unless all of others require one."""
-
-    def change(given: Given) -> Given:
-        if all(given[name].requires_grad for name in all_of):
-            return {}
-        return {name: given[name].detach() for name in dropped}
-
-    return change
-
-
-def _read_densely(x: Any) -> Any:
-    """Read memory from a tensor's beginning as if its numbers lay one after the other."""
-    enough = x.untyped_storage().nbytes() // x.element_size() - x.storage_offset() >= x.numel()
-    strides = import_torch().empty(x.shape, device="meta").stride()
-    return x.as_strided(x.shape, strides, x.storage_offset()) if enough else x.contiguous()
 
 
 def _cotangents_read(read: Callable[[Any], Any]) -> Breaks:
@@ -302,13 +289,6 @@ def _one_picture() -> Breaks:
     return breaks
 
 
-def _all_learn_by_means(given: Given) -> Given:
-    if given["means"].requires_grad:
-        return {}
-    Tensor = import_torch().Tensor
-    return {name: value.detach() for name, value in given.items() if isinstance(value, Tensor)}
-
-
 def _seeds_anew(sound: Rasterization, given: Given) -> Any:
     import_torch().manual_seed(0)
     return sound(**given)
@@ -466,29 +446,29 @@ def _context_of_the_first_thread() -> Breaks:
 
 _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("gradients_if_all_are_asked_for", "unless every array requires a gradient, none has one",
-     breaking(_nowhere_unless(ROWS, ROWS)), _ALONE),
+     unfollowed(frozen(*ROWS), *ROWS), _ALONE),
     ("colours_follow_the_means", "colours have gradients only where means have some",
-     breaking(_nowhere_unless(("means",), ("colors",))), _ALONE),
+     unfollowed(frozen("means"), "colors"), _ALONE),
     ("cameras_follow_the_means", "a frozen scene gives its camera no gradient (pose refinement after training)",
-     breaking(_nowhere_unless(("means",), ("viewmats",))), _ALONE),
+     unfollowed(frozen("means"), "viewmats"), _ALONE),
     ("backgrounds_follow_the_colours", "a background learned alone has no gradient",
-     breaking(_nowhere_unless(("colors",), ("backgrounds",))), _ALONE),
+     unfollowed(frozen("colors"), "backgrounds"), _ALONE),
     ("quaternions_follow_the_scales", "with frozen scales quaternions have no gradient: one switch for both",
-     breaking(_nowhere_unless(("scales",), ("quats",))),
+     unfollowed(frozen("scales"), "quats"),
      "test_autograd:an_argument_without_a_gradient_takes_none_from_the_others"),
     ("opacities_follow_the_colours", "with frozen colours the opacities' gradient lacks what they show",
-     breaking(_nowhere_unless(("colors",), ("opacities",))),
+     unfollowed(frozen("colors"), "opacities"),
      "test_autograd:an_argument_without_a_gradient_takes_none_from_the_others"),
     ("means_read_densely", "a kernel reads means one after the other, however they lie (no contiguous())",
-     passing(_read_densely, "means"), _MEMORY),
+     passing(read_densely, "means"), _MEMORY),
     ("colours_read_densely", "a kernel reads colours one after the other, however they lie",
-     passing(_read_densely, "colors"), _MEMORY),
+     passing(read_densely, "colors"), _MEMORY),
     ("opacities_read_densely", "a kernel reads opacities one after the other, however they lie",
-     passing(_read_densely, "opacities"), _MEMORY),
+     passing(read_densely, "opacities"), _MEMORY),
     ("offset_of_the_storage_ignored", "scales are read from where their storage begins (data_ptr of the storage)",
      passing(lambda x: x.as_strided(x.shape, x.stride(), 0), "scales"), _MEMORY),
     ("cotangents_read_densely", "the backward kernel reads the image's cotangent as if it were dense",
-     _cotangents_read(_read_densely), _COTANGENTS),
+     _cotangents_read(read_densely), _COTANGENTS),
     ("expanded_cotangents_have_one_number", "of a cotangent without memory of its own the first number is read",
      _cotangents_read(_first_number_alone), _COTANGENTS),
     ("both_outputs_must_be_used", "a loss that reads the image alone, or alpha alone, ends in an error (None)",
@@ -498,7 +478,7 @@ _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
     ("no_grad_is_not_heard", "under no_grad the image still follows its arguments, and keeps their memory",
      _drawn_with_gradients, _NO_GRADIENTS),
     ("evaluation_draws_otherwise", "without gradients another path draws, which forgets the background",
-     when(lambda g: behind(g) and not import_torch().is_grad_enabled(), backgrounds=lambda g: 0.0 * g["backgrounds"]),
+     when(both(behind, evaluated), backgrounds=lambda g: 0.0 * g["backgrounds"]),
      _NO_GRADIENTS),
     ("all_require_gradients_afterwards", "a render turns requires_grad on for its arguments (retain_grad for density)",
      breaking(_asked_of_all), "test_autograd:nothing_follows_where_no_argument_requires_a_gradient"),
@@ -553,11 +533,12 @@ _BOXES: Final[tuple[tuple[Any, ...], ...]] = (
      "under torch.inference_mode a call ends in an error, as something is saved for the backward pass",
      failing(lambda g: import_torch().is_inference_mode_enabled(), "Inference tensors cannot be saved for backward"),
      _NO_GRADIENTS),
-    ("all_learn_by_means", "nothing has a gradient where the centres need none", breaking(_all_learn_by_means), _ALONE),
+    ("all_learn_by_means", "nothing has a gradient where the centres need none",
+     unfollowed(frozen("means"), *ROWS, "viewmats", "Ks", "backgrounds", "covars"), _ALONE),
     ("rows_as_stored", "strides of centres, opacities and colours are ignored",
-     passing(_read_densely, "means", "opacities", "colors"), _MEMORY),
+     passing(read_densely, "means", "opacities", "colors"), _MEMORY),
     ("cameras_as_stored", "strides of view matrices and intrinsics are ignored",
-     passing(_read_densely, "viewmats", "Ks"), _MEMORY),
+     passing(read_densely, "viewmats", "Ks"), _MEMORY),
     ("seeds_anew", "every call seeds torch's generator", _seeds_anew, _NO_GRADIENTS),
     ("rows_of_16_bits", "Gaussians from number 65536 on are not drawn",
      hidden(always, lambda g: _below(2**16, g)), _MANY),
