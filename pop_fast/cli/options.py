@@ -198,7 +198,11 @@ def limited(shown: Shown, limits: LimitOptions, output: Output) -> Limited:
     by_itself: shrink.Score = "visibility" if shown.photographed is None else "sensitivity"
     score = by_itself if limits.score == "auto" else limits.score
     if limits.max_gaussians is not None:
+        before = len(left.params["means"])
         left.keep(shrink.best(_scores(shown, left.params, score), limits.max_gaussians), f"highest {score}")
+        if limits.target_mb is None and len(left.params["means"]) == before:
+            # where none is left out, there is nothing that the others would have to make up for
+            return left
     if shown.photographed is None:
         _fit_unseen(left, limits, output)
     else:
