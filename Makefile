@@ -104,7 +104,7 @@ emulate: setup  ## run the CUDA kernels' own source on the host, warp by warp: e
 		$(BIN)/python -m pytest -q tests/cuda/gpu tests/cuda/emulated
 
 # no environment is made and nothing installed: it runs on a node with a GPU, torch and nvcc, and writes to $$OUT
-gpu-check:  ## JOB=1: build, smoke, times, counters; JOB=2: laws, steps, sanitizer, training on CAPTURES="a b" (needs a GPU)
+gpu-check:  ## JOB=1: build, smoke, times; 2: laws, steps, training on CAPTURES="a b"; 3: rows; 4: several GPUs (needs a GPU)
 	$(PYTHON) -m cuda_ext.gpu_check $(if $(JOB),--job $(JOB)) $(if $(STAGES),--stages $(STAGES)) \
 		$(if $(CAPTURES),--captures $(CAPTURES))
 

@@ -47,7 +47,7 @@ def pack_scene(run: Path, folder: Path) -> Path:
     """Write a result of `pop train` as a packed scene: its last checkpoint, its held-out cameras, the first photograph.
 
     Raises:
-        PopError: it is no result, or its capture is not where it was.
+        PopError: it is no result, its capture is not where it was, or another of its name is packed.
     """
     splat = load_splat(run)
     capture, config = open_capture(splat, CaptureOptions())
@@ -55,7 +55,7 @@ def pack_scene(run: Path, folder: Path) -> Path:
     p = {name: value.numpy() for name, value in splat.params.items()}
     sh = np.zeros((len(p["means"]), 16, 3), np.float16)
     sh[:, :1], sh[:, 1 : 1 + p["shN"].shape[1]] = p["sh0"], p["shN"]
-    target = folder / f"{run.resolve().name}.npz"
+    target = _target(folder, f"{run.resolve().name}.npz")
     np.savez_compressed(
         target,
         means=p["means"],
@@ -75,10 +75,10 @@ def pack_capture(source: Path, folder: Path, pixels: float) -> Path:
     """Write a capture with photographs of at most so many pixels, undistorted, as JPEG with a COLMAP text model.
 
     Raises:
-        CaptureError: the capture cannot be read.
+        PopError: the capture cannot be read, or another of its name is packed.
     """
+    target = _target(folder, source.resolve().name)
     capture = load_capture(source, masks=False, normalize=False)
-    target = folder / source.resolve().name
     (target / "images").mkdir(parents=True)
     (target / "sparse" / "0").mkdir(parents=True)
     cameras: list[str] = []
@@ -103,10 +103,10 @@ def keep_capture(source: Path, folder: Path) -> Path:
     """Copy a capture as it is, of which rows of the paper's tables can be trained.
 
     Raises:
-        CaptureError: it cannot be read.
+        PopError: it cannot be read, or another of its name is packed.
     """
+    target = _target(folder, source.resolve().name)
     load_capture(source)
-    target = folder / source.resolve().name
     shutil.copytree(source, target)
     return target
 
@@ -128,6 +128,13 @@ def prepare_capture(name: str, data: Path, folder: Path) -> Path:
     if not np.array_equal(captures[0].points, captures[1].points):
         raise PopError(f"{name}: has no points of its own; those that are made up depend on the seed")
     return prepared.write(captures[0], config, folder / scene.folder)
+
+
+def _target(folder: Path, name: str) -> Path:
+    """Return where a source is packed; a second one of the same name would be mixed with the first."""
+    if (folder / name).exists():
+        raise PopError(f"another {name} is packed already; rename one of the two")
+    return folder / name
 
 
 def _shrunk(view: View, pixels: float) -> tuple[np.ndarray, np.ndarray]:
@@ -192,6 +199,23 @@ def _repository_bytes() -> int:
     return sum(path.stat().st_size for path in paths if path.is_file())
 
 
+def _make_anew(folder: Path) -> None:
+    """Empty the folder of an earlier pack, or make it.
+
+    Raises:
+        PopError: it is a file, holds what no pack has, or cannot be made.
+    """
+    try:
+        if folder.exists() and any(folder.iterdir()) and not (folder / "manifest.json").is_file():
+            raise PopError(f"{folder}: holds files that no pack has; name another folder")
+        shutil.rmtree(folder, ignore_errors=True)
+        (folder / "scenes").mkdir(parents=True)
+    except OSError as error:
+        raise PopError(f"{folder}: {error.strerror}; name another folder") from error
+    # a pack that is interrupted is known for one by the next call
+    write_json(folder / "manifest.json", {})
+
+
 def main() -> int:
     """Pack from the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -205,11 +229,13 @@ def main() -> int:
     parser.add_argument("--no-wheels", action="store_true", help="download nothing")
     args = parser.parse_args()
     folder: Path = args.folder
-    if folder.exists() and any(folder.iterdir()) and not (folder / "manifest.json").is_file():
-        print(f"gpu_pack: {folder}: holds files that no pack has; name another folder", file=sys.stderr)
+    try:
+        if not args.pixels >= 1.0:
+            raise PopError(f"--pixels is {args.pixels:g}; it must be at least 1")
+        _make_anew(folder)
+    except PopError as error:
+        print(f"gpu_pack: {error}", file=sys.stderr)
         return 2
-    shutil.rmtree(folder, ignore_errors=True)
-    (folder / "scenes").mkdir(parents=True)
     absent: list[str] = []
     scenes, captures = folder / "scenes", folder / "captures"
     packed: tuple[tuple[str, list[Path], Callable[[Path], Path]], ...] = (

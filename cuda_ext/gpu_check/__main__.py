@@ -26,6 +26,7 @@ All of it, with the repository's own files, must be under 64 MiB. Every part of 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import platform
 import signal
@@ -116,7 +117,8 @@ def run_stages(names: list[str], limit: float, check: StageContext, report: dict
         if found["status"] != 0:
             failed.append(name)
         if words != "ok":
-            print(found.get("skipped") or found.get("output", "")[-1500:], flush=True)
+            said = [found["skipped"]] if "skipped" in found else [found.get("output", "")[-1500:], found.get("note")]
+            print("\n".join(filter(None, said)), flush=True)
     report["complete"] = True
     write_json(path, report)
     return failed
@@ -181,6 +183,8 @@ def _parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Run a job, or pack what it takes along, from the command line."""
     args = _parser().parse_args(argv)
+    if math.isnan(args.limit_s):
+        raise SystemExit("gpu_check: --limit-s is nan; give seconds, for example 560")
     if args.pack is not None:
         return _pack(args.pack.resolve(), args)
     out = _results_folder(args.out)
@@ -202,6 +206,8 @@ def main(argv: list[str] | None = None) -> int:
         note=lambda found: None,
     )
     names = args.stages or list(JOBS[args.job])
+    if here.get("gpu", "") is None and not args.rehearse:
+        print("note: nvidia-smi names no GPU here, which most stages need; --rehearse emulates one", flush=True)
     try:
         failed = run_stages(names, args.limit_s, check, report, path)
     finally:
@@ -217,5 +223,8 @@ def main(argv: list[str] | None = None) -> int:
 
 if __name__ == "__main__":
     # a job that is ended takes its commands, which have sessions of their own, along
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    for ending in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        # what nohup, or a shell in the background, told to be ignored stays ignored
+        if signal.getsignal(ending) != signal.SIG_IGN:
+            signal.signal(ending, lambda number, _: sys.exit(128 + number))
     sys.exit(main())

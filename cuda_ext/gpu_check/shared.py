@@ -69,13 +69,15 @@ class Command:
         quarter of it and `GRACE` at most, if nothing else is said.
 
         Returns:
-            Its `status`, its `seconds` so far and the end of its words, `output`.
+            Its `status`, its `seconds` so far and the end of its words, `output`; `note` where its time was up.
         """
         grace = min(GRACE, limit / 4) if grace is None else grace
+        note: dict[str, Any] = {}
         try:
             status = self._process.wait(max(limit - grace, 0.0))
         except subprocess.TimeoutExpired:
             self._process.send_signal(stop)
+            note = {"note": f"its time, {limit:.0f} s, was up"}
             try:
                 status = self._process.wait(grace)
             except subprocess.TimeoutExpired:
@@ -86,7 +88,8 @@ class Command:
         except BaseException:
             self.kill()
             raise
-        return {"status": status, "seconds": round(time.monotonic() - self._start, 1), "output": self._words()}
+        found = {"status": status, "seconds": round(time.monotonic() - self._start, 1), "output": self._words()}
+        return found | note
 
     def kill(self) -> None:
         """End it and its children at once."""

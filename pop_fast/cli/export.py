@@ -314,7 +314,7 @@ def _finish(folder: Path, capture: Capture, options: FinishOptions, progress: bo
         output, left = page if name == HTML else Output(name, page.antialiased, frame, capture.world_transform), kept
         if options.target_mb is not None:
             left = limited(shown, options, output)
-        left.write(folder / EXPORTS / file_name(folder.resolve().name, name), output)
+        left.write(folder / EXPORTS / file_name(folder.resolve().name, name), output, progress)
     write_file(folder / VIEWER, page.write(kept.params))
     if not options.skip_sizes:
         with Heartbeat(progress) as beat:

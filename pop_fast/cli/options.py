@@ -14,7 +14,7 @@ import tyro
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_file
 from pop_fast.io.formats import format_names
-from pop_fast.io.heartbeat import bars, duration
+from pop_fast.io.heartbeat import Heartbeat, bars, duration
 from pop_fast.io.ply import Frame
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.load_result import CaptureOptions, Splat, open_capture
@@ -169,12 +169,14 @@ class Limited:
             raise PopError(f"{what} leaves no Gaussian of {before:,}; loosen that limit")
         self.params = {name: value[kept] for name, value in self.params.items()}
 
-    def write(self, out: Path, output: Output) -> None:
+    def write(self, out: Path, output: Output, progress: bool = True) -> None:
         """Print what was said, write the file, and say how much is in it."""
         for line in self.said:
-            print(line)
+            print(line, flush=True)
         self.said.clear()
-        data = output.write(self.params, self.level)
+        with Heartbeat(progress) as beat:
+            beat.say(f"writing {len(self.params['means']):,} Gaussians to {out.name}")
+            data = output.write(self.params, self.level)
         write_file(out, data)
         print(f"{len(self.params['means']):,} Gaussians, {len(data) / 1e6:.2f} MB -> {out}")
 
@@ -198,7 +200,11 @@ def limited(shown: Shown, limits: LimitOptions, output: Output) -> Limited:
     by_itself: shrink.Score = "visibility" if shown.photographed is None else "sensitivity"
     score = by_itself if limits.score == "auto" else limits.score
     if limits.max_gaussians is not None:
+        before = len(left.params["means"])
         left.keep(shrink.best(_scores(shown, left.params, score), limits.max_gaussians), f"highest {score}")
+        if limits.target_mb is None and len(left.params["means"]) == before:
+            # where none is left out, there is nothing that the others would have to make up for
+            return left
     if shown.photographed is None:
         _fit_unseen(left, limits, output)
     else:

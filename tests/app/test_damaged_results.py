@@ -87,6 +87,16 @@ def test_a_file_of_a_result_that_is_damaged_is_named(pop, result, file, damage, 
         says(pop(command, result), *(part.replace("{}", str(path)).replace("{n}", last) for part in parts))
 
 
+@pytest.mark.parametrize("kind", ["train", "val"])
+def test_statistics_that_are_damaged_are_measured_again_as_the_message_says(pop: Pop, result: Path, kind: str) -> None:
+    path = result / "stats" / f"{kind}_step0029.json"
+    path.write_text("{")
+    says(pop("report", result), f"{path}: is not JSON", "remove the file; 'pop eval' measures a result again")
+    path.unlink()
+    pop.done("eval", result)
+    pop.done("report", result)
+
+
 def test_a_record_cut_off_is_left_out_and_null_becomes_a_dash(pop: Pop, result: Path) -> None:
     with open(result / RECORDS, "ab") as file:
         file.write(b'{"step": 30, "view": "\xc3')

@@ -237,6 +237,8 @@ def test_one_command_writes_table_json_page_and_maps(explain: Callable[..., Outc
     assert not re.search(r"""(src|href)=["'](?!data:)""", html)
     drawn = [row for row in plain["rows"] if row["status"] == "blended"]
     assert all(f'data-id="{row["id"]}"' in html for row in drawn)
+    # the keyboard reaches the lines, too
+    assert all(f'data-id="{row["id"]}" tabindex="0"' in html for row in drawn)
     assert html.count("<ellipse") == 4 * min(len(drawn), 14)
     assert all("aria-label=" in drawing for drawing in re.findall('<svg[^>]*role="img"[^>]*>', html))
     names = {path.stem for path in (tmp_path / "maps").iterdir()}

@@ -243,6 +243,13 @@ def test_limits_are_applied_one_after_the_other_and_said(export: Said, own: Path
     assert len(load_ply("x.ply")["means"]) == n // 2
 
 
+def test_a_limit_that_leaves_none_out_changes_nothing(export: Said, own: Path) -> None:
+    n = len(load_ply(own)["means"])
+    export("--out", "whole.ply")
+    assert f"highest sensitivity: {n:,} of {n:,}" in export("--out", "x.ply", "--max-gaussians", n)
+    assert Path("x.ply").read_bytes() == Path("whole.ply").read_bytes()
+
+
 def test_scores_of_views_need_a_capture(pop: Pop, export: Said) -> None:
     export("--out", "a.ply")
     said = pop.done("export", "a.ply", "--out", "b.spz", "--max-gaussians", "20").out

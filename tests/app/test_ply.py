@@ -215,6 +215,16 @@ def test_numbers_that_are_none_are_named_by_row_and_column(tmp_path: Path, colum
     assert_one_line(lambda: load_ply(tmp_path / "x.ply"), *words)
 
 
+@pytest.mark.parametrize("name", ["splat", "gltf", "spz", "compressed-ply"])
+@pytest.mark.filterwarnings("error")
+def test_a_size_that_no_number_of_a_file_can_be_is_its_largest(name: str) -> None:
+    params = many(3)
+    params["scales"][1, 2] = 300.0
+    back = decoded(name, encoded(name, params)).params["scales"]
+    assert back.isfinite().all()
+    assert 5.0 < back.amax() < 89.0
+
+
 @pytest.mark.parametrize("ending", ["ply", "spz"])
 def test_a_file_larger_than_memory_is_named(tmp_path: Path, ending: str) -> None:
     path = tmp_path / f"a.{ending}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -25,7 +26,7 @@ from paper_repro.results import from_line
 from pop_fast.cli import main as pop
 from pop_fast.data import load_capture
 from tests.app.captures import colmap_capture
-from tests.cuda.test_bare_node import stand_in_gsplat
+from tests.cuda.test_bare_node import stand_in_gsplat, stand_in_tool
 
 
 def check(folder: Path, **changes: object) -> StageContext:
@@ -97,6 +98,19 @@ def test_a_call_without_time_says_so_for_every_stage(stages, tmp_path):
     assert "no time was left" in report(tmp_path)["stages"]["build"]["output"]
 
 
+def test_a_stage_that_runs_out_of_time_says_so_and_a_machine_without_a_gpu_is_told(
+    stages, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(gpu_check, "environment", lambda commit: {"gpu": None})
+    stages["build"] = lambda check: check.run([sys.executable, "-c", "import time; time.sleep(60)"], 0.5)
+    assert main([str(tmp_path), "--stages", "build"]) == 1
+    said = capsys.readouterr().out.splitlines()
+    assert said[0].startswith("note: nvidia-smi names no GPU here")
+    assert said[2] == report(tmp_path)["stages"]["build"]["note"] == "its time, 0 s, was up"
+    with pytest.raises(SystemExit, match="--limit-s is nan"):
+        main([str(tmp_path), "--limit-s", "nan"])
+
+
 def test_no_stage_takes_what_later_ones_need():
     shares = {"build": Share(100, 300), "bench": Share(120, 1e9), "gsplat": Share(60, 1e9)}
     budget = Budget(560.0, shares, list(shares))
@@ -136,28 +150,29 @@ def test_a_command_is_asked_to_stop_before_it_is_made_to(tmp_path):
     assert (found["status"], found["output"]) == (2, "begun\na summary\n")
     deaf = f"signal.signal(signal.SIGTERM, signal.SIG_IGN)\n{wait}"
     found = begun(deaf, tmp_path).wait(0.5, grace=0.5)
-    assert (found["status"], found["output"]) == (124, "begun\n")
+    assert (found["status"], found["output"], found["note"]) == (124, "begun\n", "its time, 0 s, was up")
     # each command's words stand in the log, and only its own in what is returned
     assert (tmp_path / "log").read_text().count("$ ") == 3
 
 
-def test_a_job_that_is_ended_takes_its_commands_along(tmp_path):
+@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_a_job_that_is_ended_takes_its_commands_along(tmp_path, ending):
     mark = tmp_path / "begun"
-    child = f"import pathlib, time; pathlib.Path({str(mark)!r}).write_text('x'); time.sleep(60)"
-    code = (
-        "import signal, sys, pathlib; from cuda_ext.gpu_check.shared import Command;"
-        "signal.signal(signal.SIGTERM, lambda *_: sys.exit(143));"
-        f"command = Command([sys.executable, '-c', {child!r}], pathlib.Path({str(tmp_path / 'log')!r}));"
-        "print(command._process.pid, flush=True); command.wait(50.0)"
-    )
-    with subprocess.Popen([sys.executable, "-c", code], cwd=gpu_check_tools.ROOT, stdout=subprocess.PIPE) as job:
-        assert job.stdout is not None
-        child_id = int(job.stdout.readline())
+    script = (f"echo $$ > {mark}.partial", f"mv {mark}.partial {mark}", "exec sleep 60")
+    path = stand_in_tool(tmp_path / "bin" / "compute-sanitizer", "#!/bin/sh", *script)
+    words = [sys.executable, "-m", "cuda_ext.gpu_check", str(tmp_path / "out"), "--stages", "sanitizer"]
+
+    def listen() -> None:  # what starts the tests may ignore it
+        signal.signal(ending, signal.SIG_DFL)
+
+    over = {**os.environ, **path}
+    with subprocess.Popen(words, cwd=gpu_check_tools.ROOT, env=over, preexec_fn=listen) as job:
         while not mark.exists():
             time.sleep(0.1)
-        job.terminate()
-        assert job.wait(20.0) == 143
-    assert gone(child_id)
+        job.send_signal(ending)
+        assert job.wait(20.0) == 128 + ending
+    assert gone(int(mark.read_text()))
+    assert report(tmp_path / "out")["stages"]["sanitizer"]["state"] == "begun"
 
 
 def gone(pid: int) -> bool:
@@ -490,3 +505,34 @@ def test_a_pack_that_is_too_large_is_refused_and_no_other_folder_touched(pack, t
     assert pack(tmp_path / "mine") == 2
     assert (tmp_path / "mine" / "thesis.txt").read_text() == "years"
     assert "holds files that no pack has" in capsys.readouterr().err
+
+
+def test_two_sources_of_one_name_are_not_mixed(pack, tmp_path, capsys):
+    source = colmap_capture(tmp_path / "scene")
+    other = shutil.copytree(source, tmp_path / "other" / "scene")
+    assert pack(tmp_path / "pack", "--captures", str(source), str(other), "--whole", str(other)) == 1
+    assert capsys.readouterr().err.count("another scene is packed already; rename one of the two") == 2
+    assert len(json.loads((tmp_path / "pack" / "manifest.json").read_text())["absent"]) == 2
+
+
+def test_a_pack_that_was_interrupted_is_begun_anew(pack, tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    words = [tmp_path / "pack", "--captures", str(colmap_capture(tmp_path / "scene"))]
+    with monkeypatch.context() as context:
+        context.setattr(pack.module, "_points", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            pack(*words)
+    assert pack(*words) == 0
+
+
+def test_a_pack_that_cannot_be_is_refused_by_name(pack, tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    for folder in (tmp_path / "file", tmp_path / "file" / "x"):
+        assert pack(folder) == 2
+        assert f"gpu_pack: {folder}: Not a directory; name another folder" in capsys.readouterr().err
+    for pixels in ("0", "nan", "-5"):
+        assert pack(tmp_path / "pack", "--pixels", pixels) == 2
+        assert f"--pixels is {pixels}; it must be at least 1" in capsys.readouterr().err
+    assert not (tmp_path / "pack").exists()

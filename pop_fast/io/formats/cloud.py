@@ -30,6 +30,8 @@ _ODD: Final = (
 )
 # a stored opacity of 255 of 255 stands for the last half step below 1, one of 0 for the first above 0: in the middle
 _QUARTER_STEP: Final = 0.25 / 255.0
+# the logarithm of what a float32 holds, nearly
+_LARGEST: Final = 88.7
 _FIELDS: Final = ("means", "log_scales", "quats", "logits", "sh0", "rest")
 
 
@@ -59,9 +61,14 @@ class Cloud:
         return 0.5 * (1.0 + np.tanh(0.5 * self.logits.astype(np.float64)))
 
     @property
+    def scales(self) -> np.ndarray:
+        """Standard deviations, no larger than a float32 can be. float64 [N, 3]"""
+        return np.exp(np.minimum(self.log_scales.astype(np.float64), _LARGEST))
+
+    @property
     def visibility(self) -> np.ndarray:
         """Guess how much each is seen: its opacity times the root of its largest cross-section. float64 [N]"""
-        scales = np.sort(np.exp(self.log_scales.astype(np.float64)), axis=1)
+        scales = np.sort(self.scales, axis=1)
         return self.opacities * np.sqrt(scales[:, 1] * scales[:, 2])
 
     @classmethod

@@ -41,7 +41,7 @@ def encode_splat(cloud: Cloud) -> bytes:
     rgba = np.concatenate([0.5 + SH_C0 * cloud.sh0.astype(np.float64), cloud.opacities[:, None]], axis=1)
     rows = np.zeros(len(cloud), _SPLAT_ROW)
     rows["xyz"] = cloud.means
-    rows["scale"] = np.exp(cloud.log_scales.astype(np.float64))
+    rows["scale"] = cloud.scales
     rows["rgba"] = to_bytes(255.0 * rgba)
     rows["rot"] = to_bytes(128.0 + 128.0 * cloud.quats.astype(np.float64))
     return rows.tobytes()

@@ -56,7 +56,7 @@ def _attributes(turned: Cloud) -> dict[str, np.ndarray]:
     arrays = {
         "POSITION": turned.means,
         f"{NAME}:ROTATION": turned.quats[:, [1, 2, 3, 0]],
-        f"{NAME}:SCALE": np.exp(turned.log_scales.astype(np.float64)),
+        f"{NAME}:SCALE": turned.scales,
         f"{NAME}:OPACITY": opacities[:, None],
         f"{NAME}:SH_DEGREE_0_COEF_0": turned.sh0,
     }

@@ -4,7 +4,8 @@
     document.querySelectorAll('.stage').forEach(e => e.classList.toggle('any', id !== null && !!e.querySelector(`[data-id="${id}"]`)));
     if (id !== null) document.querySelectorAll(`[data-id="${id}"]`).forEach(e => e.classList.add('on'));
   };
-  document.addEventListener('pointerover', event => {
+  // a line of the table is also reached by the keyboard
+  for (const kind of ['pointerover', 'focusin']) document.addEventListener(kind, event => {
     const hit = event.target.closest('[data-id]');
     light(hit ? hit.dataset.id : null);
   });

@@ -172,8 +172,8 @@ def _stages(e: PixelExplanation, drawn: Sequence[Row], pictures: dict[str, np.nd
         f'<div class="caption">The render. The cross marks the pixel, the dashed square what is enlarged; ellipses are '
         f"the {len(drawn)} heaviest splats at one standard deviation.</div></figure><div>"
         f'<figure>{stage(e, drawn, near, box, None)}<div class="caption">{box[2]} x {box[3]} px around it. Point at an '
-        "ellipse, a piece of the bar or a line of the table: the splat lights up everywhere, dashed where its alpha "
-        f'falls to the floor.</div></figure><div class="small3">{small}</div></div></section>'
+        "ellipse, a piece of the bar or a line of the table, or go to a line by Tab: the splat lights up everywhere, "
+        f'dashed where its alpha falls to the floor.</div></figure><div class="small3">{small}</div></div></section>'
     )
 
 
@@ -261,7 +261,7 @@ def _row(row: Row, chosen: bool, has_pop: bool) -> str:
     pull = "" if row.pop == "none" else f'<span class="{row.pop}">{row.pop} {abs(row.v_opacity_pop):.1e}</span>'
     pull = f"<td>{pull}</td>" if has_pop else ""
     body += f'<td>{row.v_opacity_view:+.1e}</td>{pull}<td class="{row.net}">{row.net}</td>'
-    return f'<tr class="{" ".join(kinds)}" data-id="{row.id}">{body}</tr>'
+    return f'<tr class="{" ".join(kinds)}" data-id="{row.id}" tabindex="0">{body}</tr>'
 
 
 def _dot(color: Sequence[float]) -> str:

@@ -181,7 +181,7 @@ def page_of(
         f"<title>{escape(title)}</title><style>{asset('html', 'page.css')}</style></head>"
         f'<body><canvas id="view" tabindex="0" aria-label="{escape(title)}: {escape(_KEYS)}"></canvas>'
         '<div id="message" role="status"></div>'
-        f'<div id="panel"><span class="buttons">{buttons}</span><span id="name"></span>'
+        f'<div id="panel"><span class="buttons">{buttons}</span><span id="name" role="status"></span>'
         f'<span id="help">{keys}</span></div>'
         f"{held}<script>{asset('html', 'viewer.js')}</script></body></html>\n"
     ).encode("utf-8", "backslashreplace")  # a title that is a file's name may be no text

@@ -175,11 +175,15 @@ def verdict_section(findings: Sequence[Finding], checked: bool) -> str:
     if not findings and checked:
         return ""
     rows = "".join(
-        f'<li class="{finding.kind}"><i title="{_SIGNS[finding.kind][1]}">{_SIGNS[finding.kind][0]}</i>'
+        f'<li class="{finding.kind}">{_sign(*_SIGNS[finding.kind])}'
         f"<b>{escape(finding.about)}</b><span>{escape(finding.text)}{_to_type(finding)}</span></li>"
         for finding in findings
     )
     return f'<h2>Verdict</h2>{"" if checked else _UNCHECKED}<ul class="verdict">{rows}</ul>'
+
+
+def _sign(mark: str, about: str) -> str:
+    return f'<i role="img" aria-label="{about}" title="{about}">{mark}</i>'
 
 
 def _to_type(finding: Finding) -> str:

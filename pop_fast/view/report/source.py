@@ -197,7 +197,7 @@ def read_last_stats(folder: Path) -> dict[str, Any]:
 
 def read_stats(path: Path) -> dict[str, Any]:
     """Read one file of statistics."""
-    fix = "write it again with 'pop eval'"
+    fix = "remove the file; 'pop eval' measures a result again"
     return check_record(read_json(path, fix), str(path), fix)
 
 
