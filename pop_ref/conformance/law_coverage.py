@@ -18,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 import pytest
 
+from pop_ref._files import write_file
 from pop_ref.conformance.adapter import STAGE_MODULES, Adapter, OracleAdapter
 from pop_ref.conformance.backends import shipped
 from pop_ref.conformance.calls import Call
@@ -243,7 +244,7 @@ def main(words: list[str]) -> int:
     if len(words) != 1 or words[0].startswith("-"):
         print("usage: python -m pop_ref.conformance.law_coverage FILE")
         return 2
-    Path(words[0]).write_text(json.dumps(run(), indent=1) + "\n", encoding="utf-8")
+    write_file(Path(words[0]), json.dumps(run(), indent=1) + "\n")
     return 0
 
 

@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 
+from pop_ref._files import write_file
 from pop_ref.conformance.capabilities import SIGNATURE, STAGES
 
 LAWS = "pop_ref.conformance.laws"
@@ -312,7 +313,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         from pop_ref.conformance.tolerances import measured
 
         needed = {f"{key} {dtype}": units for (key, dtype), units in sorted(measured().items())}
-        Path(path).write_text(json.dumps(needed, indent=1) + "\n", encoding="utf-8")
+        write_file(Path(path), json.dumps(needed, indent=1) + "\n")
 
 
 class _Recorder:

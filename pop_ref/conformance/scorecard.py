@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from pop_ref._files import write_file
 from pop_ref.conformance.capabilities import DOMINANCE, GRADIENTS, RENDER, SIGNATURE, STAGES, WHOLE
 from pop_ref.conformance.law import missing
 from pop_ref.conformance.mutants.trial import every_law
@@ -74,8 +75,7 @@ class Scorecard:
     def write(self, path: Path) -> None:
         """Write JSON, or a page if the name ends in .html."""
         text = page(self, versions()) if path.suffix == ".html" else _compact(self.as_dict())
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text + "\n", encoding="utf-8")
+        write_file(path, text + "\n")
 
     def as_dict(self) -> dict[str, Any]:
         """Return what the JSON file holds: counts, and by backend, stage and outcome the names of laws.

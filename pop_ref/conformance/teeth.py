@@ -18,6 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from pop_ref._files import write_file
 from pop_ref.compositing import composite
 from pop_ref.conformance import tolerances
 from pop_ref.conformance.adapter import Adapter, OracleAdapter, projected
@@ -145,7 +146,7 @@ def main(words: list[str]) -> int:
         return 2
     text = json.dumps(measured(), indent=1) + "\n"
     if words:
-        Path(words[0]).write_text(text, encoding="utf-8")
+        write_file(Path(words[0]), text)
     else:
         print(text, end="")
     return 0

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from pop_ref._files import write_file
 from pop_ref.conformance import capabilities
 from pop_ref.conformance import vector_training as training
 from pop_ref.conformance.adapter import OracleAdapter
@@ -109,7 +110,7 @@ def main(words: list[str]) -> int:
         return 2
     known = json.loads(Path(words[0]).read_text(encoding="utf-8")) if more else None
     found = kills(lambda name, first: print(f"{name}: {first or 'survives'}", flush=True), known)
-    Path(words[0]).write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    write_file(Path(words[0]), json.dumps(found, indent=1) + "\n")
     return 0
 
 

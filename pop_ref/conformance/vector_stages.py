@@ -20,6 +20,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from pop_ref._files import write_file
 from pop_ref.conformance import tolerances
 from pop_ref.conformance.adapter import OracleAdapter, stage_function
 from pop_ref.conformance.scenes import in_precision
@@ -315,10 +316,7 @@ def main(names: list[str]) -> int:
         said = f"there is no mutant {', '.join(sorted(strange))}" if strange else "no mutant is named"
         print(f"{said}: python -m pop_ref.conformance.vector_stages MUTANT ...; docs/MUTANTS.md lists them")
         return 2
-    text = json.dumps(record(names)) + "\n"
-    beside = FILE.with_suffix(".new")
-    beside.write_text(text, encoding="utf-8")
-    beside.replace(FILE)
+    write_file(FILE, json.dumps(record(names)) + "\n")
     return 0
 
 

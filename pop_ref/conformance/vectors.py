@@ -18,6 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from pop_ref._files import write_file
 from pop_ref.conformance import vector_training as training
 from pop_ref.conformance.adapter import Adapter, OracleAdapter
 from pop_ref.conformance.calls import Call
@@ -388,7 +389,7 @@ def export(folder: Path) -> list[str]:
     for name, (arrays, options) in stage_vectors().items():
         write(name, name, arrays, options)
     index = {**schema(kinds()), "vectors": vectors}
-    (folder / "index.json").write_text(json.dumps(index, indent=1) + "\n", encoding="utf-8")
+    write_file(folder / "index.json", json.dumps(index, indent=1) + "\n")
     return list(vectors)
 
 

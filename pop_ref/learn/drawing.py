@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from pop_ref._files import write_file
 from pop_ref.conformance.scenes import Scene
 from pop_ref.learn.judge import Verdict
 from pop_ref.learn.student import Call, numbers
@@ -204,12 +205,11 @@ def write_film(path: Path, frames: Sequence[np.ndarray], seconds: float = 0.4) -
         number = max(2 * k - 1, 0)
         parts.append((b"fcTL", struct.pack(">IIIIIHHBB", number, width, height, 0, 0, shown, 1000, 0, 0)))
         parts.append((b"fdAT", struct.pack(">I", number + 1) + body) if k else (b"IDAT", body))
-    beside = path.with_name(f".{path.name}.part")
-    with beside.open("wb") as file:
-        file.write(b"\x89PNG\r\n\x1a\n")
-        for kind, data in [*parts, (b"IEND", b"")]:
-            file.write(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)))
-    beside.replace(path)
+    chunks = [
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in [*parts, (b"IEND", b"")]
+    ]
+    write_file(path, b"".join((b"\x89PNG\r\n\x1a\n", *chunks)))
 
 
 _CHARACTERS: Final = "0123456789abcdefghijklmnopqrstuvwxyz[]-+.,: "

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from pop_ref._files import write_file
 from pop_ref.learn.course import BY_NAME, COURSE, Stage
 from pop_ref.learn.splat import BALLS, PAINT, SH_C0, orbit
 from pop_ref.learn.student import Borrowed, Work, borrowing, said, where
@@ -146,9 +147,7 @@ def _notes(folder: Path) -> dict[str, Any]:
 
 
 def _keep(folder: Path, notes: dict[str, Any]) -> None:
-    beside = folder / f"{_NOTES}.partial"
-    beside.write_text(json.dumps(notes, indent=1) + "\n", encoding="utf-8")
-    beside.replace(folder / _NOTES)
+    write_file(folder / _NOTES, json.dumps(notes, indent=1) + "\n")
 
 
 def _digest(path: Path) -> str:

@@ -11,6 +11,7 @@ import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from pop_ref._files import write_file
 from pop_ref.conformance.hypothesis_profiles import EXAMPLES
 from pop_ref.conformance.mutants import FAMILIES, BlackBox, Mutant
 from pop_ref.conformance.mutants.trial import killed_by, killers
@@ -65,7 +66,7 @@ def main(words: Sequence[str] | None = None) -> int:
             }
             for family, mutants in FAMILIES.items()
         }
-        args.json.write_text(json.dumps(trials, indent=1) + "\n", encoding="utf-8")
+        write_file(args.json, json.dumps(trials, indent=1) + "\n")
     alive = 0
     for family, of in found.items():
         killed = sum(None not in breaks.values() for breaks in of.values())

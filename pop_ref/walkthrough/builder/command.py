@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from pop_ref._files import write_file
 from pop_ref.walkthrough.builder.chapter import Chapter, ChapterError, chapter_files, chapter_number, read_chapter
 
 if TYPE_CHECKING:
@@ -123,16 +124,16 @@ def write(wanted: argparse.Namespace) -> None:
     if wanted.notebooks:
         names = [notebooks.notebook_name(each) for each in chosen]
         for chapter, name in zip(chosen, names, strict=True):
-            _write(wanted.notebooks / name, notebooks.notebook(chapter))
-        _write(wanted.notebooks / "index.html", layout.notebook_index(chosen, names))
+            write_file(wanted.notebooks / name, notebooks.notebook(chapter))
+        write_file(wanted.notebooks / "index.html", layout.notebook_index(chosen, names))
     if wanted.folder:
         _write_pages(wanted, chosen, chapters)
     if wanted.slides:
         told = slides.read_slides(slides.FILE.read_text(encoding="utf-8"))
         numbered = {each.number: each for each in chapters}
-        _write(wanted.slides, slides.deck(told, lambda number: (numbered[number], _run(numbered[number]))))
+        write_file(wanted.slides, slides.deck(told, lambda number: (numbered[number], _run(numbered[number]))))
     if wanted.pdf:
-        _write(wanted.pdf, _printed(layout.book([(each, _run(each)) for each in chosen])))
+        write_file(wanted.pdf, _printed(layout.book([(each, _run(each)) for each in chosen])))
     opened = [wanted.folder and wanted.folder / "index.html", wanted.slides, wanted.pdf]
     print("\n".join(f"open {each}" for each in opened if each))
     if wanted.notebooks:
@@ -158,9 +159,9 @@ def _write_pages(wanted: argparse.Namespace, chosen: Sequence[Chapter], chapters
         near = (
             f"{Path(beside['notebooks']).parent}/{notebooks.notebook_name(chapter)}" if "notebooks" in beside else None
         )
-        _write(folder / chapter.page, layout.chapter_page(chapter, _run(chapter), chapters, near))
-    _write(folder / glossary.GLOSSARY_PAGE, layout.glossary_page())
-    _write(folder / "index.html", layout.index_page(chapters, beside))
+        write_file(folder / chapter.page, layout.chapter_page(chapter, _run(chapter), chapters, near))
+    write_file(folder / glossary.GLOSSARY_PAGE, layout.glossary_page())
+    write_file(folder / "index.html", layout.index_page(chapters, beside))
 
 
 @functools.cache
@@ -210,10 +211,3 @@ def _printed(page: str) -> bytes:
             why = f"(exit status {done.returncode}): {done.stderr.strip()[-400:]}"
             raise BrowserError(f"{program} printed nothing {why}")
         return printed.read_bytes()
-
-
-def _write(path: Path, what: str | bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_bytes(what.encode() if isinstance(what, str) else what)
-    os.replace(partial, path)
