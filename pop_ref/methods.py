@@ -226,9 +226,15 @@ class Driven:
         pulled = of.pop_loss_vjp(o, mask, prior, visible) * o * (1.0 - o)
         return term, pulled + of.opacity_entropy_vjp(logits, entropy)
 
+    def collects(self, step: int) -> bool:
+        """Tell whether what a step shows is read later: until nothing grows any more, or the prior reads no window."""
+        recipe = self.recipe
+        by_prior = recipe.pop_views == "window" and step < recipe.pop_stop_iter
+        return by_prior or step < recipe.density.refine_stop_iter
+
     def _collect(self, step: int, view: ScriptedView) -> None:
         script, config = self.script, self.recipe.density
-        if step >= config.refine_stop_iter:
+        if not self.collects(step):
             return
         grads = script.cameras * (view.absolute if self.extras.absgrad else view.v_means2d)
         if config.blur_window == "own_view":

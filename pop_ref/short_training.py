@@ -73,7 +73,7 @@ class Trained:
             camera, mask = short.cameras[view], short.mask(view)
             seen = (found.v_means2d, found.visible, found.dominant_counts, camera.width, camera.height)
             kept = None if mask is None else int(np.sum(mask))
-            if self.step < recipe.density.refine_stop_iter:
+            if driven.collects(self.step):
                 driven.window = density.accumulate(driven.window, *seen, recipe.density, kept)
 
     def change(self) -> dict[str, int]:

@@ -452,5 +452,6 @@ def control(
         rows = reset_opacities(rows, config.reset_opa)
     if step == config.final_prune_iter:
         faint = _faint_at_last(rows, config)
-        rows, statistics = prune_rows(rows, faint), zero_statistics(len(rows) - int(np.sum(faint)))
+        kept = {name: array[~faint] for name, array in vars(statistics).items() if name != "n_views"}
+        rows, statistics = prune_rows(rows, faint), replace(statistics, **kept)
     return rows, statistics

@@ -233,3 +233,14 @@ READINGS: Final = tuple(
     script_of(method, settings=settings, seed=seed, **{"steps": EVERY_STEP[:34], **more})
     for seed, (method, settings, more) in enumerate(_READINGS)
 )
+# of trainings in which one rule meets another, or a number its limit
+MEETINGS: Final = (
+    # a last prune between two changes, whose window goes on
+    script_of("pop", settings={"final_prune_iter": 10, "final_prune_opa": 0.5}, seed=3, steps=EVERY_STEP[:20]),
+    # and one right after a reset, which leaves nobody
+    script_of("gsplat", settings={"final_prune_iter": 12, "final_prune_opa": 0.5}, seed=3, steps=EVERY_STEP[:16]),
+    # a prior that reads the window when nothing grows any more
+    script_of("pop", settings={"pop_views": "window", "refine_stop_iter": 9}, seed=3, steps=EVERY_STEP[:20]),
+    # as many Gaussians as may be, and a share that leaves half a Gaussian over
+    script_of("mini-splatting", settings={"max_gaussians": 12, "sampling_factor": 0.7}, steps=EVERY_STEP[:18]),
+)

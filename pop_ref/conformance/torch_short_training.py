@@ -137,14 +137,17 @@ class Trainee:
             self._step(run, step)
         return strategy.drawn, bool(self._torch.equal(self._torch.get_rng_state(), before))
 
-    def corrected_steps(self, short: ShortTraining, corrections: np.ndarray) -> tuple[list[dict[str, Any]], np.ndarray]:
-        """Take steps with cameras that are corrected and stay so; return them, and the cameras from which they saw.
+    def corrected_steps(
+        self, short: ShortTraining, corrections: np.ndarray, rate: float = 0.0
+    ) -> tuple[list[dict[str, Any]], np.ndarray]:
+        """Take steps with cameras that are corrected; return them, and the cameras that are left.
 
         Args:
             short: what is trained, from cameras that are not corrected.
             corrections: of every camera, without a motion that all share. [V, 6]
+            rate: at which they are learned; at 0 they stay.
         """
-        run = self._run(short, refine_cameras=True, appearance_lr=AppearanceRates(cameras=0.0))
+        run = self._run(short, refine_cameras=True, appearance_lr=AppearanceRates(cameras=rate, cameras_decay=1.0))
         with self._torch.no_grad():
             run.appearance.params["cameras"].copy_(self._torch.as_tensor(corrections))
         taken = [self._taken(run, step) for step in range(short.steps)]
@@ -335,19 +338,22 @@ class Trainee:
             meta[name] = name
         return [name for name in list(meta) if meta[name] != name]
 
-    def blank_losses(self, watch: Watch, exposure: np.ndarray) -> list[float]:
-        """Return the photometric loss of steps over random backgrounds, with nothing drawn and clear photographs.
+    def blank_losses(self, watch: Watch, exposure: np.ndarray, seed: int, opaque: bool) -> list[float]:
+        """Return the photometric loss of steps over random backgrounds, with nothing drawn and black photographs.
 
         Args:
             watch: the steps; its background, over which photographs have been laid, is left out: it is black.
             exposure: of every photograph. [3, 4]
+            seed: of the run.
+            opaque: whether photographs are; otherwise all of them is clear.
         """
         config, strategy = self._settings(watch)
-        config = replace(config, background=(0.0, 0.0, 0.0), random_background=True, exposure=True)
+        config = replace(config, background=(0.0, 0.0, 0.0), random_background=True, exposure=True, seed=seed,
+                         appearance_lr=AppearanceRates(exposures=0.0))  # fmt: skip
         views = []
         for view in self._views(watch):
             blank = self._torch.zeros_like(view.photo)
-            views.append(replace(view, photo=blank, alpha=blank[..., 0]))
+            views.append(replace(view, photo=blank, alpha=None if opaque else blank[..., 0]))
         params = self._params(watch)
         with self._torch.no_grad():
             params["opacities"].fill_(-30.0)

@@ -11,6 +11,7 @@ import functools
 
 import numpy as np
 
+from pop_ref.appearance import background_at
 from pop_ref.compositing import composite
 from pop_ref.conformance.assertions import assert_close, assert_same_bits
 from pop_ref.conformance.error_bounds import pixel_error_bounds
@@ -116,8 +117,10 @@ def test_antialiased_steps_collect_antialiased_gradients(backend):
 
 @law("training", "collected_statistics")
 def test_absolute_gradients_are_collected_where_they_are_asked_for(backend):
-    signed, absolute = (list(_assert_collected(backend, 0, absgrad=asked)) for asked in (False, True))
-    assert np.any(absolute[-1][0]["grad2d"] > 1.01 * signed[-1][0]["grad2d"])
+    for batch in (1, 2):
+        asks = {"batch": batch}
+        signed, absolute = (list(_assert_collected(backend, 0, absgrad=asked, **asks)) for asked in (False, True))
+        assert np.any(absolute[-1][0]["grad2d"] > 1.01 * signed[-1][0]["grad2d"])
 
 
 @law("training", "collected_statistics")
@@ -184,9 +187,18 @@ def test_what_a_strategy_writes_into_meta_stays_whether_it_was_read_before_or_no
 def test_where_nothing_is_drawn_and_a_photograph_is_clear_both_are_the_same_background(backend):
     # in the colours of the photograph, whatever its exposure
     exposure = np.array([[0.5, 0.25, 0.0, 0.125], [0.0, 0.75, 0.0, 0.25], [0.25, 0.0, 1.0, -0.125]])
-    for loss in backend.stage("blank_losses")(_watch(0), exposure):
+    for loss in backend.stage("blank_losses")(_watch(0), exposure, 5, False):
         # the square of a rounding
         assert loss <= (8.0 * np.finfo(backend.dtype).eps) ** 2, f"a loss of {loss} is left"
+
+
+@law("training", "blank_losses")
+def test_every_step_draws_over_the_background_of_its_number_and_of_the_runs_seed(backend):
+    # before a black photograph the loss is the mean square of what is drawn, which is the background
+    for seed in (0, 5):
+        found = backend.stage("blank_losses")(_watch(0), np.eye(3, 4), seed, True)
+        expected = np.array([np.mean(background_at(step, seed) ** 2) for step in range(len(found))])
+        assert_close("training.term", found, expected, expected, backend.dtype, against_oracle=True)
 
 
 @law("training", "view_order")

@@ -88,7 +88,8 @@ def test_a_split_replaces_each_parent_by_two_smaller_children_drawn_from_it(back
             through = np.sqrt(1.0 / (1.0 + np.exp(expected)))
             expected = np.log((1.0 - through) / through)
         assert_close("density.split", children, expected, np.abs(expected) + 4.0, backend.dtype)
-        for moments in (after.m, after.v):
+        for moments, old in ((after.m, rows.m), (after.v, rows.v)):
+            assert_same_bits(f"moments of {name}, survivors", moments[name][:n_kept], old[name][~mask])
             assert_same_bits(f"moments of {name}", moments[name][n_kept:], np.zeros((2 * n_split, *array.shape[1:])))
 
 
@@ -228,6 +229,11 @@ def test_the_faint_are_pruned_and_later_the_far_too_large(backend, opacity, scen
     config = DensityConfig(prune_opa=0.25)
     pruned = backend.stage("prune_mask")(at_it, sizes, scene_scale, 600, config)
     assert_same_bits("pruned at the threshold", pruned, [False, True, False])
+    # so does what has just the size
+    for bound, large in ((0.0625, False), (0.03125, True)):
+        config = DensityConfig(prune_too_big=True, prune_scale3d=bound)
+        pruned = backend.stage("prune_mask")(at_it, sizes, scene_scale, 5000, config)
+        assert_same_bits(f"pruned at a size of {bound}", pruned, [large] * 3)
 
 
 # every how many steps opacities are reset, whether at step 0, too, and how long nothing changes then; also from step 0

@@ -16,6 +16,7 @@ from pop_ref.conformance.law import law
 from pop_ref.conformance.strategy_script import (
     EVERY_STEP,
     GROWTH,
+    MEETINGS,
     METHODS,
     OWN,
     READINGS,
@@ -71,7 +72,7 @@ del _name, _test
 
 @law("training", "scripted_steps", "method_settings")
 def test_a_training_is_the_oracles_under_every_reading(backend):
-    for script in READINGS:
+    for script in (*MEETINGS, *READINGS):
         _assert_the_oracles(backend, script)
 
 
