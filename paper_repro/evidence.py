@@ -262,7 +262,7 @@ def compare(
         weights: of each row's mean in the combination.
         asked: what is asked of the combination.
         bound: on the scale of the quantity.
-        shown_as: how it is written; None takes dB, or a share for what is compared by logarithms.
+        shown_as: how it is written; None takes a share for what is compared by logarithms, dB for PSNR, else "plain".
 
     Returns:
         The comparison, or None where a row has no run, or a run lacks the quantity.
@@ -273,7 +273,8 @@ def compare(
         return None
     pairs = list(zip(weights.values(), values, strict=True))
     value, parts = sum(c * fmean(v) for c, v in pairs), [(quantity, c, len(v)) for c, v in pairs]
-    return with_error(says, value, parts, noise, asked, bound, shown_as or ("share" if quantity.is_log else "dB"))
+    usual: Literal["dB", "share", "plain"] = "share" if quantity.is_log else "dB" if quantity is PSNR else "plain"
+    return with_error(says, value, parts, noise, asked, bound, shown_as or usual)
 
 
 def with_error(
@@ -408,14 +409,6 @@ class Claim:
     def under(self) -> str:
         """Say what its runs were trained with, by scene."""
         return "; ".join(f"{e.scene}: {e.under}" for e in self.told.evidence)
-
-
-def told(reading: str, evidence: Iterable[Evidence], deciders: Iterable[str], enough: Iterable[str] | None) -> Told:
-    """Put what the scenes say together."""
-    found, commands = tuple(evidence), tuple(dict.fromkeys(deciders))
-    # where no scene has all its runs, or none of the whole schedule, the first is as good as any
-    fewest = commands[:1] if enough is None else tuple(enough)
-    return Told(reading, verdict_over(e.verdict for e in found if e.is_whole), found, commands, fewest)
 
 
 def verdict_over(verdicts: Iterable[Verdict]) -> Verdict:

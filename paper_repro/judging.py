@@ -22,7 +22,7 @@ from paper_repro.evidence import (
     command,
     conditions,
     is_shortened,
-    told,
+    verdict_over,
 )
 from paper_repro.jobs import SEED
 from paper_repro.paper import paper
@@ -186,7 +186,10 @@ def _under(reading: str, question: Question, found: Groups, noise: Noise, scale:
         if verdict == "not decided":
             _decide(deciders, question, one, names, together, _seeds_at_first(noise))
     is_open = [one for one, e in zip(judged, evidence, strict=True) if e.is_whole and e.verdict == "not decided"]
-    return told(reading, evidence, deciders.commands(), _enough(scale, names, is_open, together))
+    commands, enough = tuple(dict.fromkeys(deciders.commands())), _enough(scale, names, is_open, together)
+    # where no scene has all its runs, or none of the whole schedule, the first is as good as any
+    fewest = commands[:1] if enough is None else tuple(enough)
+    return Told(reading, verdict_over(e.verdict for e in evidence if e.is_whole), tuple(evidence), commands, fewest)
 
 
 def _verdict(question: Question, at: _At, together: int) -> tuple[Verdict, str]:

@@ -24,9 +24,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
-from paper_repro.scenes import SCALES as _SCALES
+from paper_repro.scenes import SCALES, scale_named
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import write_atomically
+from pop_fast.io.atomic import write_file
 
 SCHEMA: Final = 2
 LPIPS_VARIANTS: Final = ("vgg_01", "alex_norm", "alex_01")
@@ -314,8 +314,8 @@ def _parse(found: Mapping[str, Any], where: str) -> Result:
 
 
 def _result(take: _Fields) -> Result:
-    if take.text("scale") not in _SCALES:
-        raise take.fail("scale", f"one of {', '.join(_SCALES)}")
+    if take.text("scale") not in SCALES:
+        raise take.fail("scale", f"one of {', '.join(SCALES)}")
     name = r"[a-z0-9]+(?:_[a-z0-9]+)*"
     lower = "lower-case letters, digits and _"
     n, files = take.whole("num_gaussians", 0), take.inner("files")
@@ -448,9 +448,6 @@ def _per_view(take: _Fields) -> dict[str, dict[str, float]]:
     return views
 
 
-SCALES: Final = tuple(_SCALES)
-
-
 def home(package: Path) -> Path:
     """Return the folder of results and work: the package's own in a clone, else `paper_repro` of the current folder."""
     # pip neither installs nor keeps what a command would write between the files of a package
@@ -518,9 +515,7 @@ def read_all(scale: str, folder: Path = RESULTS) -> tuple[Result, ...]:
     Raises:
         PopError: the scale is unknown, or as `read`.
     """
-    if scale not in SCALES:
-        raise PopError(f"scale is '{scale}'; it must be one of {', '.join(SCALES)}")
-    return tuple(result for path in sorted((folder / scale).glob("*.jsonl")) for result in read(path))
+    return tuple(result for path in sorted((folder / scale_named(scale).name).glob("*.jsonl")) for result in read(path))
 
 
 def write(result: Result, folder: Path = RESULTS) -> Path:
@@ -532,8 +527,7 @@ def write(result: Result, folder: Path = RESULTS) -> Path:
     path, line = path_of(result.scale, result.row, folder), to_line(result)
     with _alone(path.parent):
         lines = {key: text for key, (_, text) in _lines(path).items()} | {(result.scene, result.seed): line}
-        text = "".join(f"{lines[key]}\n" for key in sorted(lines))
-        write_atomically(path, lambda file: file.write(text.encode("utf-8")))
+        write_file(path, "".join(f"{lines[key]}\n" for key in sorted(lines)))
     return path
 
 

@@ -15,8 +15,7 @@ from typing import Final
 from paper_repro.jobs import added_rows
 from paper_repro.paper import Metric, NotComparable, Paper, PaperTable, paper, places
 from paper_repro.results import Result, most_timed_on
-from paper_repro.scenes import SCALES
-from pop_fast.errors import PopError
+from paper_repro.scenes import SCALES, scale_named
 
 # what a scale is meant to train; results of further scenes are shown too
 SCENES_OF: Final = {name: tuple(scale.factors) for name, scale in SCALES.items() if name != "paper"}
@@ -186,9 +185,8 @@ def setting(result: Result, name: str) -> float | None:
 
 
 def _of_scale(scale: str, results: Iterable[Result]) -> list[Result]:
-    if scale not in SCALES:
-        raise PopError(f"scale is '{scale}'; it must be one of {', '.join(SCALES)}")
-    return [r for r in results if r.scale == scale]
+    known = scale_named(scale).name
+    return [r for r in results if r.scale == known]
 
 
 def _groups(scale: str, found: Sequence[Result], datasets: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:

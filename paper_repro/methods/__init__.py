@@ -39,11 +39,6 @@ class Pinned:
     scenes: Mapping[str, Mapping[str, Cited]]
 
 
-def pinned_methods() -> list[str]:
-    """List the methods that have a table."""
-    return sorted(path.stem for path in FOLDER.glob("*.toml"))
-
-
 def load_pinned(method: str) -> Pinned:
     """Read a method's table."""
     found = tomllib.loads((FOLDER / f"{method}.toml").read_text(encoding="utf-8"))
