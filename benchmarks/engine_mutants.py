@@ -66,16 +66,11 @@ _NOT_ARITHMETIC: Final = re.compile(
 
 @dataclass(frozen=True)
 class Fault:
-    """One line of the engine, changed.
+    """One line of the engine, changed."""
 
-    Attributes:
-        file: in the checkout.
-        line: its number, from 1.
-        old, new: the line before and after.
-    """
-
-    file: str
-    line: int
+    file: str  # in the checkout
+    line: int  # its number, from 1
+    # the line before and after
     old: str
     new: str
 

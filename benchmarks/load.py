@@ -52,16 +52,11 @@ PROGRAM, PHOTOGRAPHS, DRAWN, TRAINED, RENDERED = 0.5 * 2**30, 3.5, 200.0, 5_000.
 
 @dataclass(frozen=True)
 class Case:
-    """A load.
+    """A load."""
 
-    Attributes:
-        photographs: of the capture; 0 renders a splat.
-        gaussians: of the splat, or points of the capture.
-        width, height: of a photograph or of the render, px.
-    """
-
-    photographs: int
-    gaussians: int
+    photographs: int  # of the capture; 0 renders a splat
+    gaussians: int  # of the splat, or points of the capture
+    # of a photograph or of the render, px
     width: int
     height: int
 

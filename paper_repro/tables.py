@@ -39,48 +39,28 @@ SEE_MAIN: Final = "see tables 1 and 2"
 
 @dataclass(frozen=True)
 class Cell:
-    """One number of ours with one of the paper's; every text says something.
+    """One number of ours with one of the paper's; every text says something."""
 
-    Attributes:
-        value: ours; None where there is none.
-        spread: sample standard deviation over the seeds; None with fewer than two.
-        ours: as printed, or why there is none.
-        paper: the paper's as printed, or why there is none.
-        difference: ours less the paper's, or why there is none.
-        place: of ours among the best of its column, 0 without.
-        paper_place: as the paper colours it.
-        is_ranked: whether ours may have a place.
-    """
-
-    value: float | None
-    spread: float | None
-    ours: str
-    paper: str
-    difference: str
-    place: int = 0
-    paper_place: int = 0
-    is_ranked: bool = True
+    value: float | None  # ours; None where there is none
+    spread: float | None  # sample standard deviation over the seeds; None with fewer than two
+    ours: str  # as printed, or why there is none
+    paper: str  # the paper's as printed, or why there is none
+    difference: str  # ours less the paper's, or why there is none
+    place: int = 0  # of ours among the best of its column, 0 without
+    paper_place: int = 0  # as the paper colours it
+    is_ranked: bool = True  # whether ours may have a place
 
 
 @dataclass(frozen=True)
 class Line:
-    """One method or ablation.
+    """One method or ablation."""
 
-    Attributes:
-        row: its configuration.
-        name: as the paper prints it.
-        cells: by metric.
-        seeds: how many seeds every scene has; 0 without runs.
-        missing: scenes without a run.
-        runs: "scene seed id" of every run in it.
-    """
-
-    row: str
-    name: str
-    cells: Mapping[str, Cell]
-    seeds: int
-    missing: tuple[str, ...]
-    runs: tuple[str, ...]
+    row: str  # its configuration
+    name: str  # as the paper prints it
+    cells: Mapping[str, Cell]  # by metric
+    seeds: int  # how many seeds every scene has; 0 without runs
+    missing: tuple[str, ...]  # scenes without a run
+    runs: tuple[str, ...]  # "scene seed id" of every run in it
 
 
 @dataclass(frozen=True)
@@ -95,27 +75,16 @@ class Block:
 
 @dataclass(frozen=True)
 class Table:
-    """A table with everything that has to be said about it.
+    """A table with everything that has to be said about it."""
 
-    Attributes:
-        name: "table 1" to "table 5", or "beyond".
-        scale: of the runs.
-        title: what it is about.
-        header: sentences that stand above it; the first says whether this is the paper's protocol.
-        metrics: its columns.
-        blocks: one a data set or capture.
-        ratios: ratios to one line, with the paper's; None at scale "paper".
-        remarks: what of the paper's numbers in it cannot be compared, by label.
-    """
-
-    name: str
-    scale: str
-    title: str
-    header: tuple[str, ...]
-    metrics: tuple[Metric, ...]
-    blocks: tuple[Block, ...]
-    ratios: Block | None
-    remarks: Mapping[str, str]
+    name: str  # "table 1" to "table 5", or "beyond"
+    scale: str  # of the runs
+    title: str  # what it is about
+    header: tuple[str, ...]  # sentences that stand above it; the first says whether this is the paper's protocol
+    metrics: tuple[Metric, ...]  # its columns
+    blocks: tuple[Block, ...]  # one a data set or capture
+    ratios: Block | None  # ratios to one line, with the paper's; None at scale "paper"
+    remarks: Mapping[str, str]  # what of the paper's numbers in it cannot be compared, by label
 
 
 def table(number: int, scale: str, results: Iterable[Result], absent: Iterable[str] = ()) -> Table:

@@ -51,23 +51,14 @@ LEAST_SHARE: Final = 0.5
 
 @dataclass(frozen=True)
 class Check:
-    """A library under sanitizers, and the tests that use it.
+    """A library under sanitizers, and the tests that use it."""
 
-    Attributes:
-        units: what it is made of.
-        sources: all that its text depends on.
-        flags: of the compiler.
-        runtime: the sanitizers' library, which must be loaded before all others.
-        use: what the child does with it, told the library by `POP_SANITIZED`.
-        about: the sanitizers, in words.
-    """
-
-    units: tuple[Path, ...]
-    sources: tuple[Path, ...]
-    flags: tuple[str, ...]
-    runtime: str
-    use: str
-    about: str
+    units: tuple[Path, ...]  # what it is made of
+    sources: tuple[Path, ...]  # all that its text depends on
+    flags: tuple[str, ...]  # of the compiler
+    runtime: str  # the sanitizers' library, which must be loaded before all others
+    use: str  # what the child does with it, told the library by `POP_SANITIZED`
+    about: str  # the sanitizers, in words
 
     @property
     def library(self) -> Path:

@@ -248,17 +248,11 @@ def darker(color: str) -> str:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure and the numbers behind it.
+    """A figure and the numbers behind it."""
 
-    Attributes:
-        figure: the picture.
-        columns: of the table.
-        rows: its lines; numbers are written unrounded.
-    """
-
-    figure: Figure
-    columns: Sequence[str]
-    rows: Sequence[Sequence[Any]]
+    figure: Figure  # the picture
+    columns: Sequence[str]  # of the table
+    rows: Sequence[Sequence[Any]]  # its lines; numbers are written unrounded
 
 
 class Sheet:
