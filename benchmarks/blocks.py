@@ -14,12 +14,11 @@ which docs/using.md has a table.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -57,8 +56,7 @@ def run(words: Sequence[str], folder: Path, note: Path) -> dict[str, float]:
         "clock": spent["clock"] + time.perf_counter() - start,
         "processor": spent["processor"] + used.ru_utime + used.ru_stime,
     }
-    note.parent.mkdir(parents=True, exist_ok=True)
-    note.write_text(json.dumps({**spent, "done": 1.0} if status == 0 else spent))
+    write_json(note, {**spent, "done": 1.0} if status == 0 else spent)
     if status != 0:
         raise SystemExit(f"pop train {' '.join(words)}: ended with {os.waitstatus_to_exitcode(status)}")
     return spent
@@ -90,7 +88,7 @@ def numbers(stats: dict[str, Any]) -> dict[str, Any]:
     return {**chosen, "gaussians": stats["num_GS"], "peak_gib": stats["memory_bytes"] / GIB}
 
 
-def main(words: list[str], say: Callable[[str], None] = print) -> int:
+def main(words: list[str]) -> int:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("capture", type=Path)
@@ -115,7 +113,7 @@ def main(words: list[str], say: Callable[[str], None] = print) -> int:
     rounds = read_last_stats(blocks)["rounds"][1:]
     more = len(rounds) * read_json(blocks / "blocks" / "job.json")["round_steps"]
     write(args, whole, blocks, spent, train_on(whole, more, work / "longer"))
-    say(table(args.out, args.capture.resolve().name))
+    print(table(args.out, args.capture.resolve().name))
     return 0
 
 

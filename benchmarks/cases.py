@@ -19,21 +19,13 @@ VIEWS = 6  # of a capture
 
 @dataclass(frozen=True)
 class Case:
-    """A synthetic scene.
+    """A synthetic scene."""
 
-    Attributes:
-        name: as it stands in results.
-        n: Gaussians.
-        width: px.
-        height: px.
-        spread: factor on the Gaussians' size; 1 covers a pixel with about fifteen.
-    """
-
-    name: str
-    n: int
-    width: int
-    height: int
-    spread: float = 1.0
+    name: str  # as it stands in results
+    n: int  # Gaussians
+    width: int  # px
+    height: int  # px
+    spread: float = 1.0  # factor on the Gaussians' size; 1 covers a pixel with about fifteen
 
 
 RASTER_CASES = (

@@ -48,13 +48,9 @@ _OF_ONE: Final = ("abs", "ceil", "floor", "rint", "round", "detach")
 
 @dataclass(frozen=True)
 class Site(Mutant):
-    """A module with one condition broken.
+    """A module with one condition broken."""
 
-    Attributes:
-        text: of the module.
-    """
-
-    text: str = ""
+    text: str = ""  # of the module
 
     def broken_source(self) -> str:
         """Return the module's text."""

@@ -14,7 +14,6 @@ hand which law of later has noticed it.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import random
 import re
@@ -33,7 +32,7 @@ from typing import Any, Final
 if __package__ in (None, ""):
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.record import commit, read_json, write_json
+from benchmarks.record import commit, lines_run, read_json, write_json
 from cuda_ext.toolkit import find_compiler, no_compiler
 from pop_fast.children import module_command
 from pop_fast.compiled import build, library
@@ -66,16 +65,11 @@ _NOT_ARITHMETIC: Final = re.compile(
 
 @dataclass(frozen=True)
 class Fault:
-    """One line of the engine, changed.
+    """One line of the engine, changed."""
 
-    Attributes:
-        file: in the checkout.
-        line: its number, from 1.
-        old, new: the line before and after.
-    """
-
-    file: str
-    line: int
+    file: str  # in the checkout
+    line: int  # its number, from 1
+    # the line before and after
     old: str
     new: str
 
@@ -213,7 +207,7 @@ def draw(count: int, seed: int, work: Path) -> None:
         print(fault.name, tried[fault.name], flush=True)
 
 
-def lines_run(work: Path) -> dict[str, Any]:
+def engine_lines(work: Path) -> dict[str, Any]:
     """Return how many of the engine's lines the laws run, and those that they do not, by file.
 
     Raises:
@@ -232,18 +226,8 @@ def lines_run(work: Path) -> dict[str, Any]:
         )
         if judge.returncode:
             raise SystemExit("the sound engine breaks a law: no line can be told to be judged")
-        counted = [path.name for path in Path(folder).glob("*.gcda")]
-        found = subprocess.run(
-            [gcov, "--json-format", "--stdout", *counted], capture_output=True, text=True, check=True, cwd=folder
-        )
-    ran: dict[tuple[str, int], bool] = {}
-    for text in found.stdout.splitlines():
-        for file in json.loads(text)["files"]:
-            if (path := Path(folder, file["file"]).resolve()).is_relative_to(ROOT):
-                # a line of a template is counted once for each type that it is made for
-                for line in file["lines"]:
-                    at = str(path.relative_to(ROOT)), line["line_number"]
-                    ran[at] = ran.get(at, False) or line["count"] > 0
+        found = lines_run(gcov, Path(folder), [path.name for path in Path(folder).glob("*.gcda")], check=True)
+    ran = {(str(path.relative_to(ROOT)), n): run for (path, n), run in found.items() if path.is_relative_to(ROOT)}
     left: dict[str, list[str]] = {}
     for name, number in sorted(at for at, run in ran.items() if not run):
         left.setdefault(name, []).append((ROOT / name).read_text(encoding="utf-8").splitlines()[number - 1].strip())
@@ -279,7 +263,7 @@ def main() -> None:
         sys.exit(_judge(args.judge) or 0)
     if args.lines:
         args.work.mkdir(parents=True, exist_ok=True)
-        write_json(RESULTS, read_json(RESULTS) | {"lines": lines_run(args.work.resolve())})
+        write_json(RESULTS, read_json(RESULTS) | {"lines": engine_lines(args.work.resolve())})
     if args.draw is not None:
         args.work.mkdir(parents=True, exist_ok=True)
         draw(args.draw, args.seed, args.work.resolve())

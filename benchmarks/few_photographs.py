@@ -28,7 +28,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.record import machine, read_json, write_json
+from benchmarks.record import machine, markdown, read_json, write_json
 from pop_fast.api.backend import get_backend
 from pop_fast.data import Capture, View, load_capture
 from pop_fast.train import TrainConfig, TrainingRun
@@ -163,8 +163,7 @@ def table_of(known: Mapping[str, Any], only: Sequence[str] | None = None) -> str
             place, _, seed = what.rpartition(", seed ")
             found.setdefault(place, {}).setdefault(setting, {})[seed] = (numbers["psnr"], numbers["ssim"])
     settings = [s for s in only or dict.fromkeys(s for row in found.values() for s in row) if s != "plain"]
-    titles = " | ".join(f"`{setting}`" for setting in settings)
-    lines = [f"| capture | plain | {titles} |", f"| --- | --- |{' --- |' * len(settings)}"]
+    rows: list[list[str]] = []
     for place in sorted(found, key=_by_count):
         plain = found[place].get("plain", {})
         cells = [_mean_of(list(plain.values()), "{:.2f} / {:.3f} ({})")]
@@ -172,8 +171,8 @@ def table_of(known: Mapping[str, Any], only: Sequence[str] | None = None) -> str
             seeds = found[place].get(setting, {})
             both = [np.subtract(value, plain[seed]) for seed, value in seeds.items() if seed in plain]
             cells.append(_mean_of(both, "{:+.2f} / {:+.3f} ({})"))
-        lines.append(f"| {place} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        rows.append([place, *cells])
+    return markdown(["capture", "plain", *(f"`{setting}`" for setting in settings)], rows)
 
 
 def _mean_of(pairs: Sequence[Any], shown: str) -> str:

@@ -237,31 +237,20 @@ def with_tables(text: str) -> str:
 
 @dataclass(frozen=True)
 class Loads:
-    """What a step has to do.
+    """What a step has to do."""
 
-    Attributes:
-        gaussians: all of them.
-        visible: those with an extent on the screen.
-        instances: pairs of a splat and a 16 x 8 tile that it reaches.
-        evaluated: pairs of a list entry and a pixel up to where the last pixel of the tile stops.
-        contributing: of these, those that are blended.
-        pixels: of the image.
-        longest: entries of one tile's list up to where its last pixel stops, at most.
-        visits, eights, batches: of the blend's warps, as `gpu_visits` counts them.
-        tried: tiles in the splats' rectangles.
-    """
-
-    gaussians: int
-    visible: int
-    instances: int
-    evaluated: int
-    contributing: int
-    pixels: int
-    longest: int
+    gaussians: int  # all of them
+    visible: int  # those with an extent on the screen
+    instances: int  # pairs of a splat and a 16 x 8 tile that it reaches
+    evaluated: int  # pairs of a list entry and a pixel up to where the last pixel of the tile stops
+    contributing: int  # of these, those that are blended
+    pixels: int  # of the image
+    longest: int  # entries of one tile's list up to where its last pixel stops, at most
+    # of the blend's warps, as `gpu_visits` counts them
     visits: int
     eights: int
     batches: int
-    tried: int
+    tried: int  # tiles in the splats' rectangles
 
 
 CASE = Loads(270_000, 160_000, 2_000_000, *_BLENDED, tried=4_360_000)

@@ -23,24 +23,17 @@ FULL_SIZE: Final = 1.6e6  # px; a smaller trained scene is timed as large as thi
 
 @dataclass(frozen=True)
 class GpuCase:
-    """How much there is to draw.
+    """How much there is to draw."""
 
-    Attributes:
-        name: of the case.
-        n: Gaussians.
-        width, height: px.
-        size: median of the shorter standard deviations on the screen, px; 0 for a trained scene, which is not made so.
-        seen: share of the Gaussians in front of the camera's frustum; the others stand outside it.
-        gathered: share of the seen ones that stand in clusters, so that some tiles have many and others few.
-    """
-
-    name: str
-    n: int
+    name: str  # of the case
+    n: int  # Gaussians
+    # px
     width: int
     height: int
+    # median of the shorter standard deviations on the screen, px; 0 for a trained scene, which is not made so
     size: float
-    seen: float = 0.59
-    gathered: float = 0.65
+    seen: float = 0.59  # share of the Gaussians in front of the camera's frustum; the others stand outside it
+    gathered: float = 0.65  # share of the seen ones that stand in clusters, so that some tiles have many and others few
 
     def smaller(self, by: int) -> GpuCase:
         """Return a case of the same density and sizes in px, on an image smaller by that factor along both sides."""

@@ -18,17 +18,11 @@ FLOOR = 1.0 / 255.0
 
 
 class Visits(NamedTuple):
-    """What is made for a view.
+    """What is made for a view."""
 
-    Attributes:
-        visits: of a splat a quarter, by a warp, rounded up to four in every batch.
-        eights: eight visits or what is left of them in a batch, whose sums the backward pass adds up together.
-        batches: of 32 entries of a list or what is left of it.
-    """
-
-    visits: int
-    eights: int
-    batches: int
+    visits: int  # of a splat a quarter, by a warp, rounded up to four in every batch
+    eights: int  # eight visits or what is left of them in a batch, whose sums the backward pass adds up together
+    batches: int  # of 32 entries of a list or what is left of it
 
 
 def count_tried(means2d: Tensor, radii: Tensor, width: int, height: int) -> int:

@@ -23,7 +23,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -52,16 +51,11 @@ PROGRAM, PHOTOGRAPHS, DRAWN, TRAINED, RENDERED = 0.5 * 2**30, 3.5, 200.0, 5_000.
 
 @dataclass(frozen=True)
 class Case:
-    """A load.
+    """A load."""
 
-    Attributes:
-        photographs: of the capture; 0 renders a splat.
-        gaussians: of the splat, or points of the capture.
-        width, height: of a photograph or of the render, px.
-    """
-
-    photographs: int
-    gaussians: int
+    photographs: int  # of the capture; 0 renders a splat
+    gaussians: int  # of the splat, or points of the capture
+    # of a photograph or of the render, px
     width: int
     height: int
 
@@ -180,7 +174,7 @@ def _child(folder: Path, case: Case) -> None:
     print(json.dumps({**found, "peak_gib": peak_bytes() / 2**30}))
 
 
-def main(words: list[str], say: Callable[[str], None] = print) -> int:
+def main(words: list[str]) -> int:
     """Run from the command line."""
     if words[:1] == ["--child"]:
         _child(Path(words[1]), Case(*map(int, words[2:])))
@@ -197,10 +191,10 @@ def main(words: list[str], say: Callable[[str], None] = print) -> int:
     if out is not None:
         write_json(out, {"machine": now, "cases": {**read_json(out).get("cases", {}), **cases}})
     for name, found in cases.items():
-        say(f"{name}: {found['peak_gib']:.2f} GiB of {found['bound_gib']:.2f} GiB, {found['seconds']:.0f} s")
+        print(f"{name}: {found['peak_gib']:.2f} GiB of {found['bound_gib']:.2f} GiB, {found['seconds']:.0f} s")
     above = [name for name, found in cases.items() if found["peak_gib"] > found["bound_gib"]]
     for name in above:
-        say(f"{name}: above its bound")
+        print(f"{name}: above its bound")
     return 1 if above else 0
 
 

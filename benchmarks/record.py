@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 
+from pop_fast.io.atomic import write_file
 from pop_fast.machine import machine_name
 
 
@@ -41,11 +42,8 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def write_json(path: Path, result: dict[str, Any]) -> None:
-    """Write results under a temporary name and rename, so that a file is whole or not there."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_suffix(".part")
-    beside.write_text(text_of(result), encoding="utf-8")
-    os.replace(beside, path)
+    """Write results, so that a file is whole or not there."""
+    write_file(path, text_of(result))
 
 
 def text_of(result: dict[str, Any]) -> str:
@@ -63,6 +61,27 @@ def peak_bytes(field: str = "VmHWM") -> int:
     """Return how much memory this process has had at most, or a field of /proc/self/status in its place."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(f"{field}:"))
+
+
+def lines_run(gcov: str, folder: Path, counted: Sequence[str], check: bool = False) -> dict[tuple[Path, int], bool]:
+    """Return whether each line ran that was compiled to be counted, by file and number.
+
+    Args:
+        gcov: the program.
+        folder: in which the compiler worked.
+        counted: names of the files of counts in there.
+        check: raise where the program fails; without, nothing ran then.
+    """
+    asked = [gcov, "--json-format", "--stdout", *counted]
+    ran: dict[tuple[Path, int], bool] = {}
+    for text in subprocess.run(asked, capture_output=True, text=True, check=check, cwd=folder).stdout.splitlines():
+        for file in json.loads(text)["files"]:
+            path = Path(folder, file["file"]).resolve()
+            for line in file["lines"]:
+                # a line of a template is counted once for each type that it is made for
+                at = path, line["line_number"]
+                ran[at] = ran.get(at, False) or line["count"] > 0
+    return ran
 
 
 def with_table(text: str, name: str, table: str) -> str:

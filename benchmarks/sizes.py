@@ -36,6 +36,7 @@ from pop_fast.density.passes import Passes
 from pop_fast.io.formats import FORMATS, encoded, save_as
 from pop_fast.train.compact import TRIAL, Tuner
 from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
+from pop_fast.train.results import read_config
 from pop_fast.train.views import ViewTensors, evenly
 
 RESULTS: Final = Path(__file__).resolve().parent / "results"
@@ -56,11 +57,6 @@ def pop(*arguments: str) -> None:
     subprocess.run(module_command("pop_fast.cli", *arguments), check=True, stdout=sys.stderr)
 
 
-def resolved(result: Path) -> dict[str, Any]:
-    """Return the settings that a result was trained with."""
-    return dict(json.loads((result / "cfg.json").read_text(encoding="utf-8"))["resolved"])
-
-
 def measured(splat: Path, folder: Path, *options: str) -> dict[str, Any]:
     """Measure a splat as `pop eval` does: PSNR, Gaussians and the rest of its JSON."""
     pop("eval", str(splat), *options, "--json", str(folder / "eval.json"))
@@ -73,8 +69,8 @@ def rows(result: Path, shares: tuple[float, ...] = SHARES) -> Iterator[dict[str,
     Yields:
         format, final_prune, gaussians, bytes, psnr.
     """
-    run = resolved(result)
-    capture = ["--capture", run["data"], "--own-frame", "--factor", str(run["factor"])]
+    run = read_config(result)
+    capture = ["--capture", run.data, "--own-frame", "--factor", str(run.factor)]
     for share in shares:
         for name in _NAMES:
             with TemporaryDirectory() as scratch:
@@ -102,12 +98,12 @@ def rows_of_budgets(result: Path, names: list[str], steps: int) -> Iterator[dict
     Yields:
         format, share, bytes, and of each kind ("fewer", "spent", "tuned") bytes, gaussians, psnr.
     """
-    run, splat = resolved(result), load_splat(result)
+    splat = load_splat(result)
     capture, config = open_capture(splat, CaptureOptions())
     views = [ViewTensors.of(view) for view in evenly(capture.train_views(config.test_every), _SCORED)]
     scores = shrink.view_scores("sensitivity", Passes.of(config.backend, views, config), splat.params, splat.sh_degree)
     own = to_capture_frame(splat.params, capture.world_transform)
-    given = ["--capture", run["data"], "--own-frame", "--factor", str(run["factor"])]
+    given = ["--capture", splat.config.data, "--own-frame", "--factor", str(splat.config.factor)]
     for name in names:
         for share in BUDGETS:
             most = PLY_BYTES * len(scores) // share
@@ -145,7 +141,7 @@ def within_budgets(result: Path, whole: dict[str, Any], names: list[str]) -> Ite
     """Measure a result in every format and budget, and give what is known of it after each."""
     steps = LimitOptions().fine_tune_steps
     entry = {"gaussians": whole["num_GS"], "psnr": whole["psnr"], "psnr_tuned": whole_tuned(result, steps)}
-    entry |= {"factor": resolved(result)["factor"], "rows": []}
+    entry |= {"factor": read_config(result).factor, "rows": []}
     for row in rows_of_budgets(result, names, steps):
         entry["rows"].append(row)
         yield entry
@@ -230,7 +226,7 @@ def main() -> int:
         found = within_budgets(result, whole, args.formats) if args.budgets else in_whole(result, whole)
         for entry in found:
             # with every result, because others are kept that were measured elsewhere
-            captures[Path(resolved(result)["data"]).name] = {"machine": machine(), **steps, **entry}
+            captures[Path(read_config(result).data).name] = {"machine": machine(), **steps, **entry}
             write_json(args.json, {"ply_bytes": PLY_BYTES, "captures": captures})
     return 0
 

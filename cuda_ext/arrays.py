@@ -182,30 +182,19 @@ def _kernel_profile(kernels: Any, profile: Profile, tile_size: int) -> Any:
 
 @dataclass(frozen=True)
 class Settings:
-    """What a render depends on besides tensors.
+    """What a render depends on besides tensors."""
 
-    Attributes:
-        width, height: px.
-        profile: constants.
-        tile_size: px, the caller's.
-        sh_degree: bands, None for given colours.
-        antialiased: scale opacities by the low-pass compensation.
-        radius_clip: px.
-        absgrad: also sum |v_means2d|.
-        backward: "pixel_parallel" or "gaussian_parallel", which kernel goes back.
-        deterministic: sum gradients through slots; False adds atomically and saves 48 bytes an instance.
-    """
-
+    # px
     width: int
     height: int
-    profile: Profile
-    tile_size: int
-    sh_degree: int | None = None
-    antialiased: bool = False
-    radius_clip: float = 0.0
-    absgrad: bool = False
-    backward: str = "pixel_parallel"
-    deterministic: bool = True
+    profile: Profile  # constants
+    tile_size: int  # px, the caller's
+    sh_degree: int | None = None  # bands, None for given colours
+    antialiased: bool = False  # scale opacities by the low-pass compensation
+    radius_clip: float = 0.0  # px
+    absgrad: bool = False  # also sum |v_means2d|
+    backward: str = "pixel_parallel"  # "pixel_parallel" or "gaussian_parallel", which kernel goes back
+    deterministic: bool = True  # sum gradients through slots; False adds atomically and saves 48 bytes an instance
 
     def kernel_profile(self) -> Any:
         """Return the kernels' form of the profile."""

@@ -89,7 +89,7 @@ def _fastest(published: Paper) -> Question:
         _by_dataset(saved),
         "the time of POP is below that of each method; runs on one machine alone are compared",
         ("pop", *METHODS),
-        [_share(SECONDS, "pop", other, "at most", 0.0) for other in METHODS],
+        [_against(SECONDS, "pop", other, "at most", 0.0) for other in METHODS],
         of_times=True,
     )
 
@@ -109,7 +109,7 @@ def _fewest(published: Paper) -> Question:
         _by_dataset(counts, datasets) + "; not claimed for Tanks & Temples",
         "N(pop) is below that of each method of table 1",
         ("pop", *others),
-        [_share(COUNT, "pop", other, "at most", 0.0) for other in others],
+        [_against(COUNT, "pop", other, "at most", 0.0) for other in others],
         datasets=datasets,
     )
 
@@ -124,7 +124,7 @@ def _above(published: Paper) -> Question:
         "claim",
         "PSNR(pop) is above PSNR(pup) and PSNR(speedy_splat)",
         ("pop", *others),
-        [_difference(PSNR, "pop", other, "at least", 0.0) for other in others],
+        [_against(PSNR, "pop", other, "at least", 0.0) for other in others],
         datasets=("Mip-NeRF 360",),
     )
 
@@ -138,7 +138,7 @@ def _comparable(published: Paper) -> Question:
         f"comparable is read as the paper's own tables have it: no more below 3DGS than their largest differences, "
         f"{min(psnr):+.2f} dB and {min(ssim):+.3f} of SSIM",
         ("pop", "3dgs"),
-        [_difference(quantity, "pop", "3dgs", "at least", min(of)) for quantity, of in ((PSNR, psnr), (SSIM, ssim))],
+        [_against(quantity, "pop", "3dgs", "at least", min(of)) for quantity, of in ((PSNR, psnr), (SSIM, ssim))],
     )
 
 
@@ -154,7 +154,7 @@ def _compact(published: Paper) -> Question:
         f"{_each(shares, '.1%')} at {_each(changes, '+.2f')} dB",
         f"N(pop) / N(gsplat) is at most the paper's largest, {max(shares):.1%}",
         ("pop", "gsplat"),
-        [_share(COUNT, "pop", "gsplat", "at most", log(max(shares))), _difference(PSNR, "pop", "gsplat")],
+        [_against(COUNT, "pop", "gsplat", "at most", log(max(shares))), _against(PSNR, "pop", "gsplat")],
     )
 
 
@@ -165,7 +165,7 @@ def _half(published: Paper) -> Question:
         f"{_each(paper_ratios(published, 'pop', 'l2_blur'), '.1%')} of L2+Blur's Gaussians ({', '.join(DATASETS)})",
         "N(pop) / N(l2_blur) is at most 50 %",
         ("pop", "l2_blur"),
-        [_share(COUNT, "pop", "l2_blur", "at most", log(0.5)), _difference(PSNR, "pop", "l2_blur")],
+        [_against(COUNT, "pop", "l2_blur", "at most", log(0.5)), _against(PSNR, "pop", "l2_blur")],
         of_duration=True,
     )
 
@@ -179,8 +179,8 @@ def _blur(published: Paper) -> Question:
         f"at least the paper's least factors, {min(without):.2f} without POP and {min(with_pop):.2f} with it",
         ("l2_blur", "l2", "pop", "l2_pop"),
         [
-            _share(COUNT, "l2_blur", "l2", "at least", log(min(without)), "factor"),
-            _share(COUNT, "pop", "l2_pop", "at least", log(min(with_pop)), "factor"),
+            _against(COUNT, "l2_blur", "l2", "at least", log(min(without)), "factor"),
+            _against(COUNT, "pop", "l2_pop", "at least", log(min(with_pop)), "factor"),
         ],
         of_duration=True,
     )
@@ -194,7 +194,7 @@ def _reset(published: Paper) -> Question:
         f"{_each(changes, '+.2f')} dB with {_each(paper_ratios(published, 'pop', 'reset'), '.1%')} of its Gaussians",
         "PSNR(pop) is at least PSNR(reset)",
         ("pop", "reset"),
-        [_difference(PSNR, "pop", "reset", "at least", 0.0), _share(COUNT, "pop", "reset")],
+        [_against(PSNR, "pop", "reset", "at least", 0.0), _against(COUNT, "pop", "reset")],
         of_duration=True,
         always=("A16 on",),
     )
@@ -221,7 +221,7 @@ def _window(published: Paper) -> Question:
         [
             psnr("PSNR from 4k to 7k", {pop: 1.0, short: -1.0}),
             psnr("that gain less the gain from 7k to 15k", {pop: 2.0, short: -1.0, longest: -1.0}),
-            _share(COUNT, longest, pop, "at least", log(low), "factor"),
+            _against(COUNT, longest, pop, "at least", log(low), "factor"),
         ],
         of_duration=True,
     )
@@ -273,7 +273,7 @@ def _pixel() -> Question:
         "fewer are blended and fewer are visited a pixel",
         ("pop", "3dgs"),
         [
-            _share(quantity, "pop", "3dgs", "at most", 0.0, says=f"{what}, pop / 3dgs")
+            _against(quantity, "pop", "3dgs", "at most", 0.0, says=f"{what}, pop / 3dgs")
             for what, quantity in (("blended", BLENDED), ("visited", VISITED))
         ],
     )
@@ -315,31 +315,19 @@ def against_sweep(l2: Group, sweep: Mapping[str, Group], noise: Noise) -> Compar
     return with_error(says, l2.psnr - expected, parts, noise, "at least", 0.0, "dB")
 
 
-def _share(
+def _against(
     quantity: Quantity,
     row: str,
     base: str,
     asked: Literal["at least", "at most", "nothing"] = "nothing",
     bound: float = 0.0,
-    shown_as: Literal["share", "factor"] = "share",
+    shown_as: Literal["factor"] | None = None,
     says: str = "",
 ) -> Ask:
-    """Compare a row with another by their ratio."""
-    text = says or f"{'N' if quantity is COUNT else quantity.name} {row} / {base}"
+    """Compare a row with another, by their ratio where the quantity is compared by logarithms, else by difference."""
+    name = "N" if quantity is COUNT else quantity.name
+    text = says or f"{name} {row} {'/' if quantity.is_log else '-'} {base}"
     return lambda rows, noise: compare(text, rows, noise, quantity, {row: 1.0, base: -1.0}, asked, bound, shown_as)
-
-
-def _difference(
-    quantity: Quantity,
-    row: str,
-    base: str,
-    asked: Literal["at least", "at most", "nothing"] = "nothing",
-    bound: float = 0.0,
-) -> Ask:
-    """Compare a row with another by their difference."""
-    text, weights = f"{quantity.name} {row} - {base}", {row: 1.0, base: -1.0}
-    shown_as: Literal["dB", "plain"] = "dB" if quantity is PSNR else "plain"
-    return lambda rows, noise: compare(text, rows, noise, quantity, weights, asked, bound, shown_as)
 
 
 def _densifications(rows: Groups) -> tuple[float, float, float]:

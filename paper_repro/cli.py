@@ -382,9 +382,9 @@ def _absent(scale: str, data: Path) -> list[str]:
 
 
 def _write(path: Path, text: str) -> None:
-    from pop_fast.io.atomic import write_atomically
+    from pop_fast.io.atomic import write_file
 
-    write_atomically(path, lambda file: file.write((text.rstrip("\n") + "\n").encode()))
+    write_file(path, text.rstrip("\n") + "\n")
     print(path)
 
 

@@ -26,23 +26,14 @@ Status = Literal["ok", "missing", "refused"]
 
 @dataclass(frozen=True)
 class Found:
-    """What was found of a scene.
+    """What was found of a scene."""
 
-    Attributes:
-        scene: the scene.
-        status: "ok", "missing" (not there) or "refused" (there, and not as the protocol has it).
-        reason: what is wrong and how to fix it; empty for nothing.
-        folder: where it is.
-        n_images: photographs with a known camera.
-        sizes: their widths and heights, px, the most frequent first.
-    """
-
-    scene: PaperScene
-    status: Status
-    reason: str
-    folder: Path | None = None
-    n_images: int = 0
-    sizes: tuple[tuple[int, int], ...] = ()
+    scene: PaperScene  # the scene
+    status: Status  # "ok", "missing" (not there) or "refused" (there, and not as the protocol has it)
+    reason: str  # what is wrong and how to fix it; empty for nothing
+    folder: Path | None = None  # where it is
+    n_images: int = 0  # photographs with a known camera
+    sizes: tuple[tuple[int, int], ...] = ()  # their widths and heights, px, the most frequent first
 
     @property
     def n_test(self) -> int:

@@ -45,17 +45,12 @@ DATASETS: Final = ("Mip-NeRF 360", "Tanks & Temples", "Deep Blending")
 
 @dataclass(frozen=True)
 class Quantity:
-    """Something that is compared between runs.
+    """Something that is compared between runs."""
 
-    Attributes:
-        name: for people.
-        get: reads it off a run, on the scale on which it is compared; None where the run has none.
-        is_log: whether that is a natural logarithm.
-    """
-
-    name: str
+    name: str  # for people
+    # reads it off a run, on the scale on which it is compared; None where the run has none
     get: Callable[[Result], float | None]
-    is_log: bool = False
+    is_log: bool = False  # whether that is a natural logarithm
 
 
 def _log(value: float | None) -> float | None:
@@ -100,23 +95,14 @@ class Group:
 
 
 class Spread(NamedTuple):
-    """The standard deviation over seeds, pooled.
+    """The standard deviation over seeds, pooled."""
 
-    Attributes:
-        s: the standard deviation.
-        df: its degrees of freedom.
-        groups: how many pairs of row and scene have several seeds.
-        least: the smallest standard deviation of one of them.
-        largest: the largest.
-        scenes: that they are of.
-    """
-
-    s: float
-    df: int
-    groups: int
-    least: float
-    largest: float
-    scenes: tuple[str, ...]
+    s: float  # the standard deviation
+    df: int  # its degrees of freedom
+    groups: int  # how many pairs of row and scene have several seeds
+    least: float  # the smallest standard deviation of one of them
+    largest: float  # the largest
+    scenes: tuple[str, ...]  # that they are of
 
 
 class Noise:
@@ -158,29 +144,18 @@ def _by_machine(runs: Iterable[Result]) -> list[list[Result]]:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A combination of group means, and what is asked of it.
+    """A combination of group means, and what is asked of it."""
 
-    Attributes:
-        says: what is compared.
-        value: the combination; a natural logarithm where `shown_as` is "share" or "factor".
-        asked: "at least" or "at most" the bound, or "nothing" where the number is only told.
-        bound: on the scale of `value`.
-        variance: of one run of each group, sum_i c_i^2 s^2; None without a noise floor.
-        error: standard error of `value` with the seeds that are there; None without a noise floor.
-        df: degrees of freedom of the noise floor.
-        seeds: how many runs each group has, the smallest first.
-        shown_as: how the value is written.
-    """
-
-    says: str
-    value: float
+    says: str  # what is compared
+    value: float  # the combination; a natural logarithm where `shown_as` is "share" or "factor"
+    # "at least" or "at most" the bound, or "nothing" where the number is only told
     asked: Literal["at least", "at most", "nothing"]
-    bound: float
-    variance: float | None
-    error: float | None
-    df: int
-    seeds: tuple[int, ...]
-    shown_as: Literal["dB", "share", "factor", "plain"]
+    bound: float  # on the scale of `value`
+    variance: float | None  # of one run of each group, sum_i c_i^2 s^2; None without a noise floor
+    error: float | None  # standard error of `value` with the seeds that are there; None without a noise floor
+    df: int  # degrees of freedom of the noise floor
+    seeds: tuple[int, ...]  # how many runs each group has, the smallest first
+    shown_as: Literal["dB", "share", "factor", "plain"]  # how the value is written
 
     @property
     def margin(self) -> float:
@@ -262,7 +237,7 @@ def compare(
         weights: of each row's mean in the combination.
         asked: what is asked of the combination.
         bound: on the scale of the quantity.
-        shown_as: how it is written; None takes dB, or a share for what is compared by logarithms.
+        shown_as: how it is written; None takes a share for what is compared by logarithms, dB for PSNR, else "plain".
 
     Returns:
         The comparison, or None where a row has no run, or a run lacks the quantity.
@@ -273,7 +248,8 @@ def compare(
         return None
     pairs = list(zip(weights.values(), values, strict=True))
     value, parts = sum(c * fmean(v) for c, v in pairs), [(quantity, c, len(v)) for c, v in pairs]
-    return with_error(says, value, parts, noise, asked, bound, shown_as or ("share" if quantity.is_log else "dB"))
+    usual: Literal["dB", "share", "plain"] = "share" if quantity.is_log else "dB" if quantity is PSNR else "plain"
+    return with_error(says, value, parts, noise, asked, bound, shown_as or usual)
 
 
 def with_error(
@@ -321,47 +297,30 @@ Groups = Mapping[str, Mapping[str, Group]]
 
 @dataclass(frozen=True)
 class Evidence:
-    """What one scene says.
+    """What one scene says."""
 
-    Attributes:
-        scene: where.
-        says: the numbers, with their intervals.
-        verdict: of this scene.
-        why: what keeps it from being decided; empty where it is.
-        under: what the runs were trained with, as far as it bears on the claim.
-        runs: ids of the runs.
-        nearest: of what is asked, the number that is nearest to failing or fails by most, with its interval, and its
-            bound where that is not 0 or one to one.
-        is_whole: whether it has every run, or is decided without; a scene that is not counts as one that was not run.
-    """
-
-    scene: str
-    says: str
-    verdict: Verdict
-    why: str
-    under: str
-    runs: tuple[str, ...]
+    scene: str  # where
+    says: str  # the numbers, with their intervals
+    verdict: Verdict  # of this scene
+    why: str  # what keeps it from being decided; empty where it is
+    under: str  # what the runs were trained with, as far as it bears on the claim
+    runs: tuple[str, ...]  # ids of the runs
+    # of what is asked, the number that is nearest to failing or fails by most, with its interval, and its bound where
+    # that is not 0 or one to one
     nearest: str = ""
+    # whether it has every run, or is decided without; a scene that is not counts as one that was not run
     is_whole: bool = True
 
 
 @dataclass(frozen=True)
 class Told:
-    """A claim's verdict under one reading of the paper.
+    """A claim's verdict under one reading of the paper."""
 
-    Attributes:
-        reading: its name; empty for the default of every question.
-        verdict: over the scenes.
-        evidence: by scene.
-        deciders: commands that train what would decide the scenes that are not.
-        enough: the fewest of such commands that would decide the claim.
-    """
-
-    reading: str
-    verdict: Verdict
-    evidence: tuple[Evidence, ...]
-    deciders: tuple[str, ...]
-    enough: tuple[str, ...]
+    reading: str  # its name; empty for the default of every question
+    verdict: Verdict  # over the scenes
+    evidence: tuple[Evidence, ...]  # by scene
+    deciders: tuple[str, ...]  # commands that train what would decide the scenes that are not
+    enough: tuple[str, ...]  # the fewest of such commands that would decide the claim
 
     @property
     def where(self) -> str:
@@ -375,23 +334,14 @@ class Told:
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim of the paper, and what the runs of one scale say.
+    """A claim of the paper, and what the runs of one scale say."""
 
-    Attributes:
-        id: short, for tables and links.
-        says: the claim.
-        paper: the paper's own numbers for it.
-        holds_if: what is asked of a scene.
-        told: under the default reading of every question.
-        others: under other readings for which there are runs.
-    """
-
-    id: str
-    says: str
-    paper: str
-    holds_if: str
-    told: Told
-    others: tuple[Told, ...] = field(default=())
+    id: str  # short, for tables and links
+    says: str  # the claim
+    paper: str  # the paper's own numbers for it
+    holds_if: str  # what is asked of a scene
+    told: Told  # under the default reading of every question
+    others: tuple[Told, ...] = field(default=())  # under other readings for which there are runs
 
     @property
     def verdict(self) -> Verdict:
@@ -408,14 +358,6 @@ class Claim:
     def under(self) -> str:
         """Say what its runs were trained with, by scene."""
         return "; ".join(f"{e.scene}: {e.under}" for e in self.told.evidence)
-
-
-def told(reading: str, evidence: Iterable[Evidence], deciders: Iterable[str], enough: Iterable[str] | None) -> Told:
-    """Put what the scenes say together."""
-    found, commands = tuple(evidence), tuple(dict.fromkeys(deciders))
-    # where no scene has all its runs, or none of the whole schedule, the first is as good as any
-    fewest = commands[:1] if enough is None else tuple(enough)
-    return Told(reading, verdict_over(e.verdict for e in found if e.is_whole), found, commands, fewest)
 
 
 def verdict_over(verdicts: Iterable[Verdict]) -> Verdict:

@@ -60,34 +60,21 @@ _STEPS: Final = ("max_steps", "sh_interval", "l2_stop_iter")
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """What a row of a table is trained with.
+    """What a row of a table is trained with."""
 
-    Attributes:
-        name: of the row, and of its file.
-        title: what it is, in a few words.
-        method: its name for `pop train --method`.
-        options: the options of `pop train` in which it differs from that, on the whole schedule.
-        tables: the paper's tables that it stands in.
-        figures: the paper's figures that it stands in.
-        paper: its name in the paper's tables, by table; empty beyond the paper.
-        description: about ten lines: what the method does, from which sources, and what is left out.
-        cost: time of a training over that of POP, for the order of a queue; from the paper's table where it has one.
-        bytes_per_gaussian: of the file whose size the paper's table gives.
-        scenes: further options by dataset or scene; the scene's own come last.
-        base: the row from whose training it begins, where that is finished, or None; see `paper_repro.train_row`.
-    """
-
-    name: str
-    title: str
-    method: str
-    options: tuple[str, ...]
-    tables: tuple[int, ...]
-    figures: tuple[str, ...]
-    paper: Mapping[str, str]
-    description: str
+    name: str  # of the row, and of its file
+    title: str  # what it is, in a few words
+    method: str  # its name for `pop train --method`
+    options: tuple[str, ...]  # the options of `pop train` in which it differs from that, on the whole schedule
+    tables: tuple[int, ...]  # the paper's tables that it stands in
+    figures: tuple[str, ...]  # the paper's figures that it stands in
+    paper: Mapping[str, str]  # its name in the paper's tables, by table; empty beyond the paper
+    description: str  # about ten lines: what the method does, from which sources, and what is left out
+    # time of a training over that of POP, for the order of a queue; from the paper's table where it has one
     cost: float
-    bytes_per_gaussian: int
-    scenes: Mapping[str, tuple[str, ...]]
+    bytes_per_gaussian: int  # of the file whose size the paper's table gives
+    scenes: Mapping[str, tuple[str, ...]]  # further options by dataset or scene; the scene's own come last
+    # the row from whose training it begins, where that is finished, or None; see `paper_repro.train_row`
     base: str | None = None
 
     def options_for(self, scene: PaperScene) -> tuple[str, ...]:

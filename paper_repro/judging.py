@@ -22,7 +22,7 @@ from paper_repro.evidence import (
     command,
     conditions,
     is_shortened,
-    told,
+    verdict_over,
 )
 from paper_repro.jobs import SEED
 from paper_repro.paper import paper
@@ -39,43 +39,26 @@ _FIRST_SEEDS: Final = 3
 
 @dataclass(frozen=True)
 class Question:
-    """A claim before it is judged.
+    """A claim before it is judged."""
 
-    Attributes:
-        id: short, for tables and links.
-        says: the claim.
-        paper: the paper's own numbers for it.
-        holds_if: what is asked of a scene.
-        rows: that it needs on a scene.
-        asks: make its comparisons on one scene.
-        of_duration: whether it asks what a length of the schedule does, which no shortened schedule decides.
-        of_times: whether it compares times, which only runs on one machine allow.
-        datasets: of which the paper says it.
-        always: other readings under which it is told even where nothing was run.
-    """
-
-    id: str
-    says: str
-    paper: str
-    holds_if: str
-    rows: tuple[str, ...]
-    asks: Sequence[Ask]
-    of_duration: bool = False
-    of_times: bool = False
-    datasets: tuple[str, ...] = DATASETS
-    always: tuple[str, ...] = ()
+    id: str  # short, for tables and links
+    says: str  # the claim
+    paper: str  # the paper's own numbers for it
+    holds_if: str  # what is asked of a scene
+    rows: tuple[str, ...]  # that it needs on a scene
+    asks: Sequence[Ask]  # make its comparisons on one scene
+    of_duration: bool = False  # whether it asks what a length of the schedule does, which no shortened schedule decides
+    of_times: bool = False  # whether it compares times, which only runs on one machine allow
+    datasets: tuple[str, ...] = DATASETS  # of which the paper says it
+    always: tuple[str, ...] = ()  # other readings under which it is told even where nothing was run
 
 
 @dataclass(frozen=True)
 class Other:
-    """Another reading of the paper.
+    """Another reading of the paper."""
 
-    Attributes:
-        name: the label of the open question and its other answer.
-        rows: the rows that train otherwise under it, each with the row that does so, or None where there is none.
-    """
-
-    name: str
+    name: str  # the label of the open question and its other answer
+    # the rows that train otherwise under it, each with the row that does so, or None where there is none
     rows: Mapping[str, str | None]
 
 
@@ -116,23 +99,14 @@ def judge(question: Question, found: Groups, noise: Noise, scale: str) -> Claim:
 
 @dataclass(frozen=True)
 class _At:
-    """One scene: what a question uses there, what could be compared, and what lacks.
+    """One scene: what a question uses there, what could be compared, and what lacks."""
 
-    Attributes:
-        scene: its name.
-        rows: the groups that are used, by the question's row.
-        unused: of each of the question's rows, seeds of the runs that are there and do not count.
-        asked: what could be compared, or why not.
-        missing: names of the rows that lack.
-        where: the machine on which further runs have to be timed; empty where any would do.
-    """
-
-    scene: str
-    rows: Mapping[str, Group]
-    unused: Mapping[str, set[int]]
-    asked: Asked
-    missing: tuple[str, ...]
-    where: str = ""
+    scene: str  # its name
+    rows: Mapping[str, Group]  # the groups that are used, by the question's row
+    unused: Mapping[str, set[int]]  # of each of the question's rows, seeds of the runs that are there and do not count
+    asked: Asked  # what could be compared, or why not
+    missing: tuple[str, ...]  # names of the rows that lack
+    where: str = ""  # the machine on which further runs have to be timed; empty where any would do
 
     @property
     def made(self) -> tuple[Comparison, ...]:
@@ -186,7 +160,10 @@ def _under(reading: str, question: Question, found: Groups, noise: Noise, scale:
         if verdict == "not decided":
             _decide(deciders, question, one, names, together, _seeds_at_first(noise))
     is_open = [one for one, e in zip(judged, evidence, strict=True) if e.is_whole and e.verdict == "not decided"]
-    return told(reading, evidence, deciders.commands(), _enough(scale, names, is_open, together))
+    commands, enough = tuple(dict.fromkeys(deciders.commands())), _enough(scale, names, is_open, together)
+    # where no scene has all its runs, or none of the whole schedule, the first is as good as any
+    fewest = commands[:1] if enough is None else tuple(enough)
+    return Told(reading, verdict_over(e.verdict for e in evidence if e.is_whole), tuple(evidence), commands, fewest)
 
 
 def _verdict(question: Question, at: _At, together: int) -> tuple[Verdict, str]:

@@ -24,35 +24,22 @@ M360, TT, DB = "Mip-NeRF 360", "Tanks & Temples", "Deep Blending"
 
 @dataclass(frozen=True)
 class Metric:
-    """A column of the tables.
+    """A column of the tables."""
 
-    Attributes:
-        id: its name here.
-        name: as printed.
-        unit: "k", "s", "MB", "dB" or none.
-        best: which values are good.
-    """
-
-    id: str
-    name: str
-    unit: str
-    best: Literal["least", "most"]
+    id: str  # its name here
+    name: str  # as printed
+    unit: str  # "k", "s", "MB", "dB" or none
+    best: Literal["least", "most"]  # which values are good
 
 
 @dataclass(frozen=True)
 class PaperRow:
-    """A line of a table.
+    """A line of a table."""
 
-    Attributes:
-        row: its configuration here.
-        name: as printed.
-        values: by dataset and metric.
-        marks: its printed place among the best by dataset and metric, 1 to 3; 0 without colour.
-    """
-
-    row: str
-    name: str
-    values: Mapping[str, Mapping[str, float]]
+    row: str  # its configuration here
+    name: str  # as printed
+    values: Mapping[str, Mapping[str, float]]  # by dataset and metric
+    # its printed place among the best by dataset and metric, 1 to 3; 0 without colour
     marks: Mapping[str, Mapping[str, int]]
 
 
@@ -94,18 +81,12 @@ class Stated:
 
 @dataclass(frozen=True)
 class NotComparable:
-    """Cells of the published tables that cannot be compared, or not without a remark.
+    """Cells of the published tables that cannot be compared, or not without a remark."""
 
-    Attributes:
-        id: its label in protocol.md.
-        why: in one clause.
-        blocked: whether such a cell gets no difference at all.
-        tables, datasets, rows, metrics: where it holds; empty for everywhere.
-    """
-
-    id: str
-    why: str
-    blocked: bool = False
+    id: str  # its label in protocol.md
+    why: str  # in one clause
+    blocked: bool = False  # whether such a cell gets no difference at all
+    # where it holds; empty for everywhere
     tables: tuple[int, ...] = ()
     datasets: tuple[str, ...] = ()
     rows: tuple[str, ...] = ()
@@ -119,26 +100,17 @@ class NotComparable:
 
 @dataclass(frozen=True)
 class Paper:
-    """All of paper.toml.
+    """All of paper.toml."""
 
-    Attributes:
-        datasets: scenes by dataset.
-        metrics: by id, in the order of the columns.
-        tables: one to five.
-        bytes_per_gaussian: of the file whose size Ckpt is, by row.
-        stated: by id.
-        not_comparable: in the order of protocol.md.
-        exceptions: (row, dataset, metric) of what is printed differently in two tables, and why.
-        lpips: the variant that a cell seems to hold, by (dataset, row).
-    """
-
-    datasets: Mapping[str, tuple[str, ...]]
-    metrics: Mapping[str, Metric]
-    tables: tuple[PaperTable, ...]
-    bytes_per_gaussian: Mapping[str, int]
-    stated: Mapping[str, Stated]
-    not_comparable: tuple[NotComparable, ...]
+    datasets: Mapping[str, tuple[str, ...]]  # scenes by dataset
+    metrics: Mapping[str, Metric]  # by id, in the order of the columns
+    tables: tuple[PaperTable, ...]  # one to five
+    bytes_per_gaussian: Mapping[str, int]  # of the file whose size Ckpt is, by row
+    stated: Mapping[str, Stated]  # by id
+    not_comparable: tuple[NotComparable, ...]  # in the order of protocol.md
+    # (row, dataset, metric) of what is printed differently in two tables, and why
     exceptions: Mapping[tuple[str, str, str], str]
+    # the variant that a cell seems to hold, by (dataset, row)
     lpips: Mapping[tuple[str, str], str] = field(default_factory=dict)
 
     def table(self, number: int) -> PaperTable:
@@ -250,19 +222,12 @@ def _not_comparable(found: Mapping[str, Any]) -> NotComparable:
 
 @dataclass(frozen=True)
 class Statement:
-    """One statement about the paper's own numbers.
+    """One statement about the paper's own numbers."""
 
-    Attributes:
-        says: the statement.
-        found: the numbers.
-        holds: whether they bear it out.
-        known: why it does not hold, where that is known; empty for what has to hold.
-    """
-
-    says: str
-    found: str
-    holds: bool
-    known: str = ""
+    says: str  # the statement
+    found: str  # the numbers
+    holds: bool  # whether they bear it out
+    known: str = ""  # why it does not hold, where that is known; empty for what has to hold
 
 
 def checks(paper: Paper) -> tuple[Statement, ...]:

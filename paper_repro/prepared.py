@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from pop_fast.errors import PopError
+from pop_fast.io.atomic import write_atomically
 
 if TYPE_CHECKING:
     from pop_fast.data import Capture, View
@@ -73,11 +74,8 @@ def write(capture: Capture, config: TrainConfig, folder: Path) -> Path:
     seen = [view.seen for view in views if view.seen is not None and len(view.seen)]
     arrays |= {"masks": np.concatenate(masks)} if masks else {}
     arrays |= {"seen": np.concatenate(seen).astype(np.int32)} if seen else {}
-    folder.mkdir(parents=True, exist_ok=True)
     path = path_of(folder, config)
-    partial = path.with_name(f".{path.name}.partial.npz")
-    np.savez_compressed(partial, **arrays)
-    partial.replace(path)
+    write_atomically(path, lambda file: np.savez_compressed(file, **arrays))
     return path
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from paper_repro.collect import PROBE, read_probe
 from pop_fast.data import Capture
-from pop_fast.io.atomic import write_atomically
+from pop_fast.io.atomic import write_file
 from pop_fast.stages import losses
 from pop_fast.train.config import TrainConfig
 from pop_fast.train.engines import engine_of
@@ -97,8 +97,7 @@ class ProbedRun(TrainingRun):
         # nothing is written into a folder that the run itself has not begun
         if not self._points or len(self._points) == self._written or not self._path.with_name("cfg.json").is_file():
             return
-        text = json.dumps(self._points)
-        write_atomically(self._path, lambda file: file.write(text.encode("utf-8")))
+        write_file(self._path, json.dumps(self._points))
         self._written = len(self._points)
 
 

@@ -24,9 +24,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
-from paper_repro.scenes import SCALES as _SCALES
+from paper_repro.scenes import SCALES, scale_named
 from pop_fast.errors import PopError
-from pop_fast.io.atomic import write_atomically
+from pop_fast.io.atomic import write_file
 
 SCHEMA: Final = 2
 LPIPS_VARIANTS: Final = ("vgg_01", "alex_norm", "alex_01")
@@ -61,78 +61,50 @@ _AGAIN: Final = "train the row again with pop-repro run --again"
 
 @dataclass(frozen=True)
 class Result:
-    """What one finished run says of itself.
+    """What one finished run says of itself."""
 
-    Attributes:
-        scale: a name of `paper_repro.scenes`.
-        row: the configuration, by the name of its file in `configs`.
-        scene: the capture, by its name here ("fox", "bonsai_800", "kitchen", ...).
-        seed: of every random number of the run.
-        run: twelve hex digits of the hash of configuration, data and seed.
-        commit: the git commit that ran, to the end; None outside a clone.
-        config_hash: of the configuration.
-        data_hash: of the capture as it was loaded: names, photographs, masks, cameras, points, and what else is used.
-        machine: the processor, and after ", " the GPU where one was used.
-        cpu: family, model, stepping and instructions of the processor, by which two machines are of one kind; None
-            where nothing tells them.
-        engine: what took the steps: "native", "cuda", or "torch (BACKEND)", autograd over a backend.
-        threads: CPU threads.
-        versions: of Python and the packages that compute.
-        protocol: split, images, size, metrics, timing, and the bytes of a Gaussian in a checkpoint; "base" is the id of
-            the run that its first steps are from, whose time is in its own, "begun" another commit that took them.
-        schedule: the settings as they were run, by dotted name.
-        seconds: by the clock, of "load", "train" and "evaluate"; "cpu" is the processor time of "train" over all
-            threads, where a CPU trained and it was counted.
-        num_gaussians: at the end.
-        checkpoint_mib: size of the parameters in float32, MiB.
-        psnr: dB, mean over the held-out views.
-        ssim: mean over the held-out views.
-        lpips: by variant; None where its weights were not given.
-        lpips_reason: why a variant is None; None when none is.
-        n_blended: Gaussians blended a pixel, mean over the held-out views; None where the engine does not count.
-        n_traversed: list entries visited a pixel, likewise.
-        opacity_below_01: share of Gaussians with opacity under 0.1 ("opacity_below_0.1" in the file).
-        opacity_above_09: share of Gaussians with opacity over 0.9 ("opacity_above_0.9" in the file).
-        opacity_histogram: counts in 50 equal bins over [0, 1].
-        curve: what was logged during training, by rising "step"; a point has only what was measured at its step. What
-            begins with "grad_" and "probe_" is of a few training views that are rendered all along, "psnr_test" of the
-            held-out views.
-        per_view: "psnr" and "ssim" of every held-out view, by its name.
-        ply_hash: SHA-256 of the PLY of the Gaussians at the end, which has all their bits; None where it is not known.
-        files: what the run left to be published, by name, each with the SHA-256 of its content.
-    """
-
-    scale: str
-    row: str
-    scene: str
-    seed: int
-    run: str
-    commit: str | None
-    config_hash: str
-    data_hash: str
-    machine: str
+    scale: str  # a name of `paper_repro.scenes`
+    row: str  # the configuration, by the name of its file in `configs`
+    scene: str  # the capture, by its name here ("fox", "bonsai_800", "kitchen", ...)
+    seed: int  # of every random number of the run
+    run: str  # twelve hex digits of the hash of configuration, data and seed
+    commit: str | None  # the git commit that ran, to the end; None outside a clone
+    config_hash: str  # of the configuration
+    data_hash: str  # of the capture as it was loaded: names, photographs, masks, cameras, points, and what else is used
+    machine: str  # the processor, and after ", " the GPU where one was used
+    # family, model, stepping and instructions of the processor, by which two machines are of one kind; None where
+    # nothing tells them
     cpu: str | None
-    engine: str
-    threads: int
-    versions: Mapping[str, Any]
+    engine: str  # what took the steps: "native", "cuda", or "torch (BACKEND)", autograd over a backend
+    threads: int  # CPU threads
+    versions: Mapping[str, Any]  # of Python and the packages that compute
+    # split, images, size, metrics, timing, and the bytes of a Gaussian in a checkpoint; "base" is the id of the run
+    # that its first steps are from, whose time is in its own, "begun" another commit that took them
     protocol: Mapping[str, Any]
-    schedule: Mapping[str, Any]
+    schedule: Mapping[str, Any]  # the settings as they were run, by dotted name
+    # by the clock, of "load", "train" and "evaluate"; "cpu" is the processor time of "train" over all threads, where a
+    # CPU trained and it was counted
     seconds: Mapping[str, float]
-    num_gaussians: int
-    checkpoint_mib: float
-    psnr: float
-    ssim: float
-    lpips: Mapping[str, float | None]
-    lpips_reason: str | None
+    num_gaussians: int  # at the end
+    checkpoint_mib: float  # size of the parameters in float32, MiB
+    psnr: float  # dB, mean over the held-out views
+    ssim: float  # mean over the held-out views
+    lpips: Mapping[str, float | None]  # by variant; None where its weights were not given
+    lpips_reason: str | None  # why a variant is None; None when none is
+    # Gaussians blended a pixel, mean over the held-out views; None where the engine does not count
     n_blended: float | None
-    n_traversed: float | None
-    opacity_below_01: float
-    opacity_above_09: float
-    opacity_histogram: tuple[int, ...]
+    n_traversed: float | None  # list entries visited a pixel, likewise
+    opacity_below_01: float  # share of Gaussians with opacity under 0.1 ("opacity_below_0.1" in the file)
+    opacity_above_09: float  # share of Gaussians with opacity over 0.9 ("opacity_above_0.9" in the file)
+    opacity_histogram: tuple[int, ...]  # counts in 50 equal bins over [0, 1]
+    # what was logged during training, by rising "step"; a point has only what was measured at its step. What begins
+    # with "grad_" and "probe_" is of a few training views that are rendered all along, "psnr_test" of the held-out
+    # views
     curve: tuple[Mapping[str, Any], ...]
-    per_view: Mapping[str, Mapping[str, float]]
+    per_view: Mapping[str, Mapping[str, float]]  # "psnr" and "ssim" of every held-out view, by its name
+    # SHA-256 of the PLY of the Gaussians at the end, which has all their bits; None where it is not known
     ply_hash: str | None
-    files: Mapping[str, str]
+    files: Mapping[str, str]  # what the run left to be published, by name, each with the SHA-256 of its content
 
     @property
     def training_seconds(self) -> float:
@@ -314,8 +286,8 @@ def _parse(found: Mapping[str, Any], where: str) -> Result:
 
 
 def _result(take: _Fields) -> Result:
-    if take.text("scale") not in _SCALES:
-        raise take.fail("scale", f"one of {', '.join(_SCALES)}")
+    if take.text("scale") not in SCALES:
+        raise take.fail("scale", f"one of {', '.join(SCALES)}")
     name = r"[a-z0-9]+(?:_[a-z0-9]+)*"
     lower = "lower-case letters, digits and _"
     n, files = take.whole("num_gaussians", 0), take.inner("files")
@@ -448,9 +420,6 @@ def _per_view(take: _Fields) -> dict[str, dict[str, float]]:
     return views
 
 
-SCALES: Final = tuple(_SCALES)
-
-
 def home(package: Path) -> Path:
     """Return the folder of results and work: the package's own in a clone, else `paper_repro` of the current folder."""
     # pip neither installs nor keeps what a command would write between the files of a package
@@ -518,9 +487,7 @@ def read_all(scale: str, folder: Path = RESULTS) -> tuple[Result, ...]:
     Raises:
         PopError: the scale is unknown, or as `read`.
     """
-    if scale not in SCALES:
-        raise PopError(f"scale is '{scale}'; it must be one of {', '.join(SCALES)}")
-    return tuple(result for path in sorted((folder / scale).glob("*.jsonl")) for result in read(path))
+    return tuple(result for path in sorted((folder / scale_named(scale).name).glob("*.jsonl")) for result in read(path))
 
 
 def write(result: Result, folder: Path = RESULTS) -> Path:
@@ -532,8 +499,7 @@ def write(result: Result, folder: Path = RESULTS) -> Path:
     path, line = path_of(result.scale, result.row, folder), to_line(result)
     with _alone(path.parent):
         lines = {key: text for key, (_, text) in _lines(path).items()} | {(result.scene, result.seed): line}
-        text = "".join(f"{lines[key]}\n" for key in sorted(lines))
-        write_atomically(path, lambda file: file.write(text.encode("utf-8")))
+        write_file(path, "".join(f"{lines[key]}\n" for key in sorted(lines)))
     return path
 
 

@@ -42,51 +42,32 @@ _POINTS: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class Dataset:
-    """Scenes that were published together.
+    """Scenes that were published together."""
 
-    Attributes:
-        name: as tables call it.
-        parents: folders under the data root that its scenes may lie in, in the order in which they are looked for.
-        source: where it comes from.
-    """
-
-    name: str
+    name: str  # as tables call it
+    # folders under the data root that its scenes may lie in, in the order in which they are looked for
     parents: tuple[str, ...]
-    source: str
+    source: str  # where it comes from
 
 
 @dataclass(frozen=True, kw_only=True)
 class PaperScene:
-    """One capture.
+    """One capture."""
 
-    Attributes:
-        name: its name here, in results and on the command line, and of its file.
-        dataset: its dataset, by its key in `DATASETS`.
-        order: its place among the scenes of the dataset.
-        folder: its folder's name.
-        images: the folder with its photographs; None where the capture's list says.
-        shrunk: how much smaller those photographs are than the camera model's images, as published (images_4 is 4).
-        n_images: photographs with a known camera.
-        size: width and height of these photographs, px.
-        factors: the scales that have it, each with what the photographs are shrunk by after they were read.
-        verified: whether count and size were compared with the photographs.
-        source: where it comes from, where that is not the dataset's.
-        note: what it is, where its name does not tell.
-        centred: whether Inria's rasterizer, which puts the principal point in the middle of the image, may draw it.
-    """
-
-    name: str
-    dataset: str
-    order: int
-    folder: str
-    images: str | None = None
-    shrunk: int
-    n_images: int
-    size: tuple[int, int]
+    name: str  # its name here, in results and on the command line, and of its file
+    dataset: str  # its dataset, by its key in `DATASETS`
+    order: int  # its place among the scenes of the dataset
+    folder: str  # its folder's name
+    images: str | None = None  # the folder with its photographs; None where the capture's list says
+    shrunk: int  # how much smaller those photographs are than the camera model's images, as published (images_4 is 4)
+    n_images: int  # photographs with a known camera
+    size: tuple[int, int]  # width and height of these photographs, px
+    # the scales that have it, each with what the photographs are shrunk by after they were read
     factors: Mapping[str, int]
-    verified: bool = False
-    source: str = ""
-    note: str = ""
+    verified: bool = False  # whether count and size were compared with the photographs
+    source: str = ""  # where it comes from, where that is not the dataset's
+    note: str = ""  # what it is, where its name does not tell
+    # whether Inria's rasterizer, which puts the principal point in the middle of the image, may draw it
     centred: bool = True
 
     @property
@@ -210,32 +191,23 @@ def source_of(scene: PaperScene) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:
-    """How much of the published protocol a run follows.
+    """How much of the published protocol a run follows."""
 
-    Attributes:
-        name: its name in results and on the command line.
-        about: one sentence for people.
-        factors: its scenes, each with what its photographs are shrunk by after they were read, by the scenes' files.
-        steps_scaler: multiplies every step number of the method.
-        settings: what else differs from the method's own values, in the names of `pop_fast.train.TrainConfig`; those
-            of density control under "strategy.".
-        of_methods: what else differs for one method alone, likewise.
-        reset_every: steps between two resets, for the rows that have resets, and the step after which large Gaussians
-            are pruned, for the rows that prune them; None leaves both as the scaled schedule has them, no sooner than
-            3,000 steps.
-        log_every: steps between two points of the curves.
-        checkpoint_every: steps that a kill can cost.
-    """
-
-    name: str
-    about: str
+    name: str  # its name in results and on the command line
+    about: str  # one sentence for people
+    # its scenes, each with what its photographs are shrunk by after they were read, by the scenes' files
     factors: Mapping[str, int]
-    steps_scaler: float = 1.0
+    steps_scaler: float = 1.0  # multiplies every step number of the method
+    # what else differs from the method's own values, in the names of `pop_fast.train.TrainConfig`; those of density
+    # control under "strategy."
     settings: Mapping[str, Any] = field(default_factory=dict)
+    # what else differs for one method alone, likewise
     of_methods: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    # steps between two resets, for the rows that have resets, and the step after which large Gaussians are pruned, for
+    # the rows that prune them; None leaves both as the scaled schedule has them, no sooner than 3,000 steps
     reset_every: int | None = None
-    log_every: int = 100
-    checkpoint_every: int = 500
+    log_every: int = 100  # steps between two points of the curves
+    checkpoint_every: int = 500  # steps that a kill can cost
 
 
 def _factors(scale: str) -> dict[str, int]:

@@ -197,17 +197,11 @@ class Reading:
 
 
 class Column(NamedTuple):
-    """A number that the tables print for two rows, or for the windows of table 4.
+    """A number that the tables print for two rows, or for the windows of table 4."""
 
-    Attributes:
-        rows: that it is made of; what a reading is judged by has to hold without any one of these.
-        quantity: what of them.
-        printed: by data set.
-    """
-
-    rows: tuple[str, ...]
-    quantity: str
-    printed: tuple[float, ...]
+    rows: tuple[str, ...]  # that it is made of; what a reading is judged by has to hold without any one of these
+    quantity: str  # what of them
+    printed: tuple[float, ...]  # by data set
 
     def apart(self, value: float) -> float:
         """Give how far a value lies from the range of the data sets; 0 within it."""
@@ -216,21 +210,13 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True)
 class Answer:
-    """What the runs say of one question.
+    """What the runs say of one question."""
 
-    Attributes:
-        id: of the question.
-        asks: the question.
-        says: the answer in a sentence.
-        head: of its table.
-        lines: by scene and row.
-    """
-
-    id: str
-    asks: str
-    says: str
-    head: tuple[str, ...]
-    lines: tuple[tuple[str, ...], ...]
+    id: str  # of the question
+    asks: str  # the question
+    says: str  # the answer in a sentence
+    head: tuple[str, ...]  # of its table
+    lines: tuple[tuple[str, ...], ...]  # by scene and row
 
 
 READINGS: Final = (

@@ -15,8 +15,7 @@ from typing import Final
 from paper_repro.jobs import added_rows
 from paper_repro.paper import Metric, NotComparable, Paper, PaperTable, paper, places
 from paper_repro.results import Result, most_timed_on
-from paper_repro.scenes import SCALES
-from pop_fast.errors import PopError
+from paper_repro.scenes import SCALES, scale_named
 
 # what a scale is meant to train; results of further scenes are shown too
 SCENES_OF: Final = {name: tuple(scale.factors) for name, scale in SCALES.items() if name != "paper"}
@@ -40,48 +39,28 @@ SEE_MAIN: Final = "see tables 1 and 2"
 
 @dataclass(frozen=True)
 class Cell:
-    """One number of ours with one of the paper's; every text says something.
+    """One number of ours with one of the paper's; every text says something."""
 
-    Attributes:
-        value: ours; None where there is none.
-        spread: sample standard deviation over the seeds; None with fewer than two.
-        ours: as printed, or why there is none.
-        paper: the paper's as printed, or why there is none.
-        difference: ours less the paper's, or why there is none.
-        place: of ours among the best of its column, 0 without.
-        paper_place: as the paper colours it.
-        is_ranked: whether ours may have a place.
-    """
-
-    value: float | None
-    spread: float | None
-    ours: str
-    paper: str
-    difference: str
-    place: int = 0
-    paper_place: int = 0
-    is_ranked: bool = True
+    value: float | None  # ours; None where there is none
+    spread: float | None  # sample standard deviation over the seeds; None with fewer than two
+    ours: str  # as printed, or why there is none
+    paper: str  # the paper's as printed, or why there is none
+    difference: str  # ours less the paper's, or why there is none
+    place: int = 0  # of ours among the best of its column, 0 without
+    paper_place: int = 0  # as the paper colours it
+    is_ranked: bool = True  # whether ours may have a place
 
 
 @dataclass(frozen=True)
 class Line:
-    """One method or ablation.
+    """One method or ablation."""
 
-    Attributes:
-        row: its configuration.
-        name: as the paper prints it.
-        cells: by metric.
-        seeds: how many seeds every scene has; 0 without runs.
-        missing: scenes without a run.
-        runs: "scene seed id" of every run in it.
-    """
-
-    row: str
-    name: str
-    cells: Mapping[str, Cell]
-    seeds: int
-    missing: tuple[str, ...]
-    runs: tuple[str, ...]
+    row: str  # its configuration
+    name: str  # as the paper prints it
+    cells: Mapping[str, Cell]  # by metric
+    seeds: int  # how many seeds every scene has; 0 without runs
+    missing: tuple[str, ...]  # scenes without a run
+    runs: tuple[str, ...]  # "scene seed id" of every run in it
 
 
 @dataclass(frozen=True)
@@ -96,27 +75,16 @@ class Block:
 
 @dataclass(frozen=True)
 class Table:
-    """A table with everything that has to be said about it.
+    """A table with everything that has to be said about it."""
 
-    Attributes:
-        name: "table 1" to "table 5", or "beyond".
-        scale: of the runs.
-        title: what it is about.
-        header: sentences that stand above it; the first says whether this is the paper's protocol.
-        metrics: its columns.
-        blocks: one a data set or capture.
-        ratios: ratios to one line, with the paper's; None at scale "paper".
-        remarks: what of the paper's numbers in it cannot be compared, by label.
-    """
-
-    name: str
-    scale: str
-    title: str
-    header: tuple[str, ...]
-    metrics: tuple[Metric, ...]
-    blocks: tuple[Block, ...]
-    ratios: Block | None
-    remarks: Mapping[str, str]
+    name: str  # "table 1" to "table 5", or "beyond"
+    scale: str  # of the runs
+    title: str  # what it is about
+    header: tuple[str, ...]  # sentences that stand above it; the first says whether this is the paper's protocol
+    metrics: tuple[Metric, ...]  # its columns
+    blocks: tuple[Block, ...]  # one a data set or capture
+    ratios: Block | None  # ratios to one line, with the paper's; None at scale "paper"
+    remarks: Mapping[str, str]  # what of the paper's numbers in it cannot be compared, by label
 
 
 def table(number: int, scale: str, results: Iterable[Result], absent: Iterable[str] = ()) -> Table:
@@ -186,9 +154,8 @@ def setting(result: Result, name: str) -> float | None:
 
 
 def _of_scale(scale: str, results: Iterable[Result]) -> list[Result]:
-    if scale not in SCALES:
-        raise PopError(f"scale is '{scale}'; it must be one of {', '.join(SCALES)}")
-    return [r for r in results if r.scale == scale]
+    known = scale_named(scale).name
+    return [r for r in results if r.scale == known]
 
 
 def _groups(scale: str, found: Sequence[Result], datasets: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:

@@ -61,41 +61,24 @@ class BusyError(PopError):
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """How a row is trained, none of which changes what it is.
+    """How a row is trained, none of which changes what it is."""
 
-    Attributes:
-        data: the folder that holds the scenes.
-        results: the folder of results.
-        work: the folder of checkpoints; what is in it for a row can be removed once the row is finished.
-        threads: CPU threads; 0 takes all cores.
-        backend: as `pop train --backend`.
-        checkpoint_every: steps that a kill can cost; None takes the scale's.
-        log_every: steps between two points of the curve; None takes the scale's.
-        lpips_vgg: weights of LPIPS on VGG16.
-        lpips_alex: weights of LPIPS on AlexNet.
-        published: the folder of what finished rows leave to be published; None takes "published" in the work folder.
-        again: train a row that is finished again, and replace its result.
-        keep_ply: keep the Gaussians in the work folder.
-        keep_checkpoints: keep the checkpoints too.
-        untimed: its seconds are not compared, because the machine has other work meanwhile.
-        quiet: no progress bar.
-    """
-
-    data: Path
-    results: Path = results.RESULTS
-    work: Path = WORK
-    threads: int = 1
-    backend: str = "auto"
-    checkpoint_every: int | None = None
-    log_every: int | None = None
-    lpips_vgg: tuple[str, ...] = ()
-    lpips_alex: tuple[str, ...] = ()
+    data: Path  # the folder that holds the scenes
+    results: Path = results.RESULTS  # the folder of results
+    work: Path = WORK  # the folder of checkpoints; what is in it for a row can be removed once the row is finished
+    threads: int = 1  # CPU threads; 0 takes all cores
+    backend: str = "auto"  # as `pop train --backend`
+    checkpoint_every: int | None = None  # steps that a kill can cost; None takes the scale's
+    log_every: int | None = None  # steps between two points of the curve; None takes the scale's
+    lpips_vgg: tuple[str, ...] = ()  # weights of LPIPS on VGG16
+    lpips_alex: tuple[str, ...] = ()  # weights of LPIPS on AlexNet
+    # the folder of what finished rows leave to be published; None takes "published" in the work folder
     published: Path | None = None
-    again: bool = False
-    keep_ply: bool = False
-    keep_checkpoints: bool = False
-    untimed: bool = False
-    quiet: bool = False
+    again: bool = False  # train a row that is finished again, and replace its result
+    keep_ply: bool = False  # keep the Gaussians in the work folder
+    keep_checkpoints: bool = False  # keep the checkpoints too
+    untimed: bool = False  # its seconds are not compared, because the machine has other work meanwhile
+    quiet: bool = False  # no progress bar
 
 
 def finished(job: Job, folder: Path) -> Result | None:

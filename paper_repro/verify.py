@@ -49,23 +49,15 @@ train_row(job_named(*asked["job"]), Options(**places, **how))
 
 @dataclass(frozen=True)
 class Verification:
-    """What came out.
+    """What came out."""
 
-    Attributes:
-        kind: what of the machine is another; empty on the same kind.
-        points: points of the curve that were compared.
-        steps: that were trained.
-        finished: whether those are all, so that the end was compared too.
-        differences: what came out otherwise, each with the result's value; empty where the result is confirmed.
-        begun: another commit, which took the result's first steps; None where its own took all.
-    """
-
-    kind: tuple[str, ...]
-    points: int
-    steps: int
-    finished: bool
+    kind: tuple[str, ...]  # what of the machine is another; empty on the same kind
+    points: int  # points of the curve that were compared
+    steps: int  # that were trained
+    finished: bool  # whether those are all, so that the end was compared too
+    # what came out otherwise, each with the result's value; empty where the result is confirmed
     differences: tuple[str, ...]
-    begun: str | None = None
+    begun: str | None = None  # another commit, which took the result's first steps; None where its own took all
 
 
 def verify(job: Job, options: Options, steps: int | None = None) -> Verification:

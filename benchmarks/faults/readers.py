@@ -55,24 +55,16 @@ from pop_ref.learn.student import borrowing, read_work
 
 @dataclass(frozen=True)
 class Reader:
-    """A reader.
+    """A reader."""
 
-    Attributes:
-        root: what of the corpus it is given, a file or a folder; copied for it.
-        file: that is mutated, relative to the root; "" is the root itself.
-        read: given the copy.
-        layer: what lies around the content: "gzip", "zip" and "glb" are also taken off, and put on again with sound
-            checksums and lengths.
-        finite: whether all tensors that it returns must be.
-        refuses: whether it refuses anything; some do without what is damaged.
-    """
-
-    root: str
-    file: str
-    read: Callable[[Path], Any]
+    root: str  # what of the corpus it is given, a file or a folder; copied for it
+    file: str  # that is mutated, relative to the root; "" is the root itself
+    read: Callable[[Path], Any]  # given the copy
+    # what lies around the content: "gzip", "zip" and "glb" are also taken off, and put on again with sound checksums
+    # and lengths
     layer: Literal["plain", "gzip", "zip", "glb", "text"] = "plain"
-    finite: bool = False
-    refuses: bool = True
+    finite: bool = False  # whether all tensors that it returns must be
+    refuses: bool = True  # whether it refuses anything; some do without what is damaged
 
 
 def _splat(path: Path) -> dict[str, torch.Tensor]:

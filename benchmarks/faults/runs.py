@@ -56,17 +56,11 @@ TOLD = 2
 
 @dataclass(frozen=True)
 class Kind:
-    """A way to start a run.
+    """A way to start a run."""
 
-    Attributes:
-        words: further ones of `pop train`.
-        ranks: processes that train together.
-        stepper: what must have taken the steps.
-    """
-
-    words: tuple[str, ...]
-    ranks: int
-    stepper: str | None
+    words: tuple[str, ...]  # further ones of `pop train`
+    ranks: int  # processes that train together
+    stepper: str | None  # what must have taken the steps
 
 
 KINDS: Final = {
@@ -78,19 +72,12 @@ KINDS: Final = {
 
 @dataclass(frozen=True)
 class UndisturbedRun:
-    """What is trained and how, and what a run of it that nobody disturbs ends with.
+    """What is trained and how, and what a run of it that nobody disturbs ends with."""
 
-    Attributes:
-        kind: how runs are started.
-        capture: the folder of photographs.
-        folder: where runs write.
-        whole: what a run ends with; of ranks, one process that draws all views.
-    """
-
-    kind: Kind
-    capture: Path
-    folder: Path
-    whole: dict[str, Any]
+    kind: Kind  # how runs are started
+    capture: Path  # the folder of photographs
+    folder: Path  # where runs write
+    whole: dict[str, Any]  # what a run ends with; of ranks, one process that draws all views
 
     def train(self, name: str, *more: str, threads: int = 1) -> int:
         """Call `pop train` in this process, which is one of `kind.ranks`, and return its status."""

@@ -8,7 +8,6 @@ a child, which is this module run by its name.
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import shutil
 import subprocess
@@ -22,6 +21,7 @@ import torch
 
 import cuda_ext
 import pop_fast.compiled
+from benchmarks.record import lines_run
 from cuda_ext.host import emulate
 from cuda_ext.toolkit import find_compiler
 from pop_fast import rasterization
@@ -51,23 +51,14 @@ LEAST_SHARE: Final = 0.5
 
 @dataclass(frozen=True)
 class Check:
-    """A library under sanitizers, and the tests that use it.
+    """A library under sanitizers, and the tests that use it."""
 
-    Attributes:
-        units: what it is made of.
-        sources: all that its text depends on.
-        flags: of the compiler.
-        runtime: the sanitizers' library, which must be loaded before all others.
-        use: what the child does with it, told the library by `POP_SANITIZED`.
-        about: the sanitizers, in words.
-    """
-
-    units: tuple[Path, ...]
-    sources: tuple[Path, ...]
-    flags: tuple[str, ...]
-    runtime: str
-    use: str
-    about: str
+    units: tuple[Path, ...]  # what it is made of
+    sources: tuple[Path, ...]  # all that its text depends on
+    flags: tuple[str, ...]  # of the compiler
+    runtime: str  # the sanitizers' library, which must be loaded before all others
+    use: str  # what the child does with it, told the library by `POP_SANITIZED`
+    about: str  # the sanitizers, in words
 
     @property
     def library(self) -> Path:
@@ -192,15 +183,9 @@ def _lines(check: Check) -> dict[str, tuple[int, int]]:
     found: dict[str, tuple[int, int]] = {}
     for unit in check.units:
         counted = [path.name for path in folder.glob(f"*-{unit.stem}.gcda")]
-        asked = [program, "--json-format", "--stdout", *counted]
-        done = subprocess.run(asked, capture_output=True, text=True, check=False, cwd=folder)
-        # a line of a template is counted once for each type that it is made for
-        ran: dict[int, bool] = {}
-        for text in done.stdout.splitlines():
-            for file in json.loads(text)["files"]:
-                for line in file["lines"] if Path(file["file"]).name == unit.name else ():
-                    ran[line["line_number"]] = ran.get(line["line_number"], False) or line["count"] > 0
-        found[str(unit.relative_to(ROOT))] = (sum(ran.values()), len(ran)) if ran else (0, 1)
+        lines = lines_run(program, folder, counted)
+        ran = [run for (path, _), run in lines.items() if path.name == unit.name]
+        found[str(unit.relative_to(ROOT))] = (sum(ran), len(ran)) if ran else (0, 1)
     return found
 
 

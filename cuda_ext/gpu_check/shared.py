@@ -160,15 +160,10 @@ MARGIN = 3.0  # seconds that are kept for writing down the end
 
 @dataclass(frozen=True)
 class Share:
-    """What a stage gets.
+    """What a stage gets."""
 
-    Attributes:
-        least: seconds that earlier stages leave to it.
-        most: seconds that it may take where there are more.
-    """
-
-    least: float
-    most: float
+    least: float  # seconds that earlier stages leave to it
+    most: float  # seconds that it may take where there are more
 
 
 class Budget:
@@ -199,33 +194,19 @@ NOTHING: Mapping[str, str] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class StageContext:
-    """What the stages share.
+    """What the stages share."""
 
-    Attributes:
-        seconds: that this stage may take.
-        out: the folder of results.
-        work: a folder for what is not brought back.
-        log: what commands say goes there.
-        packed: what was brought along (`--pack`), if anything.
-        captures: folders to train on, besides those that were packed.
-        steps_scaler: of the paper's 30,000 steps.
-        commit: names trainings that may be resumed.
-        rehearsal: the emulator takes the GPU's place, with tiny cases.
-        note: keeps what a stage has found so far.
-        beside: commands that run along with the stages, by name.
-    """
-
-    seconds: float
-    out: Path
-    work: Path
-    log: Path
-    packed: Path | None
-    captures: tuple[Path, ...]
-    steps_scaler: float
-    commit: str
-    rehearsal: bool
-    note: Callable[[dict[str, Any]], None]
-    beside: dict[str, Command] = field(default_factory=dict)
+    seconds: float  # that this stage may take
+    out: Path  # the folder of results
+    work: Path  # a folder for what is not brought back
+    log: Path  # what commands say goes there
+    packed: Path | None  # what was brought along (`--pack`), if anything
+    captures: tuple[Path, ...]  # folders to train on, besides those that were packed
+    steps_scaler: float  # of the paper's 30,000 steps
+    commit: str  # names trainings that may be resumed
+    rehearsal: bool  # the emulator takes the GPU's place, with tiny cases
+    note: Callable[[dict[str, Any]], None]  # keeps what a stage has found so far
+    beside: dict[str, Command] = field(default_factory=dict)  # commands that run along with the stages, by name
 
     @property
     def site(self) -> Path:

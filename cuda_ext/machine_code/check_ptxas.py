@@ -32,24 +32,15 @@ _SHARED = re.compile(r"(\d+) bytes smem")
 
 @dataclass(frozen=True)
 class KernelUse:
-    """What ptxas says of one kernel on one architecture.
+    """What ptxas says of one kernel on one architecture."""
 
-    Attributes:
-        file: source file.
-        kernel: name with template arguments, demangled where c++filt is found.
-        arch: for example sm_90.
-        registers: per thread.
-        shared: static shared memory, bytes.
-        stack: frame, bytes.
-        spill_stores, spill_loads: bytes.
-    """
-
-    file: str
-    kernel: str
-    arch: str
-    registers: int
-    shared: int
-    stack: int
+    file: str  # source file
+    kernel: str  # name with template arguments, demangled where c++filt is found
+    arch: str  # for example sm_90
+    registers: int  # per thread
+    shared: int  # static shared memory, bytes
+    stack: int  # frame, bytes
+    # bytes
     spill_stores: int
     spill_loads: int
 

@@ -272,21 +272,13 @@ def class_of(opcode: str) -> str:
 
 @dataclass(frozen=True)
 class Instruction:
-    """One instruction.
+    """One instruction."""
 
-    Attributes:
-        address: bytes from the kernel's begin.
-        predicate: for example "P0" or "!P0", "" where it is always executed.
-        opcode: with modifiers.
-        operands: as printed.
-        frames: source lines, innermost first, the kernel's own last.
-    """
-
-    address: int
-    predicate: str
-    opcode: str
-    operands: str
-    frames: tuple[Frame, ...] = ()
+    address: int  # bytes from the kernel's begin
+    predicate: str  # for example "P0" or "!P0", "" where it is always executed
+    opcode: str  # with modifiers
+    operands: str  # as printed
+    frames: tuple[Frame, ...] = ()  # source lines, innermost first, the kernel's own last
 
     @property
     def target(self) -> str:
@@ -416,25 +408,16 @@ class Region:
 
 @dataclass
 class Loop:
-    """One loop.
+    """One loop."""
 
-    Attributes:
-        header: its first block.
-        blocks: all of its blocks, inner loops among them.
-        depth: loops around it.
-        frames: source lines of its backward branch, innermost first, then those of its other instructions.
-        always: what every iteration issues, by class.
-        regions: what an iteration may jump over.
-        exponentials: how many exp2 it holds, for a lane.
-    """
-
-    header: int
-    blocks: set[int]
-    depth: int = 0
+    header: int  # its first block
+    blocks: set[int]  # all of its blocks, inner loops among them
+    depth: int = 0  # loops around it
+    # source lines of its backward branch, innermost first, then those of its other instructions
     frames: list[Frame] = field(default_factory=list)
-    always: Counter[str] = field(default_factory=Counter)
-    regions: list[Region] = field(default_factory=list)
-    exponentials: int = 0
+    always: Counter[str] = field(default_factory=Counter)  # what every iteration issues, by class
+    regions: list[Region] = field(default_factory=list)  # what an iteration may jump over
+    exponentials: int = 0  # how many exp2 it holds, for a lane
 
     @property
     def total(self) -> Counter[str]:

@@ -103,20 +103,14 @@ class Project(torch.autograd.Function):
 
 @dataclass(frozen=True)
 class RenderStats:
-    """What the telling instantiation of the blend found; ids index the rows that were blended.
+    """What the telling instantiation of the blend found; ids index the rows that were blended."""
 
-    Attributes:
-        dominant_ids: int32, -1 where none. [H, W]
-        dominant_weights: [H, W]
-        n_blended, n_traversed: int32. [H, W]
-        dominant_counts: int32. [N]
-    """
-
-    dominant_ids: Tensor
-    dominant_weights: Tensor
+    dominant_ids: Tensor  # int32, -1 where none. [H, W]
+    dominant_weights: Tensor  # [H, W]
+    # int32. [H, W]
     n_blended: Tensor
     n_traversed: Tensor
-    dominant_counts: Tensor
+    dominant_counts: Tensor  # int32. [N]
 
 
 class BlendBuffers:

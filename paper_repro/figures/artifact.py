@@ -22,6 +22,7 @@ from paper_repro.jobs import Job, job_named
 from paper_repro.results import Result
 from paper_repro.scenes import MADE, SCENES, find_folder
 from paper_repro.train_row import Options, capture_folder, load_capture_of, train_row
+from pop_fast.density.protocol import Strategy
 from pop_fast.errors import PopError
 
 if TYPE_CHECKING:
@@ -45,23 +46,14 @@ _FOLDER: Final = "figure_3"
 
 @dataclass(frozen=True)
 class Panel:
-    """One map of the figure.
+    """One map of the figure."""
 
-    Attributes:
-        letter: its place.
-        key: its name in the table.
-        title: as written.
-        values: mean over the channels. [H, W]
-        unit: of the values.
-        correlation: with the error map over the pixels; None where a map is constant, or is that map.
-    """
-
-    letter: str
-    key: str
-    title: str
-    values: np.ndarray
-    unit: str
-    correlation: float | None
+    letter: str  # its place
+    key: str  # its name in the table
+    title: str  # as written
+    values: np.ndarray  # mean over the channels. [H, W]
+    unit: str  # of the values
+    correlation: float | None  # with the error map over the pixels; None where a map is constant, or is that map
 
 
 def six_panels(asked: Asked) -> Drawn:
@@ -158,29 +150,14 @@ def _table(found: Pushed, maps: list[Panel], mse: float) -> tuple[list[str], lis
 
 
 @dataclass(frozen=True)
-class OpacityOne:
-    """A strategy by gsplat's protocol that leaves the Gaussians alone and pulls every opacity to 1.
+class OpacityOne(Strategy):
+    """A strategy by gsplat's protocol that leaves the Gaussians alone and pulls every opacity to 1."""
 
-    Attributes:
-        weight: of the mean of 1 - o in the loss.
-    """
-
-    weight: float = WEIGHT
-
-    def check_sanity(self, params: Any, optimizers: Any) -> None:
-        """See `pop_fast.density.Strategy`; any parameters will do."""
+    weight: float = WEIGHT  # of the mean of 1 - o in the loss
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """See `pop_fast.density.Strategy`; nothing is remembered."""
         return {}
-
-    def step_pre_backward(self, params: Any, optimizers: Any, state: Any, step: int, info: Any) -> None:
-        """See `pop_fast.density.Strategy`."""
-
-    def step_post_backward(
-        self, params: Any, optimizers: Any, state: Any, step: int, info: Any, packed: bool = False
-    ) -> None:
-        """See `pop_fast.density.Strategy`; the Gaussians stay."""
 
     def regularizer(self, opacities: Tensor, state: Any, step: int, info: Any) -> Tensor:
         """Return the term that is added to the loss."""
@@ -189,21 +166,13 @@ class OpacityOne:
 
 @dataclass(frozen=True)
 class Pushed:
-    """The trained Gaussians, and one held-out view of them.
+    """The trained Gaussians, and one held-out view of them."""
 
-    Attributes:
-        base: the 3DGS run that they come from.
-        image: the render. [H, W, 3]
-        photo: the photograph. [H, W, 3]
-        view: its name.
-        opacities: of the Gaussians. [N]
-    """
-
-    base: Result
-    image: torch.Tensor
-    photo: torch.Tensor
-    view: str
-    opacities: torch.Tensor
+    base: Result  # the 3DGS run that they come from
+    image: torch.Tensor  # the render. [H, W, 3]
+    photo: torch.Tensor  # the photograph. [H, W, 3]
+    view: str  # its name
+    opacities: torch.Tensor  # of the Gaussians. [N]
 
 
 def pushed(asked: Asked) -> Pushed:

@@ -31,21 +31,13 @@ class NoDataError(PopError):
 
 @dataclass(frozen=True)
 class Asked:
-    """What is to be drawn, and of what.
+    """What is to be drawn, and of what."""
 
-    Attributes:
-        figure: its number in the paper.
-        scale: of the results.
-        results: all of that scale.
-        work: the folder of checkpoints, with the renders of finished rows.
-        data: the folder that holds the scenes.
-    """
-
-    figure: str
-    scale: str
-    results: Sequence[Result]
-    work: Path
-    data: Path
+    figure: str  # its number in the paper
+    scale: str  # of the results
+    results: Sequence[Result]  # all of that scale
+    work: Path  # the folder of checkpoints, with the renders of finished rows
+    data: Path  # the folder that holds the scenes
 
     def scenes(self, of_paper: Sequence[str]) -> tuple[str, ...]:
         """Return the scenes that the figure is of: the paper's, or all of a scale that has others."""
@@ -54,19 +46,13 @@ class Asked:
 
 @dataclass(frozen=True)
 class Chosen:
-    """The results that a figure shows.
+    """The results that a figure shows."""
 
-    Attributes:
-        runs: by row and scene, one or more seeds each; every row has every scene.
-        scenes: that all of them have.
-        missing: rows that have none of them.
-        left_out: scenes of the figure that not all rows have.
-    """
-
+    # by row and scene, one or more seeds each; every row has every scene
     runs: Mapping[str, Mapping[str, tuple[Result, ...]]]
-    scenes: tuple[str, ...]
-    missing: tuple[str, ...]
-    left_out: tuple[str, ...]
+    scenes: tuple[str, ...]  # that all of them have
+    missing: tuple[str, ...]  # rows that have none of them
+    left_out: tuple[str, ...]  # scenes of the figure that not all rows have
 
     def of(self, row: str) -> list[Result]:
         """Return all runs of a row."""

@@ -31,23 +31,14 @@ _BOX: Final = "#E1261C"
 
 @dataclass(frozen=True)
 class ComparedView:
-    """One held-out view of a scene.
+    """One held-out view of a scene."""
 
-    Attributes:
-        scene: its name.
-        name: of the photograph.
-        photo: uint8 [H, W, 3]
-        renders: by row, uint8 [H, W, 3]
-        psnr: of this view, by row, dB.
-        box: x, y and side of the square in which the renders differ most, px.
-    """
-
-    scene: str
-    name: str
-    photo: np.ndarray
-    renders: dict[str, np.ndarray]
-    psnr: dict[str, float]
-    box: tuple[int, int, int]
+    scene: str  # its name
+    name: str  # of the photograph
+    photo: np.ndarray  # uint8 [H, W, 3]
+    renders: dict[str, np.ndarray]  # by row, uint8 [H, W, 3]
+    psnr: dict[str, float]  # of this view, by row, dB
+    box: tuple[int, int, int]  # x, y and side of the square in which the renders differ most, px
 
 
 def renders_and_photographs(asked: Asked) -> Drawn:

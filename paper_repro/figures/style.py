@@ -23,7 +23,7 @@ from paper_repro.figures.data import Asked, Chosen
 from paper_repro.jobs import ROWS
 from paper_repro.results import Result
 from paper_repro.scenes import scale_named
-from pop_fast.io.atomic import write_atomically
+from pop_fast.io.atomic import write_atomically, write_file
 
 if TYPE_CHECKING:
     import numpy as np
@@ -248,17 +248,11 @@ def darker(color: str) -> str:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure and the numbers behind it.
+    """A figure and the numbers behind it."""
 
-    Attributes:
-        figure: the picture.
-        columns: of the table.
-        rows: its lines; numbers are written unrounded.
-    """
-
-    figure: Figure
-    columns: Sequence[str]
-    rows: Sequence[Sequence[Any]]
+    figure: Figure  # the picture
+    columns: Sequence[str]  # of the table
+    rows: Sequence[Sequence[Any]]  # its lines; numbers are written unrounded
 
 
 class Sheet:
@@ -325,7 +319,7 @@ def save(drawn: Drawn, stem: Path) -> list[Path]:
     said = {"Software": None, "Source": f"sha256:{hashlib.sha256(numbers).hexdigest()}"}
     more: dict[str, Any] = {"metadata": said, "pil_kwargs": {"optimize": True}}
     write_atomically(paths[1], partial(drawn.figure.savefig, format="png", **more))
-    write_atomically(paths[-1], lambda file: file.write(numbers))
+    write_file(paths[-1], numbers)
     return paths
 
 

@@ -20,28 +20,14 @@ Cited = tuple[Any, str]
 
 @dataclass(frozen=True, kw_only=True)
 class Pinned:
-    """A method's table; every value names the place that it is from.
+    """A method's table; every value names the place that it is from."""
 
-    Attributes:
-        method: its name for `pop train --method`.
-        sources: the code, and the commit, whose files and lines are meant.
-        settings: of a run of the whole schedule.
-        order: of what happens to the Gaussians, by kind of step.
-        rows: in which settings a row differs from the method, by row.
-        scenes: in which settings a scene of the paper does, by scene.
-    """
-
-    method: str
-    sources: tuple[str, ...]
-    settings: Mapping[str, Cited]
-    order: Mapping[str, Cited]
-    rows: Mapping[str, Mapping[str, Cited]]
-    scenes: Mapping[str, Mapping[str, Cited]]
-
-
-def pinned_methods() -> list[str]:
-    """List the methods that have a table."""
-    return sorted(path.stem for path in FOLDER.glob("*.toml"))
+    method: str  # its name for `pop train --method`
+    sources: tuple[str, ...]  # the code, and the commit, whose files and lines are meant
+    settings: Mapping[str, Cited]  # of a run of the whole schedule
+    order: Mapping[str, Cited]  # of what happens to the Gaussians, by kind of step
+    rows: Mapping[str, Mapping[str, Cited]]  # in which settings a row differs from the method, by row
+    scenes: Mapping[str, Mapping[str, Cited]]  # in which settings a scene of the paper does, by scene
 
 
 def load_pinned(method: str) -> Pinned:

@@ -54,7 +54,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from pop_fast.data.capture import Capture, Listing, SparsePoints
+from pop_fast.data.capture import Capture, Listing, SparsePoints, principal_axes
 from pop_fast.data.load import in_picture, write_block
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_json
@@ -387,8 +387,9 @@ def divide(centers: np.ndarray, grid: tuple[int, int]) -> Partition:
     if len(centers) < k * l:
         raise PopError(f"--blocks {k}x{l} needs {k * l} training views or more, and there are {len(centers)}")
     origin = centers.mean(axis=0)
-    axes = _principal(centers - origin)
-    ground = (centers - origin) @ axes.T
+    offsets = centers - origin
+    axes = principal_axes(offsets.T @ offsets)[:2]
+    ground = offsets @ axes.T
     strips = _borders(ground[:, 0], k)
     strip = np.searchsorted(strips, ground[:, 0], side="right")
     short = np.flatnonzero(np.bincount(strip, minlength=k) < l)
@@ -405,16 +406,6 @@ def divide(centers: np.ndarray, grid: tuple[int, int]) -> Partition:
         f"--blocks {k}x{l}: block {empty} has no training view, because too many cameras stand at one place on the "
         "ground; ask for fewer blocks, or for other numbers of strips and cores"
     )
-
-
-def _principal(offsets: np.ndarray) -> np.ndarray:
-    """Return the two directions of greatest spread, each with its largest entry positive. float64 [2, 3]"""
-    _, axes = np.linalg.eigh(offsets.T @ offsets)
-    chosen = axes.T[::-1][:2].copy()
-    for row in chosen:
-        if row[np.argmax(np.abs(row))] < 0.0:
-            row *= -1.0
-    return chosen
 
 
 def _borders(values: np.ndarray, parts: int) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Final
 import tyro
 
 from pop_fast.cli import parse
-from pop_fast.io.atomic import file_atomically
+from pop_fast.io.atomic import write_file
 
 _EXAMPLES: Final = """
     pop learn start mine           write thirteen files to fill in
@@ -134,8 +134,7 @@ def _class(args: Class) -> int:
         grades.append((folder.name, _graded_apart(folder, args.seconds)))
         print(f"{folder.name}: {grades[-1][1].get('stopped') or grades[-1][1]['score']}", flush=True)
     out = args.out or args.folder / "report.md"
-    with file_atomically(out) as beside:
-        beside.write_text(class_report(grades), encoding="utf-8")
+    write_file(out, class_report(grades))
     print(f"the class -> {out}")
     return 0
 

@@ -261,7 +261,7 @@ def normalizing_transform(viewmats: np.ndarray, points: np.ndarray | None) -> np
     transform = _from_cameras(viewmats)
     if points is None or len(points) < 4:
         return transform
-    transform = _principal_axes(transform_points(transform, points)) @ transform
+    transform = _along_principal_axes(transform_points(transform, points)) @ transform
     heights = transform_points(transform, points)[:, 2]
     if np.median(heights) > np.mean(heights):
         transform = np.diag([1.0, -1.0, -1.0, 1.0]) @ transform
@@ -375,7 +375,17 @@ def _rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.eye(3) + skew + skew @ skew / (1.0 + cosine)
 
 
-def _principal_axes(points: np.ndarray) -> np.ndarray:
+def principal_axes(spread: np.ndarray) -> np.ndarray:
+    """Return the directions of falling spread, the first two with their largest entry positive. [3, 3] of [3, 3]"""
+    _, axes = np.linalg.eigh(spread)
+    found = axes.T[::-1].copy()
+    for row in found[:2]:
+        if row[np.argmax(np.abs(row))] < 0.0:
+            row *= -1.0
+    return found
+
+
+def _along_principal_axes(points: np.ndarray) -> np.ndarray:
     middle = np.median(points, axis=0)
     # the square of what is too far is no float
     farthest = float(np.abs(points - middle).max())
@@ -384,11 +394,7 @@ def _principal_axes(points: np.ndarray) -> np.ndarray:
             f"in units of the cameras' distance, points lie up to {farthest:.3g} from their middle, which cannot be "
             "normalized; correct the positions of cameras and points, or use --no-normalize"
         )
-    _, axes = np.linalg.eigh(np.cov(points - middle, rowvar=False))
-    rotation = axes.T[::-1].copy()
-    for row in rotation[:2]:
-        if row[np.argmax(np.abs(row))] < 0.0:
-            row *= -1.0
+    rotation = principal_axes(np.cov(points - middle, rowvar=False))
     rotation[2] = np.cross(rotation[0], rotation[1])
     return affine(rotation, -rotation @ middle)
 

@@ -97,15 +97,16 @@ def _file(arrays: dict[str, np.ndarray], antialiased: bool, frame: Frame | None)
         arrays["quats"],
     ]
     table = np.ascontiguousarray(np.concatenate(columns, axis=1), dtype="<f4")
-    return _header(n, antialiased, frame) + table.tobytes()
+    return header_bytes(antialiased, frame, ("vertex", n, "float", _COLUMNS)) + table.tobytes()
 
 
-def _header(n: int, antialiased: bool, frame: Frame | None) -> bytes:
+def header_bytes(antialiased: bool, frame: Frame | None, *elements: tuple[str, int, str, Sequence[str]]) -> bytes:
+    """Return a header; an element is its name, the number of its rows, their type and the names of its columns."""
     lines = ["ply", "format binary_little_endian 1.0", f"comment {MODE} {'mip' if antialiased else 'default'}"]
-    if frame is not None:
-        lines.append(f"comment {frame.comment()}")
-    lines += [f"element vertex {n}", *(f"property float {name}" for name in _COLUMNS), "end_header", ""]
-    return "\n".join(lines).encode("ascii")
+    lines += [] if frame is None else [f"comment {frame.comment()}"]
+    for name, n, kind, columns in elements:
+        lines += [f"element {name} {n}", *(f"property {kind} {column}" for column in columns)]
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
 
 
 def load_ply(path: str | os.PathLike[str]) -> dict[str, torch.Tensor]:

@@ -16,6 +16,7 @@ from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -512,7 +513,7 @@ def test_sizes_that_are_kept_keep_their_machine_and_steps(tmp_path: Path, monkey
     write_json(path, {"ply_bytes": 248, "captures": {"one": kept}})
     for name, made in (
         ("measured", lambda *_: {}),
-        ("resolved", lambda _: {"data": "two"}),
+        ("read_config", lambda _: SimpleNamespace(data="two")),
         ("within_budgets", lambda *_: iter([{"psnr": 30.0}])),
         ("machine", lambda: {"cpu": "new"}),
     ):

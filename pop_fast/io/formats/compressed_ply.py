@@ -16,7 +16,7 @@ import numpy as np
 
 from pop_fast.errors import PopError
 from pop_fast.io.formats.cloud import SH_C0, Cloud, drop_largest, logits_of_bytes, restore_largest, to_bytes
-from pop_fast.io.ply import MODE, Frame, asks_for_antialiasing, header_of, read_header
+from pop_fast.io.ply import Frame, asks_for_antialiasing, header_bytes, header_of, read_header
 from pop_fast.io.read_back import WRITE_AGAIN
 
 _CHUNK: Final = 256
@@ -70,19 +70,10 @@ def encode(cloud: Cloud) -> bytes:
     words = [_packed_vector(shares[0]), _packed_rotation(cloud.quats), _packed_vector(shares[1]), color]
     flat = cloud.rest.transpose(0, 2, 1).reshape(n, 3 * cloud.rest.shape[1]).astype(np.float64)
     rest = np.clip(np.floor(_SH_STEPS * flat + 128.0), 0, 255).astype(np.uint8)
-    header = _header(cloud, len(chunks), flat.shape[1])
+    elements = [("chunk", len(chunks), "float", (*_RANGES, *_COLOR_RANGES)), ("vertex", n, "uint", _WORDS)]
+    elements += [("sh", n, "uchar", [f"f_rest_{i}" for i in range(flat.shape[1])])] if flat.shape[1] else []
+    header = header_bytes(cloud.antialiased, cloud.frame, *elements)
     return header + chunks.tobytes() + np.stack(words, axis=1).astype("<u4").tobytes() + rest.tobytes()
-
-
-def _header(cloud: Cloud, chunks: int, coefficients: int) -> bytes:
-    n = len(cloud)
-    lines = ["ply", "format binary_little_endian 1.0", f"comment {MODE} {'mip' if cloud.antialiased else 'default'}"]
-    lines += [] if cloud.frame is None else [f"comment {cloud.frame.comment()}"]
-    lines += [f"element chunk {chunks}", *(f"property float {name}" for name in (*_RANGES, *_COLOR_RANGES))]
-    lines += [f"element vertex {n}", *(f"property uint {name}" for name in _WORDS)]
-    if coefficients:
-        lines += [f"element sh {n}", *(f"property uchar f_rest_{i}" for i in range(coefficients))]
-    return "\n".join([*lines, "end_header", ""]).encode("ascii")
 
 
 def _in_chunks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -40,13 +40,12 @@ _OPAQUE: Final = 1.0 - 2.0**-24
 
 def encode(cloud: Cloud) -> bytes:
     """Write .glb with float32 attributes; the order of the Gaussians is kept."""
-    turned = cloud.turned("z")
-    return _glb(turned, {name: array.tobytes() for name, array in _attributes(turned).items()}, None)
+    return _glb(cloud.turned("z"), None)
 
 
 def encode_spz(cloud: Cloud, sh_step: float = spz.SH_STEP) -> bytes:
     """Write .glb with an SPZ stream, as `spz.encode` does; the order of the Gaussians is kept."""
-    return _glb(cloud.turned("z"), {}, spz.encode(replace(cloud, frame=None), version=2, sh_step=sh_step))
+    return _glb(cloud.turned("z"), spz.encode(replace(cloud, frame=None), version=2, sh_step=sh_step))
 
 
 def _attributes(turned: Cloud) -> dict[str, np.ndarray]:
@@ -66,8 +65,9 @@ def _attributes(turned: Cloud) -> dict[str, np.ndarray]:
     return {**found, "COLOR_0": to_bytes(255.0 * np.concatenate([rgb, opacities[:, None]], axis=1))}
 
 
-def _glb(turned: Cloud, data: Mapping[str, bytes], stream: bytes | None) -> bytes:
-    """Lay out a .glb file: the attributes' bytes, or a stream that holds their values."""
+def _glb(turned: Cloud, stream: bytes | None) -> bytes:
+    """Lay out a .glb file: with the attributes' bytes, or with a stream that holds their values."""
+    attributes = _attributes(turned)
     views: list[dict[str, int]] = []
     body = bytearray()
 
@@ -82,15 +82,16 @@ def _glb(turned: Cloud, data: Mapping[str, bytes], stream: bytes | None) -> byte
     if stream is not None:
         extension["extensions"] = {SPZ_NAME: {"bufferView": view(stream)}}
         used.append(SPZ_NAME)
-    for name, array in _attributes(turned).items():
+    for name, array in attributes.items():
         kind = {"componentType": _BYTE, "normalized": True} if array.dtype == np.uint8 else {"componentType": _FLOAT}
         accessor = {**kind, "count": len(turned), "type": _TYPES[array.shape[1]]}
         if name == "POSITION" and len(turned):
             accessor |= {"min": array.min(axis=0).tolist(), "max": array.max(axis=0).tolist()}
         # a buffer view may not be empty
-        accessors.append({"bufferView": view(data[name]), **accessor} if data.get(name) else accessor)
+        stored = stream is None and array.size
+        accessors.append({"bufferView": view(array.tobytes()), **accessor} if stored else accessor)
     primitive = {
-        "attributes": {name: index for index, name in enumerate(_attributes(turned))},
+        "attributes": {name: index for index, name in enumerate(attributes)},
         "mode": 0,
         "extensions": {NAME: extension},
     }

@@ -51,7 +51,7 @@ def read_result(folder: Path, capture: Path | None = None) -> ReportData:
     stats = read_last_stats(folder)
     method = METHODS[config.method].title
     histograms = list(_histograms(folder, config.max_steps))
-    dominant = _dominant(folder)
+    shown = [read_view(path) for path in _last_view_files(folder)]
     changes = [record for record in records if "cloned" in record or "reset" in record]
     curves, checks = _curves(records, folder), None
     measured = _numbered(folder / "report_data", r"checks_step(\d+)\.json")
@@ -71,8 +71,8 @@ def read_result(folder: Path, capture: Path | None = None) -> ReportData:
         windows=_windows(config),
         resets=[int(record["step"]) for record in changes if record.get("reset")],
         histograms=histograms,
-        dominant=dominant,
-        views=_views(folder, checks is not None),
+        dominant=next(((str(a["name"]), a["dominant_ids"], a["render"]) for a in shown if "dominant_ids" in a), None),
+        views=_views(shown, folder, checks is not None),
         n_held_out=stats.get("views"),
         config=_settings(config, folder),
         changes=[{key: change.get(key) for key in _CHANGE_COLUMNS} for change in changes],
@@ -311,24 +311,15 @@ def _histograms(folder: Path, max_steps: int) -> Iterator[Histogram]:
         yield Histogram(title, counts.reshape(-1, 2).sum(axis=1))
 
 
-def _views(folder: Path, checked: bool) -> list[ReportView]:
-    """Read the held-out views, the worst first; their depth was measured where the splat was checked."""
+def _views(shown: Sequence[Mapping[str, Any]], folder: Path, checked: bool) -> list[ReportView]:
+    """Order the held-out views, the worst first; their depth was measured where the splat was checked."""
     kept = (read_arrays(path, _DEPTH, _AGAIN) for path in _last_view_files(folder, "depth") if checked)
     depths = {str(found["name"]): found["depth"] for found in kept}
     views = []
-    for path in _last_view_files(folder):
-        a = read_view(path)
+    for a in shown:
         name = str(a["name"])
         views.append(ReportView(name, a["render"], a["photo"], float(a["psnr"]), float(a["ssim"]), depths.get(name)))
     return sorted(views, key=lambda view: (view.psnr is None, view.psnr))
-
-
-def _dominant(folder: Path) -> tuple[str, np.ndarray, np.ndarray] | None:
-    for path in _last_view_files(folder):
-        a = read_view(path)
-        if "dominant_ids" in a:
-            return str(a["name"]), a["dominant_ids"], a["render"]
-    return None
 
 
 def _last_view_files(folder: Path, kind: str = "val") -> list[Path]:
