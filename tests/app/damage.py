@@ -193,12 +193,13 @@ FORGED: dict[str, tuple[Callable[[Content], Any], tuple[str, ...]]] = {
     "a capture with a tensor": forged("capture.masks", torch.zeros(2), "capture.'masks' is Tensor; it must be a text"),
     "metrics negative": forged("metrics_bytes", -1, "metrics_bytes is -1"),
     "metrics in halves": forged("metrics_bytes", 1.5, "metrics_bytes is 1.5"),
-    "metrics beyond the file": forged("metrics_bytes", 2**40, "metrics.jsonl: has"),
+    "metrics beyond the file": forged("metrics_bytes", 2**40, "metrics.jsonl: has", "bytes, fewer than"),
     "no seconds": forged("seconds.total", GONE, "has no seconds.total"),
     "seconds NaN": forged("seconds.train", NAN, "seconds.train is nan"),
     "seconds in words": forged("seconds.train", "1", "seconds.train is '1'"),
     "no threads": forged("threads", 0, "threads is 0; it must be a whole number, at least 1"),
     "a format in words": forged("format", "1" * 1000, "has format '111", "this version reads format 1"),
+    "a newer format": forged("format", 99, "has format 99; this version reads format 1"),
     "no format": forged("format", GONE, "has no 'format'"),
 }
 

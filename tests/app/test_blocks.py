@@ -290,6 +290,7 @@ def test_parts_ask_for_what_comes_before_them(pop: Pop, result, blocks):
     [
         ("job.json", b"{}", "job.json: is not what 'pop train --blocks' writes"),
         ("job.json", b'{"blocks": "2x1", "colour": 3}', "job.json"),
+        ("job.json", b'{"blocks": "2x1", "coarse": "two"}', "coarse"),
         ("plan.json", b'{"blocks": []}', "plan.json"),
         ("0_0/block.json", b'{"capture": "/nowhere"}', "block.json"),
         ("0_0/block.json", b"\xff", "block.json"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -134,12 +133,3 @@ def test_parts_are_done_by_name_and_a_run_without_a_coarse_model_has_none(pop, s
 def test_what_cannot_be_is_said_in_a_line(train: Train, tmp_path, words, said):
     says(train(*words), said)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_damaged_job_is_named(pop: Pop, shared_coarse, tmp_path):
-    place = tmp_path / "blocks"
-    place.mkdir()
-    (tmp_path / "cfg.json").write_text((shared_coarse / "cfg.json").read_text())
-    content = json.loads((shared_coarse / "blocks" / "job.json").read_text())
-    (place / "job.json").write_text(json.dumps({**content, "coarse": "two"}))
-    says(pop("blocks", "train", tmp_path, "0_0"), "job.json")

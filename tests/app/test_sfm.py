@@ -105,16 +105,6 @@ def test_the_same_photographs_give_the_same_bytes(found: Path, photographs: Path
     assert_one_line(lambda: run_sfm(folder), "sparse", "--overwrite")
 
 
-def test_a_bare_folder_is_loaded_only_when_sfm_is_asked_for(photographs: Path, tmp_path: Path) -> None:
-    scene = tmp_path / "scene"
-    shutil.copytree(photographs, scene / "images")
-    assert_one_line(lambda: load_capture(scene), "7 photographs", "pop sfm")
-    assert sorted(file.name for file in scene.iterdir()) == ["images"]
-    assert len(load_capture(scene, sfm=True).views) == len(CENTERS)
-    assert (scene / "sparse" / "0" / "cameras.bin").is_file()
-    assert len(load_capture(scene).views) == len(CENTERS)
-
-
 @pytest.mark.slow
 def test_photographs_51_degrees_apart_are_all_placed_by_the_second_search(tmp_path: Path) -> None:
     kind = KINDS["few"]
@@ -315,9 +305,12 @@ def test_a_capture_among_its_photographs_is_none_of_them_the_next_time(known: No
 
 def test_folders_called_images_and_subfolders_alone_are_loaded(known: None, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
-    for options in ({"sfm": True}, {}):
-        assert len(load_capture(fill(tmp_path / "images"), **options).views) == 3
+    images = fill(tmp_path / "images")
+    assert_one_line(lambda: load_capture(images), "3 photographs", "pop sfm")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["images", "notes.txt"]
+    for options in ({"sfm": True}, {}):
+        assert len(load_capture(images, **options).views) == 3
+        assert (images / "sparse" / "0" / "cameras.bin").is_file()
     names = ["left cam/0.png", "left cam/1.png", "right/0.png"]
     capture = load_capture(fill(tmp_path / "scene", *names), sfm=True)
     assert [view.name for view in capture.views] == names

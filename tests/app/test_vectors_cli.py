@@ -169,7 +169,7 @@ def _without(name: str) -> Callable[[Path], None]:
         (lambda f: truncate(f / "index.json"), ("index.json", "damaged", "pop vectors export")),
         (lambda f: (f / "index.json").write_text("[]"), ("index.json", "format")),
         (_index(lambda i: i.update(format="other")), ("index.json", "format is not 'pop-vectors'")),
-        (_index(lambda i: i.update(version=1)), ("index.json", "version is 1", "reads 4")),
+        (_index(lambda i: i.update(version=1)), ("index.json", "version is 1", "reads 4", "again")),
         (_index(lambda i: i.pop("kinds")), ("index.json", "kinds is absent")),
         (lambda f: (f / "golden.npz").unlink(), ("golden.npz", "absent", "again")),
         (lambda f: truncate(f / "golden.npz"), ("golden.npz", "is no npz file", "again")),

@@ -178,10 +178,3 @@ def test_what_cannot_be_is_said() -> None:
         passes("fats")
     with pytest.raises(ValueError, match=r"pixel_map has shape \[3, 3\]"):
         passes("fast").contributions(raw_params(), 0, 3, torch.zeros(3, 3))
-
-
-def test_views_are_counted_and_their_photographs_are_theirs() -> None:
-    made = passes("fast")
-    assert made.n_views == 2
-    assert torch.equal(made.photo(1), views()[1].photo)
-    assert made.view(1).name == "second"

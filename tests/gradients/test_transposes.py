@@ -22,7 +22,6 @@ from pop_ref import (
     Splats,
     alpha,
     footprint,
-    harmonics,
     project,
     project_vjp,
     projection,
@@ -363,16 +362,6 @@ def test_cotangents_of_a_footprint_are_symmetric_and_none_passes_without_an_elli
     assert np.all(footprint.conics_from_covars2d_vjp(FLAT, np.ones((1, 3))) == 0.0)
     for none in (FLAT, np.zeros((1, 2, 2))):
         assert np.all(footprint.compensations_vjp(none, 0.25, np.ones(1)) == 0.0)
-
-
-def test_a_channel_at_exactly_zero_passes_its_gradient_from_above() -> None:
-    along_x = np.eye(3)[:1]
-    low = harmonics.sh_basis(along_x, 0)[0, 0]
-    sh = np.array([[[-0.75 / low, -0.5 / low, 0.0]]])
-    assert harmonics.colors_from_sh(sh, along_x, 0)[0].tolist() == [0.0, 0.0, 0.5]
-    v_sh, _ = harmonics.colors_from_sh_vjp(sh, along_x, 0, np.ones((1, 3)))
-    assert v_sh[0, 0, 0] == 0.0
-    assert v_sh[0, 0, 1] == v_sh[0, 0, 2] > 0.0
 
 
 def test_at_exactly_the_ceiling_the_derivative_from_below_is_used() -> None:

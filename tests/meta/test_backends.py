@@ -449,16 +449,8 @@ def test_a_wrong_gradient_of_a_right_image_is_told() -> None:
 
 def test_an_adapter_is_found_by_its_path_and_must_be_one() -> None:
     assert made_by("tests.meta.test_backends:OneStage").has("falloff")
-    with pytest.raises(ValueError, match="makes no adapter: it has no dtype, has, stage"):
-        made_by("pathlib:Path")
     with pytest.raises(ValueError, match=r"has dtype 'float64'; it must be np\.float32 or np\.float64"):
         made_by("tests.meta.test_backends:InWords")
-    with pytest.raises(ValueError, match="must be written module:name"):
-        made_by("tests.meta.test_backends")
-    with pytest.raises(ValueError, match="has no function Nobody"):
-        made_by("tests.meta.test_backends:Nobody")
-    with pytest.raises(Unavailable, match=r"no_such\.module:Mine needs no_such, which is not installed"):
-        made_by("no_such.module:Mine")
     assert function_named("pathlib:Path.home") == Path.home
     with pytest.raises(ValueError, match=r"module pathlib has no function Nobody\.home"):
         function_named("pathlib:Nobody.home")

@@ -275,7 +275,7 @@ REFUSED = {
         "--dtype",
         "float64",
     ): "--dtype is read with --rasterizer; backends,",
-    ("--adapter", "pathlib:Path"): "pathlib:Path makes no adapter: it has no dtype",
+    ("--adapter", "pathlib:Path"): "pathlib:Path makes no adapter: it has no dtype, has, stage",
     ("--backend", "gsplt"): "backend 'gsplt' is unknown; use one of oracle, fast64",
     ("--scorecard", "card.txt"): "scorecard card.txt must end in .json or .html",
     ("--scorecard", "kit.md/card.html"): "card.html cannot be written: ",

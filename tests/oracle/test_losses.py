@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.ndimage
-from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from pop_ref import losses
@@ -196,12 +195,6 @@ def test_rotations_are_those_of_scipy_on_both_sides_of_the_series(angle: float) 
     axis = REFINEMENT_RNG.normal(size=3)
     vector = angle * axis / np.linalg.norm(axis)
     np.testing.assert_allclose(rotmat_from_vector(vector), Rotation.from_rotvec(vector).as_matrix(), atol=1e-15)
-
-
-def test_a_rotation_is_the_exponential_of_its_generator() -> None:
-    x, y, z = vector = np.array([0.3, -0.2, 0.5])
-    generator = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    np.testing.assert_allclose(rotmat_from_vector(vector), expm(generator), atol=1e-15)
 
 
 def test_no_correction_leaves_every_bit_of_a_camera() -> None:
