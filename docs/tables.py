@@ -152,7 +152,7 @@ STAGES = (
 
 # modules of pop_ref that are data or types, not stages
 NOT_STAGES = frozenset(
-    {"__init__", "_files", "_shapes", "ambiguities", "constants", "notation", "records", "registry", "settings"}
+    {"__init__", "_shapes", "ambiguities", "constants", "notation", "records", "registry", "settings"}
     # whole trainings of the methods, which the laws of strategies and of steps are held to, and what they train
     | {"methods", "scripted", "short_training"}
 )

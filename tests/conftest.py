@@ -123,3 +123,20 @@ def _threads_of_torch() -> Iterator[None]:
     yield
     if before is not None and sys.modules["torch"].get_num_threads() != before:
         sys.modules["torch"].set_num_threads(before)
+
+
+@pytest.fixture(params=["fast", "compiled", "native"])
+def engine(request: pytest.FixtureRequest) -> Any:
+    """Return what takes a run's steps on the CPU, or skip with the reason why it cannot here."""
+    from pop_fast.train.engines import torch_engine, whole_engine
+    from tests.app.tiny import skip_without
+
+    skip_without("fast" if request.param == "fast" else "compiled")
+    return whole_engine() if request.param == "native" else torch_engine(request.param)
+
+
+@pytest.fixture
+def one_thread(_threads_of_torch: None) -> None:
+    import torch
+
+    torch.set_num_threads(1)

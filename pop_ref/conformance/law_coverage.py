@@ -18,10 +18,10 @@ from typing import Any, Final
 import numpy as np
 import pytest
 
-from pop_ref._files import write_file
 from pop_ref.conformance.adapter import STAGE_MODULES, Adapter, OracleAdapter
 from pop_ref.conformance.backends import shipped
 from pop_ref.conformance.calls import Call
+from pop_ref.conformance.files import write_file
 from pop_ref.conformance.law import Law, missing
 from pop_ref.conformance.mutants.trial import every_law, obeys
 from pop_ref.conformance.scenes import Scene

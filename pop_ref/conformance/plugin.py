@@ -18,8 +18,8 @@ from typing import Any
 
 import pytest
 
-from pop_ref._files import write_file
 from pop_ref.conformance.capabilities import SIGNATURE, STAGES
+from pop_ref.conformance.files import write_file
 
 LAWS = "pop_ref.conformance.laws"
 FAILURES = "conformance_failures"

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from pop_ref._files import write_file
 from pop_ref.conformance.capabilities import DOMINANCE, GRADIENTS, RENDER, SIGNATURE, STAGES, WHOLE
+from pop_ref.conformance.files import write_file
 from pop_ref.conformance.law import missing
 from pop_ref.conformance.mutants.trial import every_law
 from pop_ref.conformance.views import ASKED

@@ -18,13 +18,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from pop_ref._files import write_file
 from pop_ref.compositing import composite
 from pop_ref.conformance import tolerances
 from pop_ref.conformance.adapter import Adapter, OracleAdapter, projected
 from pop_ref.conformance.assertions import WORST_CONDITION
 from pop_ref.conformance.backends import Unavailable, shipped
 from pop_ref.conformance.error_bounds import PixelErrorBounds, pixel_error_bounds
+from pop_ref.conformance.files import write_file
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.scenes import Scene, cotangents, rounded_to
 from pop_ref.conformance.strategies import corners

@@ -23,12 +23,12 @@ from typing import Any
 
 import numpy as np
 
-from pop_ref._files import write_file
 from pop_ref.conformance import capabilities
 from pop_ref.conformance import vector_training as training
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.backends import SHIPPED, shipped
 from pop_ref.conformance.calls import Call, Frame, unpacked
+from pop_ref.conformance.files import write_file
 from pop_ref.conformance.mutants import FAMILIES
 from pop_ref.conformance.mutants.trial import alive
 from pop_ref.conformance.scenes import Scene, scene_from

@@ -20,9 +20,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from pop_ref._files import write_file
 from pop_ref.conformance import tolerances
 from pop_ref.conformance.adapter import OracleAdapter, stage_function
+from pop_ref.conformance.files import write_file
 from pop_ref.conformance.scenes import in_precision
 from pop_ref.conformance.vector_check import entry, equal
 from pop_ref.constants import Profile

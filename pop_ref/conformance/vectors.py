@@ -18,13 +18,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from pop_ref._files import write_file
 from pop_ref.conformance import vector_training as training
 from pop_ref.conformance.adapter import Adapter, OracleAdapter
 from pop_ref.conformance.calls import Call
 from pop_ref.conformance.corpus import GRADIENTS as IN_RUNS
 from pop_ref.conformance.corpus import MAPS, PLANS, answers, corpus_scene, unambiguous_cotangents
 from pop_ref.conformance.error_bounds import PixelErrorBounds, pixel_error_bounds
+from pop_ref.conformance.files import write_file
 from pop_ref.conformance.gradient_error_bounds import gradient_error_bounds
 from pop_ref.conformance.scenes import (
     Scene,

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from pop_ref._files import write_file
+from pop_ref.conformance.files import write_file
 from pop_ref.conformance.scenes import Scene
 from pop_ref.learn.judge import Verdict
 from pop_ref.learn.student import Call, numbers

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from pop_ref._files import write_file
+from pop_ref.conformance.files import write_file
 from pop_ref.learn.course import BY_NAME, COURSE, Stage
 from pop_ref.learn.splat import BALLS, PAINT, SH_C0, orbit
 from pop_ref.learn.student import Borrowed, Work, borrowing, said, where

@@ -23,7 +23,7 @@ from typing import Any, Final
 import numpy as np
 
 import pop_ref
-from pop_ref.conformance.copied import copied
+from pop_ref.conformance.files import copied
 from pop_ref.learn.course import COURSE, Stage
 
 PACKAGE: Final = "pop_yours"

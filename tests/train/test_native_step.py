@@ -38,7 +38,7 @@ from pop_ref.settings import PARAMETERS
 from tests.app.tiny import HEIGHT, WIDTH, interrupted, last_checkpoint, tiny_capture, tiny_config
 
 REASON = get_backend("compiled").why_not()
-pytestmark = pytest.mark.skipif(REASON is not None, reason=REASON or "")
+pytestmark = [pytest.mark.skipif(REASON is not None, reason=REASON or ""), pytest.mark.usefixtures("one_thread")]
 
 STEPS = 6
 # statistics and dominance are collected at every step, and nothing is changed

@@ -38,6 +38,8 @@ from pop_ref.render import render, render_vjp
 from pop_ref.training import gaussians_from_params
 from tests.app.tiny import last_checkpoint, run_until, skip_without, tiny_capture, tiny_config
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 ALL = {"exposure": True, "random_background": True, "refine_cameras": True}
 RNG = np.random.default_rng(21)
 EXPOSURES = np.eye(3, 4) + RNG.normal(0.0, 0.2, (5, 3, 4))

@@ -50,6 +50,8 @@ from tests.golden.ten_losses import STEPS as LADDER_STEPS
 
 WIDTH, HEIGHT, N_POINTS, STEPS = 18, 12, 14, 300
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 DENSITY = DensityConfig(
     grow_grad2d=0.012,
     grow_scale3d=0.12,

@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from pop_ref._files import write_file
+from pop_ref.conformance.files import write_file
 from pop_ref.conformance.hypothesis_profiles import EXAMPLES
 from pop_ref.conformance.mutants import FAMILIES, BlackBox, Mutant
 from pop_ref.conformance.mutants.trial import killed_by, killers

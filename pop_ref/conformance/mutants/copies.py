@@ -10,7 +10,7 @@ from typing import Any
 from pop_ref.conformance.adapter import OracleAdapter
 from pop_ref.conformance.backends import program
 from pop_ref.conformance.changes import sides
-from pop_ref.conformance.copied import copied, folder_of
+from pop_ref.conformance.files import copied, folder_of
 
 ORACLE, PROGRAM = "pop_ref", "pop_fast"
 

@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from pop_ref._files import write_file
 from pop_ref.walkthrough.builder.chapter import Chapter, ChapterError, chapter_files, chapter_number, read_chapter
 
 if TYPE_CHECKING:
@@ -124,16 +123,16 @@ def write(wanted: argparse.Namespace) -> None:
     if wanted.notebooks:
         names = [notebooks.notebook_name(each) for each in chosen]
         for chapter, name in zip(chosen, names, strict=True):
-            write_file(wanted.notebooks / name, notebooks.notebook(chapter))
-        write_file(wanted.notebooks / "index.html", layout.notebook_index(chosen, names))
+            _write(wanted.notebooks / name, notebooks.notebook(chapter))
+        _write(wanted.notebooks / "index.html", layout.notebook_index(chosen, names))
     if wanted.folder:
         _write_pages(wanted, chosen, chapters)
     if wanted.slides:
         told = slides.read_slides(slides.FILE.read_text(encoding="utf-8"))
         numbered = {each.number: each for each in chapters}
-        write_file(wanted.slides, slides.deck(told, lambda number: (numbered[number], _run(numbered[number]))))
+        _write(wanted.slides, slides.deck(told, lambda number: (numbered[number], _run(numbered[number]))))
     if wanted.pdf:
-        write_file(wanted.pdf, _printed(layout.book([(each, _run(each)) for each in chosen])))
+        _write(wanted.pdf, _printed(layout.book([(each, _run(each)) for each in chosen])))
     opened = [wanted.folder and wanted.folder / "index.html", wanted.slides, wanted.pdf]
     print("\n".join(f"open {each}" for each in opened if each))
     if wanted.notebooks:
@@ -159,9 +158,9 @@ def _write_pages(wanted: argparse.Namespace, chosen: Sequence[Chapter], chapters
         near = (
             f"{Path(beside['notebooks']).parent}/{notebooks.notebook_name(chapter)}" if "notebooks" in beside else None
         )
-        write_file(folder / chapter.page, layout.chapter_page(chapter, _run(chapter), chapters, near))
-    write_file(folder / glossary.GLOSSARY_PAGE, layout.glossary_page())
-    write_file(folder / "index.html", layout.index_page(chapters, beside))
+        _write(folder / chapter.page, layout.chapter_page(chapter, _run(chapter), chapters, near))
+    _write(folder / glossary.GLOSSARY_PAGE, layout.glossary_page())
+    _write(folder / "index.html", layout.index_page(chapters, beside))
 
 
 @functools.cache
@@ -211,3 +210,10 @@ def _printed(page: str) -> bytes:
             why = f"(exit status {done.returncode}): {done.stderr.strip()[-400:]}"
             raise BrowserError(f"{program} printed nothing {why}")
         return printed.read_bytes()
+
+
+def _write(path: Path, what: str | bytes) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_bytes(what.encode() if isinstance(what, str) else what)
+    os.replace(partial, path)
