@@ -221,7 +221,7 @@ class Trainee:
         segment = self._step(run, step)
         (stats,), (names,) = segment.stats, segment.views
         views = [int(name.removesuffix(".png")) for name in names.split(", ")]
-        moments = {key: run.optimizers[key].state[run.params[key]] for key in KEYS}
+        moments = run.stepper.moments()
         return {
             "view": views[0] if len(views) == 1 else views,
             "loss": float(stats.objective + stats.pop),
@@ -297,12 +297,12 @@ class Trainee:
         params, views = self._params(watch), self._views(watch)
         schedule = self._module("train.schedule")
         appearance = self._module("train.appearance").Appearance(config, views)
-        stepper, optimizers, state = self._stepper(config, strategy, views, watch, appearance, params)
+        stepper, _, state = self._stepper(config, strategy, views, watch, appearance, params)
         found: list[dict[str, Any]] = []
         for step in range(watch.steps):
             stepper.steps(step, step + 1, schedule.phase_at(config, strategy, step))
             stepper.synchronize()
-            moments = {name: each.state[params[name]]["exp_avg"] for name, each in optimizers.items()}
+            moments = {name: of["exp_avg"] for name, of in stepper.moments().items()}
             kept = {name: state.get(name) for name in KEPT}
             found.append(arrays_of({**kept, "params": params, "first_moments": moments}))
         return found

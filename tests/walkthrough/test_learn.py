@@ -370,16 +370,18 @@ def test_the_map_turns_green_with_a_pass_and_back_with_a_change(mine: Path) -> N
 
 
 def test_what_has_passed_is_kept_where_a_disk_is_full(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(path: Path, *_words: str, **_how: str) -> None:
-        path.write_bytes(b"{")
+    def full(path: Path, _content: bytes) -> None:
+        path.touch()
         raise OSError(28, "No space left on device")
 
     write(mine, "alpha")
     note_passed(mine, BY_NAME["alpha"])
-    monkeypatch.setattr(Path, "write_text", full)
+    monkeypatch.setattr(Path, "write_bytes", full)
     with pytest.raises(OSError, match="No space left"):
         note_passed(mine, BY_NAME["alpha"])
     assert state(read_work(mine), BY_NAME["alpha"]) == PASSED
+    assert not list(mine.glob("*.partial"))
+    assert not list(mine.glob(".*.partial"))
 
 
 def test_the_picture_is_the_oracles_with_the_students_stages_in_it(mine: Path) -> None:

@@ -26,7 +26,7 @@ _LINES: Final[Lines] = {
          "moments[name] = edited(value«→.roll(1, 0)», None",
          "test_density:survivors_of_pruning_keep_their_order_bits_and_moments"),
         ("copies_begin_with_momentum", "appended rows start with moments of their own values instead of zero",
-         "«None if tail is None else torch.zeros_like(tail)→tail»",
+         "«None if tail is None else value.new_zeros((len(tail), *value.shape[1:]))→tail»",
          "test_density:clones_are_exact_copies_at_the_end_with_fresh_moments"),
         ("reset_keeps_moments", "a reset lowers the opacities and keeps their moments, which carry them up again",
          "value.shape == opacities.shape:\n            «value.zero_()→pass»\n",
