@@ -121,8 +121,8 @@ def held_bytes(n: int, size: int, n_views: int, shown: float, n_rest: int = 15) 
     numbers = _numbers(n_rest)
     # packed splats and sums; means, depths, conics, opacities, extents
     splat = 2 * 4 * _ROW + 36
-    # a view keeps conics, opacities, extents and the side of the POP term; dominated pixels are counted
-    own = 3 * 4 * numbers + splat + n_views * 25 + 1 + 4
+    # every view keeps its conics, opacities, extents and sides of the POP term; dominated pixels are counted
+    own = 3 * 4 * numbers + splat + (n_views - 1) * 25 + 1 + 4
     return {
         "whole": n * (4 * numbers + _STATISTICS),
         "drawn": min(1.0, shown * (1.0 + 1.0 / _SPARE)) * n * splat,

@@ -22,7 +22,6 @@ from paper_repro.jobs import Job, job_named
 from paper_repro.results import Result
 from paper_repro.scenes import MADE, SCENES, find_folder
 from paper_repro.train_row import Options, capture_folder, load_capture_of, train_row
-from pop_fast.density.protocol import Strategy
 from pop_fast.errors import PopError
 
 if TYPE_CHECKING:
@@ -150,14 +149,29 @@ def _table(found: Pushed, maps: list[Panel], mse: float) -> tuple[list[str], lis
 
 
 @dataclass(frozen=True)
-class OpacityOne(Strategy):
-    """A strategy by gsplat's protocol that leaves the Gaussians alone and pulls every opacity to 1."""
+class OpacityOne:
+    """A strategy by gsplat's protocol that leaves the Gaussians alone and pulls every opacity to 1.
 
-    weight: float = WEIGHT  # of the mean of 1 - o in the loss
+    Attributes:
+        weight: of the mean of 1 - o in the loss.
+    """
+
+    weight: float = WEIGHT
+
+    def check_sanity(self, params: Any, optimizers: Any) -> None:
+        """See `pop_fast.density.Strategy`; any parameters will do."""
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """See `pop_fast.density.Strategy`; nothing is remembered."""
         return {}
+
+    def step_pre_backward(self, params: Any, optimizers: Any, state: Any, step: int, info: Any) -> None:
+        """See `pop_fast.density.Strategy`."""
+
+    def step_post_backward(
+        self, params: Any, optimizers: Any, state: Any, step: int, info: Any, packed: bool = False
+    ) -> None:
+        """See `pop_fast.density.Strategy`; the Gaussians stay."""
 
     def regularizer(self, opacities: Tensor, state: Any, step: int, info: Any) -> Tensor:
         """Return the term that is added to the loss."""
