@@ -203,7 +203,7 @@ class BatchTrainer:
             origins: for each parameter the former place of each row, from 1, or 0 for moments of zero. int32 [N]
         """
         # what the old number of Gaussians needed goes first; moments of one parameter at a time are there twice
-        self._of_place, self._programs, self._frames, self._drawn = [], {}, {}, None
+        self._of_place, self._programs, self._frames, self._drawn, self._gradients = [], {}, {}, None, {}
         moved = {key: self._moved(key, origins[key]) for key in params}
         self._bind(params, *({key: of[place] for key, of in moved.items()} for place in (0, 1)))
 
