@@ -10,72 +10,92 @@
 
 namespace pop {
 
-// A chunk of a tile's list that is blended again from the light before it.
+// A chunk of a tile's list that is blended again from the light before it. What it finds lies close together in the
+// order in which it is made, a half of what a place for every pair would fill, so that the nearest cache holds it.
 template <class Real> struct Again {
+  // a strip in which an entry blends, and where its alphas and weights begin among the pairs
+  struct Found {
+    int strip, at;
+  };
   const int padded, strips;
-  std::vector<Real> alphas, weights;  // [entries of a chunk, pixels]
-  std::vector<uint64_t> marks;        // in which strips an entry blends. [entries of a chunk, words]
+  Numbers<Real> pairs;       // [found, 2, lanes of a piece]
+  std::vector<Found> found;  // of every entry and piece, strip by strip. [entries of a chunk, PIECES, strips]
+  int counts[CHUNK][PIECES];
   Entries<Real> entries;
   Rows<Real> rows;
 
   explicit Again(const Pixels<Real> &pixels)
-      : padded(pixels.padded()), strips(pixels.strips), alphas(CHUNK * padded), weights(CHUNK * padded),
-        marks(CHUNK * words()), rows(pixels.size) {}
-
-  int words() const { return (strips + 63) / 64; }
+      : padded(pixels.padded()), strips(pixels.strips), pairs(2 * CHUNK * padded), found(CHUNK * PIECES * strips),
+        rows(pixels.size) {}
 
   template <bool ROW>
   void blend_again(const Thresholds<Real> &thresholds, const Pixels<Real> &pixels, const Real *transmittances,
                    const uint16_t *reached) {
-    std::fill(marks.begin(), marks.end(), 0);
-    Real *to_alphas = alphas.data(), *to_weights = weights.data();
-    for (int strip = 0; strip < strips; strip++) {
-      const int at = strip * LANES<Real>;
-      const Vec<Real> x = load(&pixels.x[at]), y = load(&pixels.y[at]);
-      Vec<Real> T = load(transmittances + at);
-      each_marked(reached[strip], [&](int k) {
-        marks[k * words() + strip / 64] |= uint64_t(1) << strip % 64;
-        Vec<Real> alpha, weight;
+    std::memset(counts, 0, sizeof counts);
+    int next = 0;
+    for (int each = 0; each < strips * PIECES; each++) {
+      const int strip = each / PIECES, piece = each % PIECES, at = each * PIECE_LANES<Real>;
+      const Piece<Real> x = load_piece(&pixels.x[at]), y = load_piece(&pixels.y[at]);
+      Piece<Real> T = load_piece(transmittances + at);
+      each_marked(reached[each], [&](int k, uint32_t) {
+        Piece<Real> alpha, weight;
         take(thresholds, exponent<Real, ROW>(entries, rows, strip, k, x, y), T, alpha, weight);
-        store(to_alphas + k * padded + at, alpha);
-        store(to_weights + k * padded + at, weight);
+        found[(k * PIECES + piece) * strips + counts[k][piece]++] = {strip, next};
+        store_chunk(&pairs[next], alpha);
+        store_chunk(&pairs[next + PIECE_LANES<Real>], weight);
+        next += 2 * PIECE_LANES<Real>;
       });
     }
   }
 
   bool marked(int k) const {
-    for (int word = 0; word < words(); word++)
-      if (marks[k * words() + word]) return true;
-    return false;
+    int sum = 0;
+    for (int count : counts[k]) sum += count;
+    return sum > 0;
   }
 
-  // calls f(strip) for those in which entry k blends
-  template <class F> void each_strip(int k, F f) const {
-    for (int word = 0; word < words(); word++)
-      for (uint64_t left = marks[k * words() + word]; left; left &= left - 1) f(64 * word + __builtin_ctzll(left));
+  // calls f(strip, alpha, weight) for the strips in whose piece entry k blends
+  template <class F> void each_strip(int k, int piece, F f) const {
+    const Found *of_entry = &found[(k * PIECES + piece) * strips];
+    for (int i = 0; i < counts[k][piece]; i++) {
+      const Real *pair = &pairs[of_entry[i].at];
+      f(of_entry[i].strip, load_piece(pair), load_piece(pair + PIECE_LANES<Real>));
+    }
   }
 };
 
 // A tile's cotangents, the colour from behind, and what a chunk's entries sum up in each lane.
 template <class Real> struct Transpose : Again<Real> {
   using Again<Real>::padded;
-  std::vector<Real> v, suffix_dot_grad, sums;
+  const int64_t planes;
+  Numbers<Real> v;  // of each channel, of alpha, and B. [strips, PIECES, planes, lanes of a piece]
+  Numbers<Real> sums;
 
   Transpose(const Pixels<Real> &pixels, int64_t channels)
-      : Again<Real>(pixels), v((channels + 1) * padded), suffix_dot_grad(padded),
-        sums((channels + 8) * CHUNK * LANES<Real>) {}
+      : Again<Real>(pixels), planes(channels + 2), v(planes * padded), sums((channels + 8) * CHUNK * LANES<Real>) {}
 
   void begin(const Blend<Real> &blend, const Place<Real> &place) {
-    const int64_t D = blend.channels, n = place.columns();
+    const int64_t D = blend.channels;
     std::fill(v.begin(), v.end(), Real(0));
-    std::fill(suffix_dot_grad.begin(), suffix_dot_grad.end(), Real(0));
-    place.each_row([&](int64_t pixel, int64_t from) {
-      for (int64_t d = 0; blend.v_image && d < D; d++) {
-        const Real *line = blend.v_image + from * blend.pixel_stride + d * blend.channel_stride;
-        for (int64_t x = 0; x < n; x++) v[d * padded + pixel + x] = line[x * blend.pixel_stride];
-      }
-      if (blend.v_alphas) std::copy_n(blend.v_alphas + from, n, &v[D * padded + pixel]);
-    });
+    constexpr int64_t lanes = PIECE_LANES<Real>;
+    const auto copy = [&](int64_t plane, const Real *from, int64_t stride) {
+      place.each_row([&](int64_t pixel, int64_t first) {
+        const Real *line = from + first * stride;
+        for (int64_t x = 0, n = 0; x < place.columns(); x += n) {
+          const int64_t each = (pixel + x) / lanes, lane = (pixel + x) % lanes;
+          Real *to = &v[(each * planes + plane) * lanes + lane];
+          n = std::min(lanes - lane, place.columns() - x);
+          if (stride == 1 && n == lanes) {
+            store_chunk(to, load_piece(line + x));
+          } else {
+            for (int64_t i = 0; i < n; i++) to[i] = line[(x + i) * stride];
+          }
+        }
+      });
+    };
+    for (int64_t d = 0; blend.v_image && d < D; d++)
+      copy(d, blend.v_image + d * blend.channel_stride, blend.pixel_stride);
+    if (blend.v_alphas) copy(D, blend.v_alphas, 1);
   }
 
   // of one column of a chunk's rows: the sums in every lane. [entries of a chunk, lanes]
@@ -84,47 +104,51 @@ template <class Real> struct Transpose : Again<Real> {
 
 // B3: what the ceiling lets through of G. G carries the clamped alpha; where the gradient passes as if nothing had been
 // clamped, the chain rule wants the raw one.
-template <class Real>
-inline Vec<Real> through_ceiling(const Blend<Real> &blend, Real ceiling, Vec<Real> e, Vec<Real> alpha, Vec<Real> G) {
-  const Mask<Real> clamped = alpha >= ceiling;
-  if (!blend.ceiling_passes) return select(clamped, all(Real(0)), G);
-  return select(clamped, G * (exp2_of(e) / ceiling), G);
+template <class Real, class C>
+inline C through_ceiling(const Blend<Real> &blend, Real ceiling, C e, C alpha, C G) {
+  const auto clamped = alpha >= ceiling;
+  if (!blend.ceiling_passes) return select(clamped, C{}, G);
+  return select(clamped, G * (exp2_of<Real>(e) / ceiling), G);
 }
 
-// One entry's sums in every lane: moments of G, gradient to the colours, |G dlog2(alpha)/dx| and |..dy|.
+// One entry's sums in every lane of a piece: moments of G, gradient to the colours, |G dlog2(alpha)/dx| and |..dy|.
 template <class Real, int D, bool ROW>
 void entry_sums(const Blend<Real> &blend, const Thresholds<Real> &thresholds, const Pixels<Real> &pixels, int k,
-                Transpose<Real> &state) {
-  const int64_t channels = D ? D : blend.channels;
-  const int padded = state.padded;
+                int piece, Transpose<Real> &state) {
+  using V = Piece<Real>;
+  constexpr int lanes = PIECE_LANES<Real>;
+  const int64_t channels = D ? D : blend.channels, planes = channels + 2;
   const Entries<Real> &entries = state.entries;
-  const Real *color = D ? entries.rgb[k] : entries.color[k], *all_x = pixels.x.data(), *all_y = pixels.y.data();
-  const Real *alphas = &state.alphas[k * padded], *weights = &state.weights[k * padded], *all_v = state.v.data();
+  const Real *color = D ? entries.rgb[k] : entries.color[k], *all_x = pixels.x.data() + piece * lanes;
+  const Real *all_y = pixels.y.data() + piece * lanes;
   const Real u = entries.u[k], v_center = entries.v[k];
-  Real *all_suffix_dot_grad = state.suffix_dot_grad.data();
-  Vec<Real> m{}, mx{}, my{}, mxx{}, mxy{}, myy{}, along_x{}, along_y{}, colors[D ? D : 1]{};
-  const auto of_strip = [&](int strip) {
+  Real *all_v = state.v.data() + piece * planes * lanes;
+  V m{}, mx{}, my{}, mxx{}, mxy{}, myy{}, along_x{}, along_y{}, colors[D ? D : 1]{};
+  const int at_k = k * LANES<Real> + piece * lanes;  // among the sums of a column
+  // the same on every row
+  const V x_of_row = load_piece(all_x), dx_of_row = u - x_of_row;
+  state.each_strip(k, piece, [&](int strip, V alpha, V weight) {
     const int at = strip * LANES<Real>;
-    const Vec<Real> alpha = load(alphas + at), weight = load(weights + at);
-    const Vec<Real> suffix_dot_grad = load(all_suffix_dot_grad + at);
-    Vec<Real> q = load(all_v + channels * padded + at) - suffix_dot_grad;
+    Real *v = all_v + strip * PIECES * planes * lanes, *suffix = v + (channels + 1) * lanes;
+    const V suffix_dot_grad = load_piece(suffix);
+    V q = load_piece(v + channels * lanes) - suffix_dot_grad;
     for (int d = 0; d < D; d++) {
-      const Vec<Real> v = load(all_v + d * padded + at);
-      q += v * color[d];
-      colors[d] += weight * v;
+      const V v_color = load_piece(v + d * lanes);
+      q += v_color * color[d];
+      colors[d] += weight * v_color;
     }
     for (int64_t d = 0; !D && d < channels; d++) {
-      const Vec<Real> v = load(all_v + d * padded + at);
-      Real *sum = state.column(6 + d) + k * LANES<Real>;
-      q += v * color[d];
-      store(sum, load(sum) + weight * v);
+      const V v_color = load_piece(v + d * lanes);
+      Real *sum = state.column(6 + d) + at_k;
+      q += v_color * color[d];
+      store_chunk(sum, load_piece(sum) + weight * v_color);
     }
-    store(all_suffix_dot_grad + at, suffix_dot_grad + alpha * q);
-    const Vec<Real> x = load(all_x + at), y = load(all_y + at), dx = u - x;
-    Vec<Real> G = weight * q;
+    store_chunk(suffix, suffix_dot_grad + alpha * q);
+    const V x = ROW ? x_of_row : load_piece(all_x + at), y = load_piece(all_y + at), dx = ROW ? dx_of_row : u - x;
+    V G = weight * q;
     if (any(alpha >= thresholds.ceiling))
       G = through_ceiling(blend, thresholds.ceiling, exponent<Real, ROW>(entries, state.rows, strip, k, x, y), alpha, G);
-    const Vec<Real> Gx = G * dx;
+    const V Gx = G * dx;
     m += G;
     mx += Gx;
     mxx += Gx * dx;
@@ -134,25 +158,24 @@ void entry_sums(const Blend<Real> &blend, const Thresholds<Real> &thresholds, co
       mxy += Gx * dy;
       myy += G * dy_dy;
     } else {
-      const Vec<Real> dy = v_center - y, Gy = G * dy;
+      const V dy = v_center - y, Gy = G * dy;
       my += Gy;
       mxy += Gx * dy;
       myy += Gy * dy;
     }
     if (blend.absgrad) {
       const auto f = [&](int j) { return entries.f[j][k]; };
-      const Vec<Real> by_x = G * (x * (2 * f(3)) + (y * f(4) + f(1))), by_y = G * (y * (2 * f(5)) + (x * f(4) + f(2)));
-      along_x += select(by_x < Real(0), -by_x, by_x);
-      along_y += select(by_y < Real(0), -by_y, by_y);
+      const V by_x = G * (x * (2 * f(3)) + (y * f(4) + f(1))), by_y = G * (y * (2 * f(5)) + (x * f(4) + f(2)));
+      along_x += size_of(by_x);
+      along_y += size_of(by_y);
     }
-  };
-  state.each_strip(k, of_strip);
-  const Vec<Real> *moments[6] = {&m, &mx, &my, &mxx, &mxy, &myy};
-  for (int j = 0; j < 6; j++) store(state.column(j) + k * LANES<Real>, *moments[j]);
-  for (int d = 0; d < D; d++) store(state.column(6 + d) + k * LANES<Real>, colors[d]);
+  });
+  const V *moments[6] = {&m, &mx, &my, &mxx, &mxy, &myy};
+  for (int j = 0; j < 6; j++) store_chunk(state.column(j) + at_k, *moments[j]);
+  for (int d = 0; d < D; d++) store_chunk(state.column(6 + d) + at_k, colors[d]);
   if (blend.absgrad) {
-    store(state.column(6 + channels) + k * LANES<Real>, along_x);
-    store(state.column(7 + channels) + k * LANES<Real>, along_y);
+    store_chunk(state.column(6 + channels) + at_k, along_x);
+    store_chunk(state.column(7 + channels) + at_k, along_y);
   }
 }
 
@@ -179,16 +202,21 @@ void transpose_tile(const Blend<Real> &blend, const Pixels<Real> &pixels, int64_
     const int64_t first = place.begin + chunk * CHUNK, at = blend.first_chunks[tile] + chunk;
     const int n = int(std::min<int64_t>(CHUNK, place.begin + n_reached - first));
     state.entries.gather(blend, place, first, n, first - CHUNK);
+    Real *rows[CHUNK];
+    for (int k = 0; k < n; k++) {
+      rows[k] = blend.rows + blend.slot(first + k) * blend.columns();
+      // they lie anywhere, and are written at the end
+      for (int64_t j = 0; j < blend.columns(); j += 64 / sizeof(Real)) __builtin_prefetch(rows[k] + j, 1);
+    }
     if (ROW) state.rows.expand(state.entries, pixels);
     state.template blend_again<ROW>(thresholds, pixels, blend.transmittances + at * state.padded,
-                                    blend.reached + at * state.strips);
-    Real *rows[CHUNK];
+                                    blend.reached + at * state.strips * PIECES);
     for (int k = n - 1; k >= 0; k--) {
-      rows[k] = blend.rows + blend.slot(first + k) * blend.columns();
       if (!D || !state.marked(k))
         for (int64_t j = 0; j < blend.columns(); j++)
           std::fill_n(state.column(j) + k * LANES<Real>, LANES<Real>, Real(0));
-      if (state.marked(k)) entry_sums<Real, D, ROW>(blend, thresholds, pixels, k, state);
+      for (int piece = 0; state.marked(k) && piece < PIECES; piece++)
+        entry_sums<Real, D, ROW>(blend, thresholds, pixels, k, piece, state);
     }
     write_rows(blend, n, state, rows);
   }

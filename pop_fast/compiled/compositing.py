@@ -157,7 +157,8 @@ def _lights(lists: TileLists, like: Tensor) -> dict[str, Tensor]:
     return {
         "first_chunks": chunks.cumsum(0) - chunks,
         "transmittances": like.new_empty(n_pixels),
-        "reached": torch.empty(n_pixels // library.lanes(like.dtype.itemsize), dtype=torch.int16),
+        # two bit sets of sixteen entries for every strip, one for each of its halves
+        "reached": torch.empty(n_pixels // library.lanes(like.dtype.itemsize), dtype=torch.int32),
     }
 
 

@@ -27,7 +27,9 @@ StepCounts Stepper::counted() const {
         if (!any(load(&blend.transmittances[chunk * pixels.padded() + strip * LANES<float>]) > 0.0f)) continue;
         found.pairs += n * LANES<float>;
         found.marked += __builtin_popcount(lines.of_strip(pixels, strip));
-        found.reached += __builtin_popcount(blend.reached[chunk * pixels.strips + strip]);
+        uint32_t reached = 0;
+        for (int piece = 0; piece < PIECES; piece++) reached |= blend.reached[(chunk * pixels.strips + strip) * PIECES + piece];
+        found.reached += __builtin_popcount(reached);
       }
     }
   }

@@ -19,8 +19,9 @@ template <class Real> void make_splats(const Blend<Real> &blend, Fork fork) {
 // A tile's pixels on the way through its list, every array in strips of lanes; and what is known of a chunk.
 template <class Real> struct Canvas {
   const int padded;
-  std::vector<Real> T, alphas, colors, best;
-  std::vector<Whole<Real>> winner, blended, traversed;
+  Numbers<Real> T, alphas, colors, best;
+  Numbers<Whole<Real>> winner, blended, traversed;
+  std::vector<int32_t> won;  // pixels, by nobody and by each entry. [1 + entries]
   Entries<Real> entries;
   Rows<Real> rows;
 
@@ -36,6 +37,9 @@ template <class Real> struct Canvas {
     place.each_row([&](int64_t pixel, int64_t) { std::fill_n(&T[pixel], place.columns(), Real(1)); });
   }
   bool lit(int strip) const { return any(load(&T[strip * LANES<Real>]) > Real(0)); }
+  bool lit(int strip, int piece) const {
+    return any(load_piece(&T[strip * LANES<Real> + piece * PIECE_LANES<Real>]) > Real(0));
+  }
   bool lit() const {
     for (int strip = 0; strip * LANES<Real> < padded; strip++)
       if (lit(strip)) return true;
@@ -43,79 +47,78 @@ template <class Real> struct Canvas {
   }
 };
 
-// Blend some entries into one strip, and return those that did. D channels, known to the compiler unless 0.
-template <class Real, int D, bool ROW, bool DOMINANCE>
-uint32_t blend_strip(const Blend<Real> &blend, const Thresholds<Real> &thresholds, const Pixels<Real> &pixels,
-                     int64_t place_in_list, int strip, uint32_t marks, Canvas<Real> &canvas) {
-  const int at = strip * LANES<Real>;
+// Blend some entries into one piece of a strip, and return those that did. D channels, known to the compiler unless 0;
+// COUNT where visits are counted.
+template <class Real, int D, bool ROW, bool DOMINANCE, bool COUNT>
+uint32_t blend_piece(const Blend<Real> &blend, const Thresholds<Real> &thresholds, const Pixels<Real> &pixels,
+                    int strip, int piece, uint32_t marks, Canvas<Real> &canvas) {
+  using V = Piece<Real>;
+  using M = Piece<Whole<Real>>;
+  const int at = strip * LANES<Real> + piece * PIECE_LANES<Real>;
   const Entries<Real> &entries = canvas.entries;
-  const Vec<Real> x = load(&pixels.x[at]), y = load(&pixels.y[at]);
-  Vec<Real> T = load(&canvas.T[at]), sum_of_weights = load(&canvas.alphas[at]), colors[D ? D : 1], best{};
-  Mask<Real> winner{};
-  for (int d = 0; d < D; d++) colors[d] = load(&canvas.colors[d * canvas.padded + at]);
+  const V x = load_piece(&pixels.x[at]), y = load_piece(&pixels.y[at]);
+  V T = load_piece(&canvas.T[at]), sum_of_weights = load_piece(&canvas.alphas[at]), colors[D ? D : 1], best{};
+  M winner{};
+  for (int d = 0; d < D; d++) colors[d] = load_piece(&canvas.colors[d * canvas.padded + at]);
   if (DOMINANCE) {
-    best = load(&canvas.best[at]);
-    winner = load_whole<Real>(&canvas.winner[at]);
+    best = load_piece(&canvas.best[at]);
+    winner = load_piece(&canvas.winner[at]);
   }
   uint32_t reached = 0;
-  each_marked(marks, [&](int k) {
-    if (blend.n_traversed) {
+  each_marked(marks, [&](int k, uint32_t bit) {
+    if constexpr (COUNT) {
       Whole<Real> *visits = &canvas.traversed[at];
-      store_whole<Real>(visits, load_whole<Real>(visits) - (T > Real(0)));
+      store_chunk(visits, load_piece(visits) - (T > Real(0)));
     }
-    const Vec<Real> before = T;
-    Vec<Real> alpha, weight;
+    const V before = T;
+    V alpha, weight;
     take(thresholds, exponent<Real, ROW>(entries, canvas.rows, strip, k, x, y), T, alpha, weight);
     // the transpose must also meet the entry at which a pixel stops, which has no weight there
-    reached |= uint32_t(any(T < before)) << k;
+    reached |= any(T < before) ? bit : 0;
     sum_of_weights += weight;
     for (int d = 0; d < D; d++) colors[d] += weight * entries.rgb[k][d];
     for (int d = 0; !D && d < blend.channels; d++) {
       Real *sums = &canvas.colors[d * canvas.padded + at];
-      store(sums, load(sums) + weight * entries.color[k][d]);
+      store_chunk(sums, load_piece(sums) + weight * entries.color[k][d]);
     }
     if (DOMINANCE) {
       // strictly larger: on equal weights the entry in front keeps the pixel
-      const Mask<Real> wins = weight > best, this_one = Mask<Real>{} + Whole<Real>(place_in_list + k);
+      const M wins = weight > best, this_one = M{} + entries.places[k];
       best = select(wins, weight, best);
       winner = select(wins, this_one, winner);
     }
-    if (blend.n_blended) {
+    if constexpr (COUNT) {
       Whole<Real> *count = &canvas.blended[at];
-      store_whole<Real>(count, load_whole<Real>(count) - (weight > Real(0)));
+      store_chunk(count, load_piece(count) - (weight > Real(0)));
     }
   });
-  store(&canvas.T[at], T);
-  store(&canvas.alphas[at], sum_of_weights);
-  for (int d = 0; d < D; d++) store(&canvas.colors[d * canvas.padded + at], colors[d]);
+  store_chunk(&canvas.T[at], T);
+  store_chunk(&canvas.alphas[at], sum_of_weights);
+  for (int d = 0; d < D; d++) store_chunk(&canvas.colors[d * canvas.padded + at], colors[d]);
   if (DOMINANCE) {
-    store(&canvas.best[at], best);
-    store_whole<Real>(&canvas.winner[at], winner);
+    store_chunk(&canvas.best[at], best);
+    store_chunk(&canvas.winner[at], winner);
   }
   return reached;
 }
 
 // Add the pixels that each splat won to its count; integers, so that the order does not matter.
 template <class Real>
-void count_winners(const Blend<Real> &blend, const Place<Real> &place, const Canvas<Real> &canvas) {
-  int64_t last = -1;
-  int32_t run = 0;
-  const auto flush = [&] {
-    if (last >= 0 && run > 0) __atomic_fetch_add(&blend.dominant_counts[blend.ids[place.begin + last]], run, __ATOMIC_RELAXED);
-    run = 0;
-  };
-  place.each_pixel([&](int64_t pixel, int64_t to) {
-    const int64_t winner = canvas.winner[pixel];
-    if (winner != last) {
-      flush();
-      last = winner;
-    }
-    run += !blend.kept || blend.kept[to];
+void count_winners(const Blend<Real> &blend, const Place<Real> &place, Canvas<Real> &canvas) {
+  // counted in the tile first: a splat's own count is far away, and shared by all threads
+  canvas.won.assign(size_t(blend.n_reached[place.tile]) + 1, 0);
+  place.each_row([&](int64_t pixel, int64_t to) {
+    for (int64_t x = 0; x < place.columns(); x++)
+      canvas.won[canvas.winner[pixel + x] + 1] += !blend.kept || blend.kept[to + x];
   });
-  flush();
+  for (size_t k = 1; k < canvas.won.size(); k++)
+    if (canvas.won[k] > 0) {
+      const int64_t id = blend.ids[place.begin + k - 1];
+      __atomic_fetch_add(&blend.dominant_counts[id], canvas.won[k], __ATOMIC_RELAXED);
+    }
 }
 
-template <class Real> void write(const Blend<Real> &blend, const Place<Real> &place, const Canvas<Real> &canvas) {
+template <class Real> void write(const Blend<Real> &blend, const Place<Real> &place, Canvas<Real> &canvas) {
   const int64_t n = place.columns();
   place.each_row([&](int64_t pixel, int64_t to) {
     if (blend.alphas) std::copy_n(&canvas.alphas[pixel], n, blend.alphas + to);
@@ -140,7 +143,7 @@ template <class Real> void write(const Blend<Real> &blend, const Place<Real> &pl
   });
 }
 
-template <class Real, int D, bool ROW, bool DOMINANCE>
+template <class Real, int D, bool ROW, bool DOMINANCE, bool COUNT = false>
 void blend_tile(const Blend<Real> &blend, const Pixels<Real> &pixels, int64_t tile, Canvas<Real> &canvas) {
   const Place<Real> place(blend, tile);
   const Thresholds<Real> thresholds(blend);
@@ -153,16 +156,19 @@ void blend_tile(const Blend<Real> &blend, const Pixels<Real> &pixels, int64_t ti
     canvas.rows.look(entries, pixels, thresholds);
     const int64_t chunk = blend.transmittances ? blend.first_chunks[tile] + (at - place.begin) / CHUNK : 0;
     if (blend.transmittances) std::copy(canvas.T.begin(), canvas.T.end(), blend.transmittances + chunk * canvas.padded);
+    // visits are counted of entries that reach no pixel too
+    const uint32_t all_of_them = (uint32_t(1) << entries.count) - 1;
     for (int strip = 0; strip < pixels.strips; strip++) {
-      uint32_t reached = 0;
-      if (canvas.lit(strip)) {
+      if (canvas.lit(strip))
         pairs += int64_t(entries.count) * std::min(LANES<Real>, pixels.count - strip * LANES<Real>);
-        // visits are counted of entries that reach no pixel too
-        const uint32_t all_of_them = (uint32_t(1) << entries.count) - 1;
-        const uint32_t marks = blend.n_traversed ? all_of_them : canvas.rows.of_strip(pixels, strip);
-        reached = blend_strip<Real, D, ROW, DOMINANCE>(blend, thresholds, pixels, at - place.begin, strip, marks, canvas);
+      for (int piece = 0; piece < PIECES; piece++) {
+        uint32_t reached = 0;
+        if (canvas.lit(strip, piece)) {
+          const uint32_t marks = COUNT ? all_of_them : canvas.rows.of_piece(pixels, strip, piece);
+          reached = blend_piece<Real, D, ROW, DOMINANCE, COUNT>(blend, thresholds, pixels, strip, piece, marks, canvas);
+        }
+        if (blend.reached) blend.reached[(chunk * pixels.strips + strip) * PIECES + piece] = uint16_t(reached);
       }
-      if (blend.reached) blend.reached[chunk * pixels.strips + strip] = uint16_t(reached);
     }
   }
   blend.n_reached[tile] = at - place.begin;
@@ -174,6 +180,10 @@ void blend_tile(const Blend<Real> &blend, const Pixels<Real> &pixels, int64_t ti
 template <class Real>
 auto blend_tile_function(const Blend<Real> &blend, const Pixels<Real> &pixels)
     -> void (*)(const Blend<Real> &, const Pixels<Real> &, int64_t, Canvas<Real> &) {
+  if (blend.n_traversed) {
+    if (blend.channels != 3) return blend_tile<Real, 0, false, true, true>;
+    return pixels.strips_are_rows() ? blend_tile<Real, 3, true, true, true> : blend_tile<Real, 3, false, true, true>;
+  }
   if (blend.channels != 3) return blend.dominance() ? blend_tile<Real, 0, false, true> : blend_tile<Real, 0, false, false>;
   if (pixels.strips_are_rows()) return blend.dominance() ? blend_tile<Real, 3, true, true> : blend_tile<Real, 3, true, false>;
   return blend.dominance() ? blend_tile<Real, 3, false, true> : blend_tile<Real, 3, false, false>;

@@ -4,6 +4,9 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <new>
+#include <type_traits>
+#include <vector>
 
 #ifdef __SSE2__
 #include <immintrin.h>
@@ -48,6 +51,11 @@ template <class Real> using Whole = typename Lanes<Real>::whole;  // an integer 
 template <class Real> using Vec = Chunk<Real, 64>;
 template <class Real> using Mask = Chunk<Whole<Real>, 64>;  // such integers; as a condition -1 where true
 template <class Real> constexpr int LANES = 64 / sizeof(Real);
+// What is blended at once: all lanes where one register holds them, else each half, which is left out where nothing
+// happens in it, and whose sums then stay in registers. What a lane adds up, and in which order, is the same.
+constexpr int PIECES = WHOLE == 64 ? 1 : 2;
+template <class Real> using Piece = Chunk<Real, 64 / PIECES>;
+template <class Real> constexpr int PIECE_LANES = LANES<Real> / PIECES;
 
 // A vector that the processor has no registers for. GCC compares and selects one of those number by number and keeps it
 // in memory, a quarter of the speed, so that its halves are told apart here.
@@ -131,18 +139,47 @@ template <class C> inline C fnma(C a, C b, C c) {
   template <> inline Chunk<Real, WHOLE> fnma(Chunk<Real, WHOLE> a, Chunk<Real, WHOLE> b, Chunk<Real, WHOLE> c) {     \
     return Chunk<Real, WHOLE>(call##_fnmadd_##kind(a, b, c));                                                        \
   }
-#if defined(__AVX512DQ__)
-POP_FUSED(float, _mm512, ps)
-POP_FUSED(double, _mm512, pd)
-#elif defined(__AVX2__)
-POP_FUSED(float, _mm256, ps)
-POP_FUSED(double, _mm256, pd)
 #else
-POP_FUSED(float, _mm, ps)
-POP_FUSED(double, _mm, pd)
+#define POP_FUSED(Real, call, kind)
+#endif
+
+// a < b ? a : b and a > b ? a : b: b where one of them is not a number, as the processor's own instructions have it
+template <class C> inline C least(C a, C b) {
+  if constexpr (sizeof(C) > WHOLE) {
+    return {least(a.low, b.low), least(a.high, b.high)};
+  } else {
+    return a < b ? a : b;
+  }
+}
+template <class C> inline C most(C a, C b) {
+  if constexpr (sizeof(C) > WHOLE) {
+    return {most(a.low, b.low), most(a.high, b.high)};
+  } else {
+    return a > b ? a : b;
+  }
+}
+#define POP_EXTREMES(Real, call, kind)                                                      \
+  template <> inline Chunk<Real, WHOLE> least(Chunk<Real, WHOLE> a, Chunk<Real, WHOLE> b) { \
+    return Chunk<Real, WHOLE>(call##_min_##kind(a, b));                                     \
+  }                                                                                         \
+  template <> inline Chunk<Real, WHOLE> most(Chunk<Real, WHOLE> a, Chunk<Real, WHOLE> b) {  \
+    return Chunk<Real, WHOLE>(call##_max_##kind(a, b));                                     \
+  }
+#define POP_INSTRUCTIONS(call)  \
+  POP_FUSED(float, call, ps)    \
+  POP_FUSED(double, call, pd)   \
+  POP_EXTREMES(float, call, ps) \
+  POP_EXTREMES(double, call, pd)
+#if defined(__AVX512DQ__)
+POP_INSTRUCTIONS(_mm512)
+#elif defined(__AVX2__)
+POP_INSTRUCTIONS(_mm256)
+#elif defined(__SSE2__)
+POP_INSTRUCTIONS(_mm)
 #endif
 #undef POP_FUSED
-#endif
+#undef POP_EXTREMES
+#undef POP_INSTRUCTIONS
 
 // the same bits as numbers of another kind
 template <class To, class From> inline To bits_of(From from) {
@@ -154,6 +191,14 @@ template <class To, class From> inline To bits_of(From from) {
   } else {
     return {bits_of<typename To::Half>(from.low), bits_of<typename To::Half>(from.high)};
   }
+}
+
+// the size of every lane, without its sign
+template <class C> inline C size_of(C chunk) {
+  using Number = std::decay_t<decltype(chunk[0])>;
+  using Digits = Chunk<Whole<Number>, sizeof(C)>;
+  constexpr auto digits = sizeof(Number) == 4 ? Whole<Number>(0x7fffffff) : Whole<Number>(0x7fffffffffffffff);
+  return bits_of<C>(bits_of<Digits>(chunk) & digits);
 }
 
 // both halves of a chunk
@@ -187,23 +232,41 @@ template <class C, class Real> inline void store_chunk(Real *to, C chunk) {
   }
 }
 
+// Numbers in memory that begin where a line of the cache does: loads of lanes then never lie in two lines.
+template <class T> struct LineAllocator {
+  using value_type = T;
+  LineAllocator() = default;
+  template <class U> LineAllocator(const LineAllocator<U> &) {}
+  T *allocate(size_t n) { return static_cast<T *>(::operator new(n * sizeof(T), std::align_val_t(64))); }
+  void deallocate(T *at, size_t) { ::operator delete(at, std::align_val_t(64)); }
+  friend bool operator==(LineAllocator, LineAllocator) { return true; }
+  friend bool operator!=(LineAllocator, LineAllocator) { return false; }
+};
+template <class T> using Numbers = std::vector<T, LineAllocator<T>>;
+
 template <class Real> inline Vec<Real> load(const Real *from) { return load_chunk<Vec<Real>>(from); }
 template <class Real> inline void store(Real *to, Vec<Real> v) { store_chunk(to, v); }
 template <class Real> inline Mask<Real> load_whole(const Whole<Real> *from) { return load_chunk<Mask<Real>>(from); }
 template <class Real> inline void store_whole(Whole<Real> *to, Mask<Real> v) { store_chunk(to, v); }
 
 template <class Real> inline Vec<Real> all(Real x) { return Vec<Real>{} + x; }
+template <class Real> inline Piece<Real> load_piece(const Real *from) { return load_chunk<Piece<Real>>(from); }
 
 // whether a mask is true in any lane
 template <class M> inline bool any(M mask) {
   if constexpr (sizeof(M) > WHOLE) {
     return any(mask.low | mask.high);
-  } else if constexpr (sizeof(M) > 16) {
-    const auto halves = halves_of<int64_t>(mask);
-    return any(halves.low | halves.high);
   } else {
+#if defined(__AVX512DQ__)
+    if constexpr (sizeof(M) == 64) return _mm512_movepi32_mask(__m512i(mask)) != 0;
+#elif defined(__AVX2__)
+    if constexpr (sizeof(M) == 32) return _mm256_movemask_epi8(__m256i(mask)) != 0;
+#elif defined(__SSE2__)
+    if constexpr (sizeof(M) == 16) return _mm_movemask_epi8(__m128i(mask)) != 0;
+#else
     const auto rest = bits_of<Chunk<int64_t, 16>>(mask);
     return (rest[0] | rest[1]) != 0;
+#endif
   }
 }
 
@@ -283,17 +346,17 @@ template <> inline void sums_of_rows<float>(const float *rows, float sums[16]) {
 
 // 2^e for e < 128, within a unit in the last place and exact for whole numbers; what would be subnormal is 0 or 2^-126,
 // far under any alpha floor. 2^e = 2^i 2^f with |f| <= 1/2: the minimax polynomial of degree 6 is 1.9e-9 off.
-inline Vec<float> exp2_of(Vec<float> e) {
+template <class C> inline C exp2_of_floats(C e) {
 #ifdef __AVX512DQ__
   // what is left of e after the nearest integer, and the scaling by 2^i, are instructions
-  const Vec<float> f = Vec<float>(_mm512_reduce_ps(__m512(e), _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC));
+  const C f = C(_mm512_reduce_ps(__m512(e), _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC));
 #else
-  e = select(e < -126.0f, all(-126.0f), e);
-  const Vec<float> shift = all(12582912.0f);  // 1.5 * 2^23: adding it leaves the nearest integer in the low bits
-  const Vec<float> shifted = e + shift;
-  const Vec<float> f = e - (shifted - shift);
+  e = most(C{} + -126.0f, e);
+  const C shift = C{} + 12582912.0f;  // 1.5 * 2^23: adding it leaves the nearest integer in the low bits
+  const C shifted = e + shift;
+  const C f = e - (shifted - shift);
 #endif
-  Vec<float> p = all(1.53458120e-04f);
+  C p = C{} + 1.53458120e-04f;
   p = p * f + 1.33999312e-03f;
   p = p * f + 9.61848896e-03f;
   p = p * f + 5.55032878e-02f;
@@ -301,17 +364,23 @@ inline Vec<float> exp2_of(Vec<float> e) {
   p = p * f + 6.93147206e-01f;
   p = p * f + 1.0f;
 #ifdef __AVX512DQ__
-  return Vec<float>(_mm512_scalef_ps(__m512(p), _mm512_roundscale_ps(__m512(e), _MM_FROUND_TO_NEAREST_INT)));
+  return C(_mm512_scalef_ps(__m512(p), _mm512_roundscale_ps(__m512(e), _MM_FROUND_TO_NEAREST_INT)));
 #else
-  return bits_of<Vec<float>>(bits_of<Mask<float>>(p) + (bits_of<Mask<float>>(shifted) << 23));
+  using Truth = Chunk<int32_t, sizeof(C)>;
+  return bits_of<C>(bits_of<Truth>(p) + (bits_of<Truth>(shifted) << 23));
 #endif
 }
 
-inline Vec<double> exp2_of(Vec<double> e) {
-  double lanes[LANES<double>];
-  store(lanes, e);
-  for (double &lane : lanes) lane = std::exp2(lane);
-  return load(lanes);
+// 2^e in every lane of a strip or of a part of it.
+template <class Real, class C> inline C exp2_of(C e) {
+  if constexpr (sizeof(Real) == 4) {
+    return exp2_of_floats(e);
+  } else {
+    double lanes[sizeof(C) / sizeof(double)];
+    store_chunk(lanes, e);
+    for (double &lane : lanes) lane = std::exp2(lane);
+    return load_chunk<C>(lanes);
+  }
 }
 
 }  // namespace pop

@@ -28,7 +28,7 @@ constexpr int MOMENTS = 31;       // second moments of dC_c/d(mean2d, conic) and
 
 // Sums of a chunk's entries, in every lane. [columns, entries of a chunk, lanes]
 template <class Real> struct LaneSums {
-  std::vector<Real> kept;
+  Numbers<Real> kept;
 
   explicit LaneSums(int columns) : kept(size_t(columns) * CHUNK * LANES<Real>) {}
   Real *at(int column, int k) { return &kept[(column * CHUNK + k) * LANES<Real>]; }
@@ -46,7 +46,7 @@ template <class Real> struct LaneSums {
 
 // The light of a tile's pixels on the way through its list.
 template <class Real> struct TileState {
-  std::vector<Real> T;
+  Numbers<Real> T;
   Entries<Real> entries;
   Rows<Real> rows;
 
@@ -85,12 +85,12 @@ void walk(const Blend<Real> &blend, const Pixels<Real> &pixels, int64_t tile, Ti
         const int at = strip * LANES<Real>;
         const Vec<Real> x = load(&pixels.x[at]), y = load(&pixels.y[at]);
         Vec<Real> T = load(&state.T[at]);
-        each_marked(state.rows.of_strip(pixels, strip), [&](int k) {
+        each_marked(state.rows.of_strip(pixels, strip), [&](int k, uint32_t bit) {
           const Vec<Real> T_before = T;
           Vec<Real> alpha, weight;
           take(thresholds, exponent<Real, ROW>(state.entries, state.rows, strip, k, x, y), T, alpha, weight);
           // also the entry at which a pixel stops, which has no weight there
-          took |= uint32_t(any(T < T_before)) << k;
+          took |= any(T < T_before) ? bit : 0;
           pair(k, strip, alpha, weight);
         });
         store(&state.T[at], T);
@@ -113,7 +113,7 @@ template <class Real> inline Vec<Real> root_of(Vec<Real> v) {
 template <class Real> struct ContributionsState {
   TileState<Real> tile;
   LaneSums<Real> sums;
-  std::vector<Real> map;
+  Numbers<Real> map;
 
   explicit ContributionsState(const Pixels<Real> &pixels) : tile(pixels), sums(CONTRIBUTIONS), map(pixels.padded()) {}
 };
@@ -148,9 +148,9 @@ template <class Real, int D> struct BackState {
   TileState<Real> tile;
   Again<Real> again;
   LaneSums<Real> sums;
-  std::vector<Real> transmittances;       // T before every chunk. [chunks, pixels]
-  std::vector<uint16_t> reached;  // [chunks, strips]
-  std::vector<Real> suffix_color;       // [D, pixels]
+  Numbers<Real> transmittances;       // T before every chunk. [chunks, pixels]
+  std::vector<uint16_t> reached;  // the same in all pieces of a strip. [chunks, strips, PIECES]
+  Numbers<Real> suffix_color;       // [D, pixels]
 
   BackState(const Pixels<Real> &pixels, int columns)
       : tile(pixels), again(pixels), sums(columns), suffix_color(D * pixels.padded()) {}
@@ -168,14 +168,16 @@ void walk_back(const Scores<Real> &scores, const Pixels<Real> &pixels, int64_t t
   const int64_t most = (place.end - place.begin + CHUNK - 1) / CHUNK;
   if (int64_t(state.transmittances.size()) < most * padded) {
     state.transmittances.resize(most * padded);
-    state.reached.resize(most * strips);
+    state.reached.resize(most * strips * PIECES);
   }
   int64_t n_chunks = 0;
   walk<Real, ROW>(
       scores, pixels, tile, state.tile,
       [&](int64_t chunk) { std::copy(state.tile.T.begin(), state.tile.T.end(), &state.transmittances[chunk * padded]); },
       [](int, int, Vec<Real>, Vec<Real>) {},
-      [&](int strip, uint32_t took) { state.reached[n_chunks * strips + strip] = uint16_t(took); },
+      [&](int strip, uint32_t took) {
+        std::fill_n(&state.reached[(n_chunks * strips + strip) * PIECES], PIECES, uint16_t(took));
+      },
       [&](int64_t, int64_t) { n_chunks++; });
   for (int d = 0; d < D; d++) std::fill_n(state.suffix_color_of(d, 0), padded, scores.background[d]);
   const int64_t n_reached = scores.n_reached[tile];
@@ -185,7 +187,7 @@ void walk_back(const Scores<Real> &scores, const Pixels<Real> &pixels, int64_t t
     state.again.entries.gather(scores, place, first, n, first - CHUNK);
     if (ROW) state.again.rows.expand(state.again.entries, pixels);
     state.again.template blend_again<ROW>(thresholds, pixels, &state.transmittances[chunk * padded],
-                                          &state.reached[chunk * strips]);
+                                          &state.reached[chunk * strips * PIECES]);
     state.sums.clear();
     for (int k = n - 1; k >= 0; k--)
       if (state.again.marked(k)) entry(k);
@@ -200,16 +202,19 @@ void sensitivities_of_tile(const Scores<Real> &scores, const Pixels<Real> &pixel
   walk_back<Real, 1, ROW>(scores, pixels, tile, SENSITIVITIES, state, [&](int k) {
     const Again<Real> &again = state.again;
     const Real color = again.entries.color[k][0];
-    Vec<Real> total = {};
-    again.each_strip(k, [&](int strip) {
-      const int at = strip * LANES<Real>, place = k * again.padded + at;
-      const Vec<Real> alpha = load(&again.alphas[place]), weight = load(&again.weights[place]), none = {};
-      const Vec<Real> suffix_color = load(state.suffix_color_of(0, at)), q = color - suffix_color;
-      store(state.suffix_color_of(0, at), suffix_color + alpha * q);
-      const Vec<Real> slope = select(alpha > Real(0), q * (weight / alpha), none);
-      total += slope * slope;
-    });
-    store(state.sums.at(0, k), total);
+    using V = Piece<Real>;
+    for (int piece = 0; piece < PIECES; piece++) {
+      const int lane = piece * PIECE_LANES<Real>;
+      V total = {};
+      again.each_strip(k, piece, [&](int strip, V alpha, V weight) {
+        Real *suffix = state.suffix_color_of(0, strip * LANES<Real> + lane);
+        const V suffix_color = load_piece(suffix), q = color - suffix_color, none = {};
+        store_chunk(suffix, suffix_color + alpha * q);
+        const V slope = select(alpha > Real(0), q * (weight / alpha), none);
+        total += slope * slope;
+      });
+      store_chunk(state.sums.at(0, k) + lane, total);
+    }
   });
 }
 
@@ -223,41 +228,45 @@ void moments_of_tile(const Scores<Real> &scores, const Pixels<Real> &pixels, int
     const Real half = Real(0.5), ln_2 = Real(0.6931471805599453);
     // the coefficients are those of log2(alpha)
     const Real A = Real(-2) * ln_2 * entries.f[3][k], B = -ln_2 * entries.f[4][k], C = Real(-2) * ln_2 * entries.f[5][k];
-    Vec<Real> total[MOMENTS] = {};
-    again.each_strip(k, [&](int strip) {
-      const int at = strip * LANES<Real>, of_pair = k * again.padded + at;
-      const Vec<Real> alpha = load(&again.alphas[of_pair]), weight = load(&again.weights[of_pair]);
-      const Vec<Real> x = load(&pixels.x[at]), y = load(&pixels.y[at]), dx = entries.u[k] - x, dy = entries.v[k] - y;
-      Vec<Real> through = weight;
-      if (any(alpha >= thresholds.ceiling))
-        through = through_ceiling<Real>(scores, thresholds.ceiling,
-                                        exponent<Real, ROW>(entries, again.rows, strip, k, x, y), alpha, weight);
-      const Vec<Real> s[5] = {fma(all(A), dx, B * dy), fma(all(B), dx, C * dy), half * dx * dx, dx * dy, half * dy * dy};
-      Vec<Real> G[3], squares = {};
-      for (int c = 0; c < 3; c++) {
-        const Vec<Real> suffix_color = load(state.suffix_color_of(c, at)), more = entries.rgb[k][c] - suffix_color;
-        store(state.suffix_color_of(c, at), suffix_color + alpha * more);
-        G[c] = through * more;
-        squares += G[c] * G[c];
-        G[c] *= weight;
-      }
-      int column = 0;
-      for (int i = 0; i < 5; i++) {
-        const Vec<Real> weighted = squares * s[i];
-        for (int j = i; j < 5; j++) total[column++] += weighted * s[j];
-      }
-      for (int c = 0; c < 3; c++)
-        for (int i = 0; i < 5; i++) total[column++] -= G[c] * s[i];
-      total[column] += weight * weight;
-    });
-    for (int column = 0; column < MOMENTS; column++) store(state.sums.at(column, k), total[column]);
+    using V = Piece<Real>;
+    for (int piece = 0; piece < PIECES; piece++) {
+      const int lane = piece * PIECE_LANES<Real>;
+      V total[MOMENTS] = {};
+      again.each_strip(k, piece, [&](int strip, V alpha, V weight) {
+        const int at = strip * LANES<Real> + lane;
+        const V x = load_piece(&pixels.x[at]), y = load_piece(&pixels.y[at]), dx = entries.u[k] - x, dy = entries.v[k] - y;
+        V through = weight;
+        if (any(alpha >= thresholds.ceiling))
+          through = through_ceiling<Real>(scores, thresholds.ceiling,
+                                          exponent<Real, ROW>(entries, again.rows, strip, k, x, y), alpha, weight);
+        const V s[5] = {fma(V{} + A, dx, B * dy), fma(V{} + B, dx, C * dy), half * dx * dx, dx * dy, half * dy * dy};
+        V G[3], squares = {};
+        for (int c = 0; c < 3; c++) {
+          Real *suffix = state.suffix_color_of(c, at);
+          const V suffix_color = load_piece(suffix), more = entries.rgb[k][c] - suffix_color;
+          store_chunk(suffix, suffix_color + alpha * more);
+          G[c] = through * more;
+          squares += G[c] * G[c];
+          G[c] *= weight;
+        }
+        int column = 0;
+        for (int i = 0; i < 5; i++) {
+          const V weighted = squares * s[i];
+          for (int j = i; j < 5; j++) total[column++] += weighted * s[j];
+        }
+        for (int c = 0; c < 3; c++)
+          for (int i = 0; i < 5; i++) total[column++] -= G[c] * s[i];
+        total[column] += weight * weight;
+      });
+      for (int column = 0; column < MOMENTS; column++) store_chunk(state.sums.at(column, k) + lane, total[column]);
+    }
   });
 }
 
 template <class Real> struct PointsState {
   TileState<Real> tile;
-  std::vector<Real> across, down, best, left;  // the rays' directions in the camera's axes, z being 1; T
-  std::vector<Whole<Real>> winner;
+  Numbers<Real> across, down, best, left;  // the rays' directions in the camera's axes, z being 1; T
+  Numbers<Whole<Real>> winner;
   Real facing[CHUNK][3];
 
   explicit PointsState(const Pixels<Real> &pixels)

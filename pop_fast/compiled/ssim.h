@@ -137,7 +137,7 @@ inline Vec<double> widened(Vec<float> v) {
 
 // Three maps under every window of one row: blurred down into lines, then across; f(first column, blurred).
 template <class Real> struct Blur {
-  std::vector<Real> lines[3];
+  Numbers<Real> lines[3];
   explicit Blur(int64_t stride) {
     for (auto &line : lines) line.assign(size_t(stride), Real(0));
   }
@@ -163,7 +163,7 @@ template <class Real> struct Blur {
 
 // What a thread works with: d, d^2 and d y on the rows that some rows of windows read.
 template <class Real> struct Products {
-  std::vector<Real> maps;
+  Numbers<Real> maps;
   int64_t rows, stride;
   Blur<Real> blur;
   explicit Products(int64_t stride)

@@ -269,7 +269,7 @@ Work Stepper::place_entries() {
   blend.ids = to_ids;
   blend.slots = to_slots;
   blend.transmittances = transmittances.get(n_chunks * pixels.padded());
-  blend.reached = reached.get(n_chunks * pixels.strips);
+  blend.reached = reached.get(n_chunks * pixels.strips * PIECES);
   blend.rows = rows.get(total * blend.columns());
   return {n_visible, part, [=](int, int64_t first, int64_t last) {
             int64_t *const next = &starts[size_t(first / part * n_tiles)];

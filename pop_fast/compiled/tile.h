@@ -2,7 +2,7 @@
 //
 // A strip is as many of the tile's pixels as there are lanes, row by row; in tiles of 16 px and float it is one row.
 // Sixteen list entries are taken at a time. On a row log2(alpha) is a parabola in x, whose maximum says, for sixteen
-// entries at once, which of them may reach the alpha floor there: only those are blended into the strip.
+// entries at once, which of them may reach the alpha floor there, or in a piece of it: only those are blended into it.
 #pragma once
 
 #include <algorithm>
@@ -44,7 +44,7 @@ template <class Real> struct Blend {
   int64_t ceiling_passes;                   // B3: whether the gradient goes through the ceiling
   Splat *splats;                            // the forward pass makes them, and the transpose takes them. [N]
   Real *transmittances;                             // T before every chunk, for the transpose. [chunks, strips, lanes]
-  uint16_t *reached;                        // likewise, which entries of a chunk blend in a strip. [chunks, strips]
+  uint16_t *reached;                        // likewise, which entries blend in a piece. [chunks, strips, PIECES]
   int64_t *n_reached, *n_pairs;             // entries blended before all pixels had stopped; pairs. [tiles]
   Real *image, *alphas;                     // [H, W, D] or [D, H, W], [H, W]
   int64_t *dominant_ids;                    // D8. [H, W]
@@ -67,7 +67,7 @@ template <class Real> struct Blend {
 // Pixel centres from the tile's centre, padded to whole strips of lanes, and the rows that each strip is of.
 template <class Real> struct Pixels {
   int size, count, strips;
-  std::vector<Real> x, y;
+  Numbers<Real> x, y;
   std::vector<int> first_row, last_row;
 
   explicit Pixels(int size)
@@ -92,10 +92,10 @@ template <class Real> struct Pixels {
 
 // Where a tile lies in the image, and its list.
 template <class Real> struct Place {
-  int64_t left, top, begin, end, size, width, height;
+  int64_t tile, left, top, begin, end, size, width, height;
 
   Place(const Blend<Real> &blend, int64_t tile)
-      : left(tile % blend.tiles_x * blend.tile_size), top(tile / blend.tiles_x * blend.tile_size),
+      : tile(tile), left(tile % blend.tiles_x * blend.tile_size), top(tile / blend.tiles_x * blend.tile_size),
         begin(blend.offsets[tile]), end(blend.offsets[tile + 1]), size(blend.tile_size), width(blend.width),
         height(blend.height) {}
 
@@ -121,6 +121,7 @@ template <class Real> struct Entries {
   int count;
   alignas(64) Real f[6][CHUNK], u[CHUNK], v[CHUNK];  // u, v: splat's centre from the tile's
   alignas(64) Real rgb[CHUNK][4];                    // where there are three channels, or the step's four
+  Whole<Real> places[CHUNK];                         // in the tile's list
   const Real *color[CHUNK];
 
   // n entries from `first` on; those from `next` on are asked for while these are worked on
@@ -139,6 +140,7 @@ template <class Real> struct Entries {
       b[k] = s.b;
       c[k] = s.c;
       top[k] = s.log2_opacity;
+      places[k] = Whole<Real>(first - place.begin + k);
       // without channels nothing is read, and torch gives a null pointer for what is empty
       if (blend.channels == 0 || (blend.colors && blend.channels != 3)) {
         color[k] = blend.colors + id * blend.channels;
@@ -175,10 +177,10 @@ template <class Real> struct Thresholds {
 // log2(alpha) of a chunk's entries on every row of the tile: f3 x^2 + linear x + constant.
 template <class Real> struct Rows {
   using Line = Real[CHUNK];
-  std::vector<Real> kept;
-  std::vector<uint16_t> may;  // which entries may reach the alpha floor on a row
+  Numbers<Real> kept;
+  std::vector<uint16_t> may;  // which entries may reach the alpha floor in a piece of a row. [rows, PIECES]
 
-  explicit Rows(int size) : kept(size_t(2 * CHUNK) * size), may(size) {}
+  explicit Rows(int size) : kept(size_t(2 * CHUNK) * size), may(size_t(size * PIECES)) {}
   Real *linear(int row) { return kept.data() + 2 * CHUNK * row; }
   Real *constant(int row) { return linear(row) + CHUNK; }
   const Real *linear(int row) const { return kept.data() + 2 * CHUNK * row; }
@@ -198,53 +200,64 @@ template <class Real> struct Rows {
   void look(const Entries<Real> &entries, const Pixels<Real> &pixels, const Thresholds<Real> &thresholds) {
     const Real edge = Real(0.5) * (pixels.size - 1), digits = sizeof(Real) == 4 ? Real(1e-6) : Real(1e-14);
     const uint32_t present = (uint32_t(1) << entries.count) - 1;
-    for (int row = 0; row < pixels.size; row++) may[row] = 0;
+    // the first and last pixel of every piece of a row; pieces of strips that are no rows are not told apart
+    const int pieces = pixels.strips_are_rows() ? PIECES : 1;
+    const Real width = Real(pixels.size) / pieces;
+    std::fill(may.begin(), may.end(), 0);
     for (int k = 0; k < CHUNK; k += LANES<Real>) {
       const Vec<Real> f3 = load(&entries.f[3][k]), vertex = Real(-0.5) / f3;
       for (int row = 0; row < pixels.size; row++) {
         const Vec<Real> c1 = load(linear(row) + k), c0 = load(constant(row) + k);
-        Vec<Real> x = c1 * vertex;
-        x = select(x < -edge, all(-edge), x);
-        x = select(x > edge, all(edge), x);
-        const Vec<Real> square = x * x * f3, mixed = x * c1;
-        const Vec<Real> size = select(mixed < Real(0), -mixed, mixed) + select(c0 < Real(0), -c0, c0) - square;
-        const Mask<Real> under = square + mixed + c0 + digits * size < thresholds.skip;
-        may[row] |= uint16_t((~lanes_of<Real>(under & (f3 < Real(0))) & ((1 << LANES<Real>) - 1)) << k & present);
+        for (int piece = 0; piece < pieces; piece++) {
+          const Real low = piece * width - edge, high = low + (width - 1);
+          const Vec<Real> x = least(all(high), most(all(low), c1 * vertex));
+          const Vec<Real> square = x * x * f3, mixed = x * c1, size = size_of(mixed) + size_of(c0) - square;
+          const Mask<Real> under = square + mixed + c0 + digits * size < thresholds.skip;
+          const uint32_t over = ~lanes_of<Real>(under & (f3 < Real(0))) & ((1 << LANES<Real>) - 1);
+          may[row * PIECES + piece] |= uint16_t(over << k & present);
+        }
       }
     }
   }
 
   uint32_t of_strip(const Pixels<Real> &pixels, int strip) const {
     uint32_t found = 0;
-    for (int row = pixels.first_row[strip]; row <= pixels.last_row[strip]; row++) found |= may[row];
+    for (int of = pixels.first_row[strip] * PIECES; of < (pixels.last_row[strip] + 1) * PIECES; of++) found |= may[of];
+    return found;
+  }
+  uint32_t of_piece(const Pixels<Real> &pixels, int strip, int piece) const {
+    if (pixels.strips_are_rows()) return may[strip * PIECES + piece];
+    const int first = (strip * PIECES + piece) * PIECE_LANES<Real>;
+    const int last = std::min(pixels.count, first + PIECE_LANES<Real>) - 1;
+    uint32_t found = 0;
+    for (int row = first / pixels.size; row <= last / pixels.size; row++) found |= may[row * PIECES];
     return found;
   }
 };
 
-// log2(alpha) of entry k in the lanes of a strip; ROW where strips are rows.
-template <class Real, bool ROW>
-inline Vec<Real> exponent(const Entries<Real> &entries, const Rows<Real> &rows, int strip, int k, Vec<Real> x,
-                          Vec<Real> y) {
+// log2(alpha) of entry k in lanes of a strip; ROW where strips are rows.
+template <class Real, bool ROW, class C>
+inline C exponent(const Entries<Real> &entries, const Rows<Real> &rows, int strip, int k, C x, C y) {
   if constexpr (ROW) return x * (x * entries.f[3][k] + rows.linear(strip)[k]) + rows.constant(strip)[k];
-  const Vec<Real> linear = y * entries.f[4][k] + entries.f[1][k];
+  const C linear = y * entries.f[4][k] + entries.f[1][k];
   return x * (x * entries.f[3][k] + linear) + (y * (y * entries.f[5][k] + entries.f[2][k]) + entries.f[0][k]);
 }
 
-// Blend one entry into one strip: T goes down; alpha and weight are 0 from where a pixel stops.
-template <class Real>
-inline void take(const Thresholds<Real> &thresholds, Vec<Real> e, Vec<Real> &T, Vec<Real> &alpha, Vec<Real> &weight) {
-  const Vec<Real> none = {}, raw = exp2_of(e), capped = select(raw > thresholds.ceiling, all(thresholds.ceiling), raw);
+// Blend one entry into lanes of a strip: T goes down; alpha and weight are 0 from where a pixel stops.
+template <class Real, class C>
+inline void take(const Thresholds<Real> &thresholds, C e, C &T, C &alpha, C &weight) {
+  const C none = {}, raw = exp2_of<Real>(e), capped = least(C{} + thresholds.ceiling, raw);
   alpha = select(raw > thresholds.floor, capped, none);
-  const Vec<Real> next = fnma(T, alpha, T);
-  const Mask<Real> lives = next > thresholds.stop;
+  const C next = fnma(T, alpha, T);
+  const auto lives = next > thresholds.stop;
   weight = select(lives, T * alpha, none);
   alpha = select(lives, alpha, none);
   T = select(lives, next, none);
 }
 
-// The entries of a chunk that are marked, one after the other.
+// Calls f(k, bit k) for the entries of a chunk that are marked, one after the other.
 template <class F> inline void each_marked(uint32_t marks, F f) {
-  for (; marks; marks &= marks - 1) f(__builtin_ctz(marks));
+  for (; marks; marks &= marks - 1) f(__builtin_ctz(marks), marks & -marks);
 }
 
 }  // namespace pop

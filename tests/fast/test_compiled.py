@@ -392,6 +392,9 @@ template <class Real> void judge(std::mt19937 &random) {
     same("u >= v", (u >= v)[i], a[i] >= b[i] ? -1 : 0);
     same("u <= bound", (u <= bound)[i], a[i] <= bound ? -1 : 0);
     same("select", select(u < v, u, v)[i], a[i] < b[i] ? a[i] : b[i]);
+    same("least", least(u, v)[i], a[i] < b[i] ? a[i] : b[i]);
+    same("most", most(u, v)[i], a[i] > b[i] ? a[i] : b[i]);
+    same("size_of", size_of(u)[i], std::abs(a[i]));
     same("select of whole numbers", select(u < v, whole, Mask<Real>{})[i], a[i] < b[i] ? places[i] : 0);
     under |= uint32_t(a[i] < b[i]) << i;
     over |= uint32_t(a[i] < b[i] && b[i] > bound) << i;
@@ -416,9 +419,12 @@ template <class Real> void judge(std::mt19937 &random) {
     same("widened", wide[i], n == 8 ? double(rows[i]) : double(rows[i]) + double(rows[(i + 8) % n]));
   Vec<Real> e = load(rows);
   for (int i = 0; i < n; i++) {
-    const double found = exp2_of(e)[i], asked = std::exp2(double(rows[i]));
+    const double found = exp2_of<Real>(e)[i], asked = std::exp2(double(rows[i]));
     if (!(std::abs(found - asked) <= 3e-7 * asked)) same("exp2_of", found, asked);
-    same("exp2_of a whole number", exp2_of(all(Real(-i)))[i], std::exp2(-i));
+    same("exp2_of a whole number", exp2_of<Real>(all(Real(-i)))[i], std::exp2(-i));
+    const int piece = i / PIECE_LANES<Real>, lane = i % PIECE_LANES<Real>;
+    same("exp2_of a piece", exp2_of<Real>(load_piece(rows + piece * PIECE_LANES<Real>))[lane], found);
+    same("any of a piece", any(load_piece(rows + piece * PIECE_LANES<Real>) >= rows[i]), 1);
   }
   for (int64_t some = 0; some <= n; some++) {
     Real out[n] = {};
