@@ -420,7 +420,7 @@ def _is_row(row: Any) -> bool:
 
 def _write_splat(results: ResultFolder, config: TrainConfig, capture: Capture, params: dict[str, Tensor]) -> None:
     step = config.max_steps - 1
-    frame = Frame.of_training(capture.world_transform if config.normalize else None)
+    frame = Frame.of_training(capture.world_transform if config.normalize else None, config.drawn)
     save_ply(results.path / "ply" / f"point_cloud_{step}.ply", params, config.antialiased, frame=frame)
     # gsplat's keys alone: training is resumed from the blocks' own checkpoints
     save_checkpoint(checkpoint_path(results.path, step), {"step": step, "splats": params})

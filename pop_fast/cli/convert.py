@@ -15,6 +15,7 @@ from pop_fast.cli.export import HTML, check_file, file_format, note_lost_frame, 
 from pop_fast.cli.options import FormatName, LimitOptions, Output, Shown, limited
 from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
+from pop_fast.train.load_result import drawn_as
 
 if TYPE_CHECKING:
     from pop_fast.io.formats import Stored
@@ -61,7 +62,7 @@ def run(argv: Sequence[str]) -> int:
     check_file(args.out, args.source, args.overwrite)
     stored = load_splat_file(args.source)
     note_lost_frame(args.out, name, stored.frame)
-    config = TrainConfig(antialiased=stored.antialiased)
+    config = drawn_as(TrainConfig(antialiased=stored.antialiased), stored.frame, args.source)
     output = _output(args, name, stored, config)
     move = _training_frame(args.source, stored) if args.crop is not None else None
     shown = Shown(params=stored.params, sh_degree=_MOST_BANDS, config=config, world_transform=move, photographed=None)

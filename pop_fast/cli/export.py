@@ -202,10 +202,11 @@ def _output_frame(splat: Splat, args: Args) -> tuple[np.ndarray | None, Frame | 
     now, transform = frame_of_splat(splat, args), known_transform(splat, args)
     wanted = args.frame or ("capture" if splat.folder is not None else now)
     if wanted is None or wanted == (now or "capture"):
-        return None, None if wanted is None else Frame(wanted, _rows(transform))
+        return None, None if wanted is None else Frame(wanted, _rows(transform), splat.config.drawn)
     if transform is None:
         transform = _loaded_transform(splat, args)
-    return transform if wanted == "capture" else np.linalg.inv(transform), Frame(wanted, _rows(transform))
+    frame = Frame(wanted, _rows(transform), splat.config.drawn)
+    return transform if wanted == "capture" else np.linalg.inv(transform), frame
 
 
 def _training_frame(splat: Splat, args: Args) -> np.ndarray | None:
@@ -309,7 +310,7 @@ def _finish(folder: Path, capture: Capture, options: FinishOptions, progress: bo
     # what the page and the table of sizes show, and every file whose size is not limited
     kept = limited(shown, replace(options, target_mb=None), page)
     names = options.export or (("ply",) if options.any else ())
-    frame = Frame("capture", _rows(capture.world_transform))
+    frame = Frame("capture", _rows(capture.world_transform), splat.config.drawn)
     for name in names:
         output, left = page if name == HTML else Output(name, page.antialiased, frame, capture.world_transform), kept
         if options.target_mb is not None:

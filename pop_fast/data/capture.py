@@ -82,9 +82,10 @@ class View:
 
     def _repr_html_(self) -> str:
         """Show the photograph in a notebook, with sides of up to 480 px."""
-        from pop_fast.io.images import inline_png
+        from pop_fast.io.images import data_uri, fit
 
-        return f"<figure>{inline_png(self.image, 480)}<figcaption>{html.escape(repr(self))}</figcaption></figure>"
+        picture = data_uri(fit(self.image, max_side=480), lossless=True)
+        return f'<figure><img src="{picture}"><figcaption>{html.escape(repr(self))}</figcaption></figure>'
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,11 +126,13 @@ class Capture:
 
     def _repr_html_(self) -> str:
         """Show up to eight of the photographs in a notebook, from the first to the last."""
-        from pop_fast.io.images import inline_png
+        from pop_fast.io.images import data_uri, fit
 
         places = np.unique(np.linspace(0, len(self.views) - 1, 8).round().astype(int))
         notes = "".join(f"<li>{html.escape(note)}</li>" for note in self.notes)
-        pictures = " ".join(inline_png(self.views[i].image, 160) for i in places)
+        pictures = " ".join(
+            f'<img src="{data_uri(fit(self.views[i].image, max_side=160), lossless=True)}">' for i in places
+        )
         return f"<p>{html.escape(repr(self))}</p><p>{pictures}</p><ul>{notes}</ul>"
 
     @property

@@ -267,6 +267,10 @@ def about_use(shown: Sequence[Shown]) -> Iterator[CaptureFinding]:
             return
         yield warn("photographs", f"{text}; leave {number(len(plain), 'it', 'them')} out")
     useful = [one for one in shown if float(one.thumb.std()) >= _PLAIN]
+    if len(useful) > 1 and len({one.digest for one in useful}) == 1:
+        text = f"all {len(useful)} photographs are the same file"
+        yield bad("photographs", f"no cameras could be found: {text}; {FIX}")
+        return
     comparable = 2 <= len(useful) <= _COMPARED and all(len(one.features[0]) >= _ENOUGH for one in useful)
     if comparable and not any(_share_something(one, other) for one, other in combinations(useful, 2)):
         text = f"no two of the {len(useful)} photographs show the same thing"

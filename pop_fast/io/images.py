@@ -107,10 +107,12 @@ def _files_ending(suffixes: Sequence[str], paths: Sequence[Path]) -> list[Path]:
 def unreadable_photographs(folder: Path) -> str | None:
     """Say what of a folder `list_images` leaves out though it may hold photographs, and what to do; None if nothing.
 
-    That is files in a format that is not read, videos, and subfolders that cannot be looked into; not what is hidden.
+    That is files in a format that is not read, videos, links to nothing, as to a disk that is not there, and subfolders
+    that cannot be looked into; not what is hidden.
     """
     denied: list[OSError] = []
     found = _visible(folder, denied)
+    gone = [path for path in found if path.is_symlink() and not path.exists()]
     unreadable = _UNREADABLE if can_read_heif() else (*_UNREADABLE, *HEIF_SUFFIXES)
     still = [path.suffix for path in _files_ending(unreadable, found)]
     moving = _files_ending(VIDEO_SUFFIXES, found)
@@ -129,6 +131,10 @@ def unreadable_photographs(folder: Path) -> str | None:
             f"{what} no photographs ({moving[0].name}): take sharp frames out first, "
             f"for example with pop frames {moving[0].name} --out photos"
         )
+    if gone:
+        what = f"{len(gone)} files are links" if len(gone) > 1 else "1 file is a link"
+        where = f"{gone[0]} -> {os.readlink(gone[0])}"
+        changes.append(f"{what} to nothing ({where}): make what they lead to reachable, or remove them")
     if denied:
         what = f"{len(denied)} folders are" if len(denied) > 1 else "1 folder is"
         first = denied[0]
@@ -236,12 +242,6 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> None:
     stored = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
     _, data = cv2.imencode(".png", stored)
     write_file(path, data.tobytes())
-
-
-def inline_png(image: np.ndarray, longest: int) -> str:
-    """Return uint8 [H, W, 3] as an HTML picture that holds its own data, shrunk to sides of at most `longest` px."""
-    _, data = cv2.imencode(".png", cv2.cvtColor(fit(image, max_side=longest), cv2.COLOR_RGB2BGR))
-    return f'<img src="data:image/png;base64,{base64.b64encode(data.tobytes()).decode()}">'
 
 
 # of OpenCV's log, as a number because OpenCV 4 has no name for it in Python

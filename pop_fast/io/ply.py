@@ -14,10 +14,11 @@ process, by what its header says or because somebody shortens it.
 from __future__ import annotations
 
 import io
+import json
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -103,7 +104,7 @@ def _file(arrays: dict[str, np.ndarray], antialiased: bool, frame: Frame | None)
 def header_bytes(antialiased: bool, frame: Frame | None, *elements: tuple[str, int, str, Sequence[str]]) -> bytes:
     """Return a header; an element is its name, the number of its rows, their type and the names of its columns."""
     lines = ["ply", "format binary_little_endian 1.0", f"comment {MODE} {'mip' if antialiased else 'default'}"]
-    lines += [] if frame is None else [f"comment {frame.comment()}"]
+    lines += [] if frame is None else [f"comment {comment}" for comment in frame.comments()]
     for name, n, kind, columns in elements:
         lines += [f"element {name} {n}", *(f"property {kind} {column}" for column in columns)]
     return "\n".join([*lines, "end_header", ""]).encode("ascii")
@@ -433,45 +434,58 @@ def _colors(path: Path, rows: np.ndarray) -> np.ndarray:
     return np.rint(rgb).astype(np.uint8)
 
 
-# what the comment of a PLY's header begins with, and the name of the object in JSON
+# what the comments of a PLY's header begin with, and the name of the object in JSON
 COMMENT: Final = "pop-frame:"
+_DRAWN: Final = "pop-drawn:"
 KEY: Final = "pop_frame"
+# settings of a training that a splat is drawn by
+DRAWN_BY: Final = ("profile", "near_plane", "eps2d")
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The world that a splat is in."""
+    """The world that a splat is in, and how it is drawn there."""
 
     # "capture" is the capture's own, "training" the one that `pop train` moves it into
     name: Literal["capture", "training"]
     # similarity, training frame = transform @ capture's own frame; None where it is not known. [4, 4]
     transform: tuple[tuple[float, ...], ...] | None = None
+    # of `DRAWN_BY`, what is not as usual; the near plane is one of the training frame
+    drawn: tuple[tuple[str, str | float], ...] = ()
 
     @classmethod
-    def of_training(cls, transform: Any) -> Frame:
+    def of_training(cls, transform: Any, drawn: tuple[tuple[str, str | float], ...] = ()) -> Frame:
         """Return the frame of a training that a similarity, an array [4, 4], moved, or that None left where it was."""
-        return cls("capture") if transform is None else cls("training", tuple(map(tuple, transform.tolist())))
+        rows = None if transform is None else tuple(map(tuple, transform.tolist()))
+        return cls("capture" if rows is None else "training", rows, drawn)
 
-    def comment(self) -> str:
-        """Return the comment of a PLY's header, without the word "comment"."""
+    def comments(self) -> list[str]:
+        """Return the comments of a PLY's header, without the word "comment"."""
         rows = () if self.transform is None else self.transform
-        return " ".join([COMMENT, self.name, *(f"{x:.17g}" for row in rows for x in row)])
+        world = " ".join([COMMENT, self.name, *(f"{x:.17g}" for row in rows for x in row)])
+        return [world, *([f"{_DRAWN} {json.dumps(dict(self.drawn))}"] if self.drawn else [])]
 
     def entry(self) -> dict[str, Any]:
         """Return what JSON holds under the name `KEY`."""
-        return {"name": self.name, **({} if self.transform is None else {"transform": self.transform})}
+        moved = {} if self.transform is None else {"transform": self.transform}
+        return {"name": self.name, **moved, **({"drawn": dict(self.drawn)} if self.drawn else {})}
 
     @classmethod
     def of_comments(cls, comments: Sequence[str], path: Path) -> Frame | None:
         """Read the frame from the comments of a PLY's header; None where they have none, as of other programs."""
+        found: Frame | None = None
         for comment in comments:
-            if comment.startswith(COMMENT):
+            sound = True
+            if comment.startswith(COMMENT) and found is None:
                 name, *numbers = comment.removeprefix(COMMENT).split() or [""]
                 found = cls._checked(name, numbers or None)
-                if found is None:
-                    raise PopError(f"{path}: comment {comment[:60]!r} is damaged; remove it, or export the splat again")
-                return found
-        return None
+                sound = found is not None
+            elif comment.startswith(_DRAWN) and found is not None:
+                drawn = _settings(comment.removeprefix(_DRAWN))
+                found, sound = replace(found, drawn=drawn or ()), drawn is not None
+            if not sound:
+                raise PopError(f"{path}: comment {comment[:60]!r} is damaged; remove it, or export the splat again")
+        return found
 
     @classmethod
     def of_entry(cls, holder: Any, path: Path) -> Frame | None:
@@ -480,9 +494,10 @@ class Frame:
             return None
         entry = holder[KEY]
         found = cls._checked(entry.get("name"), entry.get("transform")) if isinstance(entry, Mapping) else None
-        if found is None:
+        drawn = None if found is None else _settings(entry.get("drawn", {}))
+        if found is None or drawn is None:
             raise PopError(f"{path}: {KEY} is {str(entry)[:60]!r}, which is damaged; export the splat again")
-        return found
+        return replace(found, drawn=drawn)
 
     @classmethod
     def _checked(cls, name: Any, numbers: Any) -> Frame | None:
@@ -498,3 +513,16 @@ class Frame:
         except (ValueError, TypeError, OverflowError, np.linalg.LinAlgError):
             return None
         return cls(name, tuple(map(tuple, values.tolist()))) if sound else None
+
+
+def _settings(said: Any) -> tuple[tuple[str, str | float], ...] | None:
+    """Return what an object, or the JSON of one, says of how a splat is drawn; None where it is damaged."""
+    try:
+        entries = json.loads(said) if isinstance(said, str) else said
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(entries, Mapping):
+        return None
+    drawn = tuple((name, entries[name]) for name in DRAWN_BY if name in entries)
+    kinds = all(type(value) in ((str,) if name == "profile" else (int, float)) for name, value in drawn)
+    return drawn if kinds else None

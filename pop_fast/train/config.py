@@ -18,6 +18,7 @@ from typing import Any, Final, Literal, Self
 from pop_fast.api.backend import BACKENDS
 from pop_fast.density import DensityControl, POPStrategy
 from pop_fast.errors import PopError
+from pop_fast.io.ply import DRAWN_BY
 from pop_fast.train.presets import (
     LOSSES,
     METHODS,
@@ -287,6 +288,13 @@ class TrainConfig:
         """The rasterizer's constants, with the near plane and the low-pass of these settings."""
         own = {name: getattr(self, name) for name in ("near_plane", "eps2d")}
         return replace(profile_named(self.profile), **{name: value for name, value in own.items() if value is not None})
+
+    @property
+    def drawn(self) -> tuple[tuple[str, str | float], ...]:
+        """What a file has to say of how its splat is drawn: those of these settings that are not the usual ones."""
+        usual = TrainConfig()
+        own = ((name, getattr(self, name)) for name in DRAWN_BY)
+        return tuple((name, value) for name, value in own if value != getattr(usual, name))
 
     def in_world(self, world_scale: float) -> Self:
         """Return these settings with the near plane of a world, unless one was set.

@@ -136,6 +136,7 @@ def load_splat(path: Path) -> Splat:
         config = replace(config, antialiased=stored.antialiased)
         of_run = owner is not None and path.resolve().parent.name == "ply"
         frame = stored.frame or (_frame_of_run(config) if of_run else None)
+        config = config if owner else drawn_as(config, stored.frame, path)
         return Splat(path=path, params=stored.params, config=config, folder=owner, frame=frame)
     if path.suffix.lower() == ".pt":
         params, step = load_splats(path)
@@ -143,6 +144,15 @@ def load_splat(path: Path) -> Splat:
     raise PopError(
         f"{path}: is neither a result folder nor a checkpoint (.pt) nor a splat ({', '.join(readable_names())})"
     )
+
+
+def drawn_as(config: TrainConfig, frame: Frame | None, path: Path) -> TrainConfig:
+    """Return settings to draw a lone file's splat by: the usual ones but for what it says."""
+    said: Any = {} if frame is None else dict(frame.drawn)
+    try:
+        return replace(config, **said)
+    except PopError as error:
+        raise PopError(f"{path}: is to be drawn by settings that cannot be: {error}") from error
 
 
 def unbundled(folder: Path) -> Path | None:

@@ -374,7 +374,7 @@ class TrainingRun:
             self._results.write_stats("appearance", step, self.appearance.by_view(self._train))
         if taken in config.save_steps or last:
             path = self._results.path / "ply" / f"point_cloud_{step}.ply"
-            frame = Frame.of_training(self._capture.world_transform if config.normalize else None)
+            frame = Frame.of_training(self._capture.world_transform if config.normalize else None, config.drawn)
             save_ply(path, self._detached(), config.antialiased, frame=frame)
         # last, as it may be left half way
         if taken in config.eval_steps or last:

@@ -204,7 +204,8 @@ def write_inria_folder(splat: Splat, capture: Capture, out: Path, overwrite: boo
     with folder_atomically(out, overwrite, keeps=keeps, recognise=exported_to(out)) as folder:
         params = to_capture_frame(splat.params, transform)
         path = folder / "point_cloud" / f"iteration_{steps}" / "point_cloud.ply"
-        save_ply(path, params, splat.config.antialiased, frame=Frame("capture"))
+        frame = replace(Frame.of_training(transform, splat.config.drawn), name="capture")
+        save_ply(path, params, splat.config.antialiased, frame=frame)
         cameras = [_camera(i, view, transform, capture.world_scale) for i, view in enumerate(capture.views)]
         (folder / "cameras.json").write_text(json.dumps(cameras), encoding="utf-8")
         (folder / "cfg_args").write_text(_cfg_args(splat, out), encoding="utf-8")
@@ -247,7 +248,8 @@ def _cfg_args(splat: Splat, out: Path) -> str:
         "images": "images",
         "model_path": str(out),
         "resolution": splat.config.factor,
-        "sh_degree": splat.sh_degree,
+        # of the PLY's columns, which Inria's loader compares with this, whatever degree was reached
+        "sh_degree": 3,
         "source_path": splat.config.data,
         "white_background": splat.config.background == (1.0, 1.0, 1.0),
     }

@@ -386,6 +386,7 @@ def noise(seed: int) -> np.ndarray:
 
 HOPELESS = {
     "black": (lambda i: np.zeros((120, 160, 3), np.uint8), "4 of 4 photographs are of one colour all over"),
+    "copies": (lambda i: noise(0), "all 4 photographs are the same file"),
     "unrelated": (noise, "no two of the 4 photographs show the same thing"),
 }
 

@@ -24,6 +24,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
 from benchmarks.faults.corpus import ksplat_of
@@ -112,6 +113,7 @@ def test_inria_s_layout_has_what_its_scripts_read(export: Said, psnr: Psnr, shar
     for name, value in load_ply("own.ply").items():
         torch.testing.assert_close(exported[name], value)
     assert psnr(ply) == trained
+    assert frame_of(ply) == frame_of("own.ply")
     views = Path("inria/test/ours_30")
     assert (
         [p.name for p in (views / "renders").iterdir()] == [p.name for p in (views / "gt").iterdir()] == ["00000.png"]
@@ -122,6 +124,9 @@ def test_inria_s_layout_has_what_its_scripts_read(export: Said, psnr: Psnr, shar
     settings = {word.arg: ast.literal_eval(word.value) for word in call.keywords}
     assert settings["source_path"] == str(shared_capture)
     assert settings["white_background"] is False
+    # Inria's load_ply asserts it, and the run's last steps did not reach the last degree
+    columns = sum(name.startswith("f_rest_") for name in PlyData.read(ply)["vertex"].data.dtype.names)
+    assert columns == 3 * (settings["sh_degree"] + 1) ** 2 - 3
     cameras = json.loads(Path("inria/cameras.json").read_text())
     shots, _ = read_model(shared_capture / "sparse" / "0")
     assert len(cameras) == len(shots) == len(load_capture(shared_capture).views)
@@ -130,6 +135,32 @@ def test_inria_s_layout_has_what_its_scripts_read(export: Said, psnr: Psnr, shar
         np.testing.assert_allclose(camera["rotation"], shot.viewmat[:3, :3].T, atol=1e-9)
         np.testing.assert_allclose(camera["position"], -shot.viewmat[:3, :3].T @ shot.viewmat[:3, 3], atol=1e-9)
         assert camera["fx"] == pytest.approx(shot.camera.focal_length_x)
+
+
+def test_a_file_says_how_it_is_drawn_where_not_as_usual(pop: Pop, psnr: Psnr, result: Path, own: Path) -> None:
+    as_usual = psnr(result)
+    settings = json.loads((result / "cfg.json").read_text())
+    inria = {"profile": "inria", "near_plane": 0.4, "eps2d": 2.0}
+    settings["resolved"] |= inria
+    (result / "cfg.json").write_text(json.dumps(settings))
+    measured = psnr(result)
+    assert abs(measured - as_usual) > 0.1
+    for name in set(format_names()) - {"splat"}:
+        pop.done("export", result, "--to", name)
+        file = Path(default_name(result.name, name))
+        assert dict(load_splat(file).config.drawn) == inria, name
+        # what the training frame calls 0.4 is further away in the capture's own
+        pop.done("convert", file, f"{name}.ply")
+        assert psnr(f"{name}.ply") == pytest.approx(measured, abs=0.05), name
+    pop.done("export", result, "--to", "ply", "--overwrite", "--frame", "training")
+    assert psnr(f"{result.name}.ply") == pytest.approx(measured, abs=1e-3)
+    # splats that are drawn as usual say nothing of it
+    assert b"pop-drawn" not in own.read_bytes()[:2000]
+    damaged = Path(f"{result.name}.ply").read_bytes().replace(b'"inria"', b'"other"')
+    Path("damaged.ply").write_bytes(damaged)
+    says(pop("eval", "damaged.ply"), "damaged.ply: is to be drawn by settings that cannot be: profile is 'other'")
+    Path("damaged.ply").write_bytes(damaged.replace(b'"other"', b'"oth r'))
+    says(pop("eval", "damaged.ply"), "damaged.ply: comment 'pop-drawn:")
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from pop_fast.cli import main
+from pop_fast.cli.data_check import look_over
 from pop_fast.data import load_capture, run_sfm, sfm
 from pop_fast.data.photo_quality import sharpness
 from pop_fast.data.read_images import _upright, shrink_bicubic
@@ -296,6 +297,18 @@ def test_what_is_not_read_is_named_with_the_way_to_convert_it(tmp_path: Path, mo
         (tmp_path / kind / f"a.{kind}").write_bytes(b"")
         one = f"1 file is {kind.upper()} or the like, which is not read: convert them to JPEG"
         assert_one_line(lambda kind=kind: load_capture(tmp_path / kind), one)
+
+
+def test_links_to_photographs_that_are_gone_are_named(tmp_path: Path) -> None:
+    for i in range(2):
+        (tmp_path / f"{i}.jpg").symlink_to(tmp_path / "unplugged" / f"{i}.jpg")
+    link, where = tmp_path / "0.jpg", tmp_path / "unplugged" / "0.jpg"
+    assert_one_line(
+        lambda: load_capture(tmp_path), f"2 files are links to nothing ({link} -> {where}): make what they lead"
+    )
+    for i in range(2, 4):
+        write_photograph(tmp_path / f"{i}.png", photograph(i))
+    assert "2 files are links to nothing" in " ".join(finding.text for finding in look_over(tmp_path))
 
 
 def test_a_subfolder_that_cannot_be_looked_into_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
