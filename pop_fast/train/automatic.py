@@ -43,12 +43,11 @@ SHORTEST: Final = 0.01
 # fewer of a step's kind do not tell how long it takes
 _TIMED_STEPS: Final = 40
 _TIMED_SECONDS: Final = 4.0
-# steps of a run take this share of what they took when they were timed, before any training: all of it in short
-# schedules, and 0.8 on average over the paper's, in which most Gaussians become opaque. Short runs took 1.03 (fox),
-# 0.97 (bear_512), 0.91 (bonsai) and 1.16 (garden) of it by processor time, whole ones 0.72 (fox) and 0.85 (bear_512)
-_TRAINED: Final = ((0.1, 1.0), (1.0, 0.8))
-# and those of a run with few steps, whose first photographs are coarse, this share of that: whole runs of preset
-# "quick" took 0.76 to 0.88 of what they would have if all their steps had taken what the last ones did
+# Steps of a run are taken to stay as slow as those that were timed, before any training: short runs took 1.03 (fox),
+# 0.97 (bear_512), 0.91 (bonsai) and 1.16 (garden) of that by processor time, a whole one 1.0 (bear_512), and one on fox
+# that was followed for 15,400 of its 26,010 steps nearly as much.
+# Those of a run with few steps, whose first photographs are coarse, take this share: whole runs of preset "quick" took
+# 0.76 to 0.88 of what they would have if all their steps had taken what the last ones did
 _COARSE: Final = 0.8
 # a render of a view takes this share of a step
 _RENDER: Final = 0.4
@@ -145,7 +144,7 @@ def choose_length(
     def seconds(scaler: float) -> float:
         last, mean = expected(scaler)
         renders = _RENDER * speed.seconds_a_step(last) * (3 * held_out + _RENDERS)
-        share = _trained_share(scaler) * (_COARSE if scaler <= QUICK_SCALER else 1.0)
+        share = _COARSE if scaler <= QUICK_SCALER else 1.0
         written = _FILES + _WRITTEN * last
         return speed.took + share * steps * scaler * speed.seconds_a_step(mean) + renders + written
 
@@ -165,13 +164,6 @@ def choose_length(
         why = f"each of {trained} photographs is seen {LOOKS} times: more steps would overfit so few photographs "
         why += "(--steps-scaler S takes more)"
     return Choice(scaler, gaussians, seconds(scaler), memory, why)
-
-
-def _trained_share(scaler: float) -> float:
-    """Give the share of a timed step that a step takes on average, between that of short and of whole schedules."""
-    (short, of_short), (whole, of_whole) = _TRAINED
-    part = math.log(max(scaler, short) / short) / math.log(whole / short)
-    return of_short + part * (of_whole - of_short)
 
 
 # how often each of few photographs is seen; section 8 of docs/guide.md has the runs on five captures that it rests on
