@@ -525,4 +525,5 @@ def _settings(said: Any) -> tuple[tuple[str, str | float], ...] | None:
         return None
     drawn = tuple((name, entries[name]) for name in DRAWN_BY if name in entries)
     kinds = all(type(value) in ((str,) if name == "profile" else (int, float)) for name, value in drawn)
-    return drawn if kinds else None
+    # a whole number of hundreds of digits is no float
+    return drawn if kinds and all(isinstance(value, str) or abs(value) < 1e300 for _, value in drawn) else None

@@ -159,8 +159,10 @@ def test_a_file_says_how_it_is_drawn_where_not_as_usual(pop: Pop, psnr: Psnr, re
     damaged = Path(f"{result.name}.ply").read_bytes().replace(b'"inria"', b'"other"')
     Path("damaged.ply").write_bytes(damaged)
     says(pop("eval", "damaged.ply"), "damaged.ply: is to be drawn by settings that cannot be: profile is 'other'")
-    Path("damaged.ply").write_bytes(damaged.replace(b'"other"', b'"oth r'))
-    says(pop("eval", "damaged.ply"), "damaged.ply: comment 'pop-drawn:")
+    # no JSON, and a whole number that no float holds
+    for entry in (b'"oth r', b'"inria", "eps2d": 1' + 310 * b"0"):
+        Path("damaged.ply").write_bytes(damaged.replace(b'"other"', entry).replace(b', "eps2d": 2.0', b""))
+        says(pop("eval", "damaged.ply"), "damaged.ply: comment 'pop-drawn:")
 
 
 @pytest.mark.parametrize(
