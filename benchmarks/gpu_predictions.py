@@ -215,8 +215,8 @@ def held() -> str:
     lines = ["| Gaussians, ranks | before, GB | every view shows all, GB | a tenth, GB |", "|---|---|---|---|"]
     for n, size in TOGETHER:
         shown_all, tenth = (held_bytes(n, size, size, shown) for shown in (1.0, 0.1))
-        # there was room for all splats, and the others' moments were held too
-        before = sum(shown_all.values()) + 2 * 4 * 59 * n * (size - 1) / size
+        # there was room for all splats, and the others' moments and colours were held too
+        before = sum(shown_all.values()) + (2 * 4 * 59 + 4 * 48) * n * (size - 1) / size
         cells = [before, *(sum(of.values()) for of in (shown_all, tenth))]
         lines.append(f"| {n:,}, {size} | {' | '.join(f'{bytes_ / 1e9:,.2f}' for bytes_ in cells)} |")
     return "\n".join(lines)

@@ -11,8 +11,9 @@ since no two of them add to one number.
     for each view:      sums and dominated pixels, back                                     40 bytes a splat, sent
                         gradients of own rows, added up; with the last view Adam
 
-A process holds the others' rows as these were when `synchronize` was last called, and nobody else's moments. Where the
-Gaussians have changed, moments go to those that own their rows now: 472 bytes each, sent.
+A process holds the others' rows as these were when `synchronize` was last called, but nobody else's colours and
+moments. Where the Gaussians have changed, these go to those that own their rows now: 192 and 472 bytes each, sent. Most
+density control reads no colours but copies them with their rows; numbers of rows tell what it has copied.
 """
 
 from __future__ import annotations
@@ -66,6 +67,8 @@ RETURNED: Final = _SUMS + 1
 _SPARE: Final = 4
 # floats of a packed splat and of its row of sums, `RECORD` of csrc/launch.h
 _ROW: Final = 12
+# parameters that several processes keep of own Gaussians alone
+_APART: Final = ("sh0", "shN")
 # bytes of a Gaussian's statistics: gradient sum, views, dominated pixels, blur
 _STATISTICS: Final = 13
 # the POP term and the regularizers are told as sums of whole numbers, which no order changes; scales have no bound
@@ -93,18 +96,19 @@ def step_bytes(n: int, size: int, n_views: int, shown: float, steps: int, n_rest
         n_rest: coefficients of colour above the first, three channels each.
 
     Returns:
-        Bytes by the names of `BatchTrainer.received`; those of moments are what a change that moves every row to
-        another process would send.
+        Bytes by the names of `BatchTrainer.received`; those of moments and colours are what a change that moves every
+        row to another process would send. What process 0 collects for a file or a measurement is left out.
     """
-    of_others = (size - 1) / size
-    numbers = _numbers(n_rest)
-    row, moments = 4 * numbers + _STATISTICS, 2 * 4 * numbers
+    of_others, moves = (size - 1) / size, size > 1
+    numbers, colors = _numbers(n_rest), 4 * _colors(n_rest)
+    row, moments = 4 * numbers - colors + _STATISTICS, 2 * 4 * numbers
     crossing = shown * n * n_views / size * of_others
     return {
         "splats": 4 * SENT * crossing,
         "sums": 4 * RETURNED * crossing,
         "rows": row * n * of_others / steps,
-        "moments": moments * n / size * (size > 1) / steps,
+        "moments": moments * n / size * moves / steps,
+        "colors": colors * n / size * moves / steps,
     }
 
 
@@ -115,16 +119,16 @@ def held_bytes(n: int, size: int, n_views: int, shown: float, n_rest: int = 15) 
         n, size, n_views, shown, n_rest: as `step_bytes` takes them.
 
     Returns:
-        "whole": of all Gaussians, their parameters and statistics. "drawn": of the splats of a view that it draws.
-        "own": of its own Gaussians, both moments, gradients, and what each view makes of them.
+        "whole": of all Gaussians, their parameters but for colours, and statistics. "drawn": of the splats of a view
+        that it draws. "own": of its own Gaussians, colours, both moments, gradients, and what each view makes of them.
     """
-    numbers = _numbers(n_rest)
+    numbers, colors = _numbers(n_rest), 4 * _colors(n_rest)
     # packed splats and sums; means, depths, conics, opacities, extents
     splat = 2 * 4 * _ROW + 36
     # every view keeps its conics, opacities, extents and sides of the POP term; dominated pixels are counted
-    own = 3 * 4 * numbers + splat + (n_views - 1) * 25 + 1 + 4
+    own = 3 * 4 * numbers + colors + splat + (n_views - 1) * 25 + 1 + 4
     return {
-        "whole": n * (4 * numbers + _STATISTICS),
+        "whole": n * (4 * numbers - colors + _STATISTICS),
         "drawn": min(1.0, shown * (1.0 + 1.0 / _SPARE)) * n * splat,
         "own": own * n / size,
     }
@@ -132,7 +136,12 @@ def held_bytes(n: int, size: int, n_views: int, shown: float, n_rest: int = 15) 
 
 def _numbers(n_rest: int) -> int:
     """Return how many numbers a Gaussian has."""
-    return 3 + 4 + 3 + 1 + 3 + 3 * n_rest
+    return 3 + 4 + 3 + 1 + _colors(n_rest)
+
+
+def _colors(n_rest: int) -> int:
+    """Return how many of them are its colours."""
+    return 3 + 3 * n_rest
 
 
 @dataclass(frozen=True)
@@ -154,7 +163,7 @@ class BatchTrainer:
     """Owns the device's side of training between two densification steps; see `train_step.FusedTrainer`.
 
     Args:
-        params: raw parameters of all Gaussians; updated in place.
+        params: raw parameters of all Gaussians; updated in place, but for those that are kept `apart`.
         m, v: Adam's moments of all Gaussians, on any device, of which own ones are copied.
         views: the resident photographs and cameras.
         order: the views of every step of the schedule, `n_views` each.
@@ -180,8 +189,11 @@ class BatchTrainer:
         self.device, self.n_views = params["means"].device, n_views
         self._order, self._ranks, self._capacity = list(order), ranks, Capacity(views.sizes)
         self._history: dict[int, list[float]] = {}
+        # one process has all colours as its own, in the place of the parameters
+        self.apart = _APART if ranks.size > 1 else ()
+        self._apart: dict[str, Tensor] = {}
         # bytes that other processes have sent here, by what they are
-        self.received = {"splats": 0, "sums": 0, "rows": 0, "moments": 0}
+        self.received = {"splats": 0, "sums": 0, "rows": 0, "moments": 0, "colors": 0}
         with torch.cuda.device_of(params["means"]):
             self._shared = Shared.make(settings, views, self._order, step, self.device)
         self._schedule = schedule(self._shared, n_views)
@@ -193,34 +205,44 @@ class BatchTrainer:
         self._frames: dict[Size, FrameBuffers] = {}
         self._drawn: SplatBuffers | None = None
         own = self._own(stretches(len(params["means"]), self._ranks.size))
-        self._bind(params, *({key: of[key][own].to(self.device, copy=True) for key in of} for of in (m, v)))
+        apart = {key: self._own_rows(key, params[key]) for key in self.apart}
+        self._bind(params, apart, *({key: of[key][own].to(self.device, copy=True) for key in of} for of in (m, v)))
 
     def regroup(self, params: Rows, origins: Rows) -> None:
         """Take new rows after a densification step, and own ones' moments from those that had the rows before it.
 
         Args:
-            params: raw parameters of all Gaussians.
+            params: raw parameters of all Gaussians. In place of one of those that are kept `apart` there may be the
+                former place of each row, from 1, which these rows are copied from. [N]
             origins: for each parameter the former place of each row, from 1, or 0 for moments of zero. int32 [N]
         """
         # what the old number of Gaussians needed goes first; moments of one parameter at a time are there twice
         self._of_place, self._programs, self._frames, self._drawn, self._gradients = [], {}, {}, None, {}
-        moved = {key: self._moved(key, origins[key]) for key in params}
-        self._bind(params, *({key: of[place] for key, of in moved.items()} for place in (0, 1)))
+        apart = {key: self._own_rows(key, params[key]) for key in self.apart}
+        moved = {key: self._moved("moments", [of.pop(key) for of in self._moments], origins[key]) for key in params}
+        self._bind(params, apart, *({key: of[place] for key, of in moved.items()} for place in (0, 1)))
 
     def _own(self, bounds: Sequence[int]) -> slice:
         return slice(*bounds[self._ranks.rank : self._ranks.rank + 2])
 
-    def _bind(self, params: Rows, m: Rows, v: Rows) -> None:
+    def _own_rows(self, key: str, rows: Tensor) -> Tensor:
+        """Return own rows of what is kept apart: of all rows, or from those that had what their numbers say."""
+        if rows.dim() > 1:
+            return rows[self._own(stretches(len(rows), self._ranks.size))].clone()
+        return self._moved("colors", [self._apart.pop(key)], rows)[0]
+
+    def _bind(self, params: Rows, apart: dict[str, Tensor], m: Rows, v: Rows) -> None:
         n = len(params["means"])
         self._capacity.settle(n)
         self._bounds = stretches(n, self._ranks.size)
         own = self._own(self._bounds)
         self._first = own.start
         with torch.cuda.device_of(params["means"]):
-            waits = params["shN"].shape[1] if self.settings.updates.sh_rest_every > 1 else None
+            self._whole = {key: tensor for key, tensor in params.items() if key not in apart}
+            self._apart, self._moments = apart, (dict(m), dict(v))
+            own_params = {key: apart[key] if key in apart else tensor[own] for key, tensor in params.items()}
+            waits = own_params["shN"].shape[1] if self.settings.updates.sh_rest_every > 1 else None
             self.statistics = KernelStatistics.zeros(n, self.device, waits)
-            self._whole, self._moments = dict(params), (dict(m), dict(v))
-            own_params = {key: tensor[own] for key, tensor in params.items()}
             own_rows = RowBuffers.make(own_params, *self._moments, self.statistics.rows(own))
             self._of_place = [self._seen_by_a_view(own_rows) for _ in range(self.n_views)]
             self._counts = torch.zeros(len(own_rows), dtype=torch.int32, device=self.device)
@@ -258,7 +280,7 @@ class BatchTrainer:
         return {**told, **self.views.facts()}
 
     def synchronize(self) -> None:
-        """Give every process what the others have moved and counted, but for moments."""
+        """Give every process what the others have moved and counted, but for moments and what is kept `apart`."""
         found = (*self._whole.values(), *vars(self.statistics).values())
         for tensor in (tensor for tensor in found if tensor is not None):
             self._ranks.share(tensor, self._bounds)
@@ -269,24 +291,39 @@ class BatchTrainer:
 
         One tensor after the other passes through the GPU of process 0.
         """
-        ranks = self._ranks
-        lengths = [high - low for low, high in itertools.pairwise(self._bounds)]
-
-        def whole(own: Tensor) -> Tensor:
-            sent = [own, *[own[:0]] * (ranks.size - 1)]
-            return torch.cat(ranks.exchange(sent, lengths if ranks.writes else [0] * ranks.size)).cpu()
-
         m, v = self._moments
-        return {key: {"exp_avg": whole(m[key]), "exp_avg_sq": whole(v[key])} for key in m}
+        return {key: {"exp_avg": self._at_first(m[key]).cpu(), "exp_avg_sq": self._at_first(v[key]).cpu()} for key in m}
 
-    def _moved(self, key: str, origins: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the moments of one parameter's own rows as they will be, having sent the others theirs.
+    def whole(self, everywhere: bool) -> dict[str, Tensor]:
+        """Return all Gaussians' rows of what is kept `apart`, at every process or at process 0; none elsewhere."""
+        found = {key: (self._at_all if everywhere else self._at_first)(own) for key, own in self._apart.items()}
+        if not everywhere and not self._ranks.writes:
+            return {}
+        self.received["colors"] += sum(rows.nbytes - self._apart[key].nbytes for key, rows in found.items())
+        return found
+
+    def _at_first(self, own: Tensor) -> Tensor:
+        """Return the rows of all processes at process 0, none elsewhere."""
+        ranks, lengths = self._ranks, [high - low for low, high in itertools.pairwise(self._bounds)]
+        sent = [own, *[own[:0]] * (ranks.size - 1)]
+        return torch.cat(ranks.exchange(sent, lengths if ranks.writes else [0] * ranks.size))
+
+    def _at_all(self, own: Tensor) -> Tensor:
+        """Return the rows of all processes at each of them."""
+        found = own.new_empty((self._bounds[-1], *own.shape[1:]))
+        found[self._own(self._bounds)] = own
+        self._ranks.share(found, self._bounds)
+        return found
+
+    def _moved(self, what: str, held: Sequence[Tensor], origins: Tensor) -> list[Tensor]:
+        """Return tensors of own rows as they will be, having sent the others theirs.
 
         Args:
-            origins: as `regroup` takes them.
+            what: they are, by the names of `received`.
+            held: tensors of own rows as they were.
+            origins: of all rows the former place, from 1, or 0 for zeros. [N]
         """
         ranks, former = self._ranks, self._bounds
-        m, v = (of.pop(key) for of in self._moments)
         bounds = stretches(len(origins), ranks.size)
         wanted = [origins[first:last] for first, last in itertools.pairwise(bounds)]
 
@@ -298,14 +335,14 @@ class BatchTrainer:
         comes = [held_by(rank, own) for rank in range(ranks.size)]
         lengths = [int(mask.sum()) for mask in comes]
         moved = []
-        for moments in (m, v):
-            received = ranks.exchange([moments[rows] for rows in places], lengths)
-            self._note("moments", received)
-            there = moments.new_zeros((len(own), *moments.shape[1:]))
+        for tensor in held:
+            received = ranks.exchange([tensor[rows] for rows in places], lengths)
+            self._note(what, received)
+            there = tensor.new_zeros((len(own), *tensor.shape[1:]))
             for mask, rows in zip(comes, received, strict=True):
                 there[mask] = rows
             moved.append(there)
-        return moved[0], moved[1]
+        return moved
 
     def _step(self, phase: Phase) -> int | None:
         """Take a step, or return the row that is not finite."""

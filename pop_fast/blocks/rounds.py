@@ -262,6 +262,9 @@ class HoldingStepper:
     def synchronize(self) -> None:
         self._stepper.synchronize()
 
+    def gather(self, everywhere: bool = False) -> None:
+        self._stepper.gather(everywhere)
+
     def moments(self) -> dict[str, dict[str, Tensor]]:
         return self._stepper.moments()
 

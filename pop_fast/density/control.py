@@ -130,6 +130,15 @@ class DensityControl(DensityConfig, PopTerm, ScreenSizeRules, UpdateRules):
         """Tell whether the change after this step looks at the training views: where Adam begins anew, most do."""
         return step in self.adam_restarts
 
+    def reads_colors(self, step: int) -> bool:
+        """Tell whether the change after this step reads or sets colours and does not just copy them with their rows.
+
+        Where processes share the Gaussians out, `params` has no colours at other changes; see `pop_fast.density.rows`.
+        A change that looks at the training views reads them. A method of another package is taken to read them at every
+        change, unless it says here that it does not.
+        """
+        return self.needs_passes(step) or not type(self).__module__.startswith("pop_fast.")
+
     def regularizes(self, step: int) -> bool:
         """Tell whether `regularizer` adds a prior on opacities at this step."""
         weighs = self.lambda_pop != 0.0 or self.lambda_entropy != 0.0

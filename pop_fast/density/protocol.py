@@ -209,6 +209,9 @@ class ForeignStrategy:
         """Tell whether the change after this step looks at the training views: gsplat's protocol has none."""
         return False
 
+    def reads_colors(self, step: int) -> bool:
+        return True
+
     def regularizer(self, opacities: Tensor, state: State, step: int, info: Info) -> Tensor | None:
         """Return the term that it adds to the loss, or None."""
         term: Callable[..., Tensor | None] | None = getattr(self.strategy, "regularizer", None)

@@ -2,8 +2,9 @@
 
 Every edit is one call of `edit_rows`: keep some rows, append others. Rows that are kept keep their bits and their
 order, in every parameter, in every moment and in every per-Gaussian tensor of the state. Rows that are appended start
-with zero moments; an optimizer's scalar step counter is never touched. What an optimizer holds may also be a number a
-row in place of moments, where processes share the Gaussians out (`pop_fast.train.stepper.OwnRows`).
+with zero moments; an optimizer's scalar step counter is never touched. Where processes share the Gaussians out, an
+optimizer may hold a number a row in place of moments, and colours may be such numbers, which edits copy as any
+parameter's rows (`pop_fast.train.stepper.OwnRows`).
 """
 
 from __future__ import annotations

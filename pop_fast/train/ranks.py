@@ -1,8 +1,8 @@
 """Processes that train one model together: whose views are whose, and how what each has found is put together.
 
-Every process holds all parameters and statistics and takes every decision itself. On CPUs only the drawing of a step's
-views is shared out; on GPUs (`cuda_ext.training.batch_step`) the Gaussians are too within a block of steps, and Adam's
-moments always are.
+Every process holds all statistics and parameters, colours excepted, and takes every decision itself. On CPUs only the
+drawing of a step's views is shared out, and all colours are held too; on GPUs (`cuda_ext.training.batch_step`) the
+Gaussians are shared out within a block of steps, and colours and Adam's moments always are.
 What is added up is added view by view in the order of the batch, wherever a view was drawn, so that the bits do not
 depend on the number of processes. torch carries it: gloo between CPUs, NCCL between GPUs.
 """

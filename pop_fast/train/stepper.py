@@ -36,7 +36,7 @@ class Stepper(Protocol):
 
     It works on what it is bound to: after `steps` the parameters, the optimizers' state and the strategy's statistics
     in `state` are those of the last step; where several processes train together, after `synchronize`. What shares the
-    Gaussians out keeps the optimizers' moments itself; see `OwnRows`.
+    Gaussians out keeps the optimizers' moments itself, and between several processes colours too; see `OwnRows`.
     """
 
     name: str  # of the engine, for the statistics of a run
@@ -64,6 +64,16 @@ class Stepper(Protocol):
 
     def synchronize(self) -> None:
         """Take over what other processes moved and counted since the last time; all of them do so together."""
+        ...
+
+    def gather(self, everywhere: bool = False) -> None:
+        """Put all Gaussians' rows into parameters that processes keep of their own alone, until the next steps.
+
+        Processes that train together call it together, after a `synchronize`.
+
+        Args:
+            everywhere: at every process; otherwise at the one that writes, and the others' stay as they are.
+        """
         ...
 
     def moments(self) -> dict[str, dict[str, Tensor]]:
@@ -155,12 +165,18 @@ class OwnRows(Protocol):
 
     In place of their moments the optimizers hold, under `ORIGINS` and from `synchronize` to the next `rebind`, a number
     for each row: its place, from 1, which stays with the row when others are removed; 0 is a row without moments.
+
+    It may also keep parameters of its own Gaussians alone. Their `Parameter` is empty while steps are taken, and holds
+    such numbers after `synchronize`, which a copy has from its source.
     """
+
+    apart: tuple[str, ...]  # parameters that it keeps of its own Gaussians alone
 
     def regroup(self, params: Rows, origins: Rows) -> None:
         """Take new rows after a density step, as `Fused.rebind`; moments go to those that own the rows now.
 
         Args:
+            params: of those that are kept `apart` all rows, or from which former place, from 1, each is copied. [N]
             origins: for each parameter the former place of each row, from 1, or 0 for moments of zero. int32 [N]
         """
         ...
@@ -169,6 +185,13 @@ class OwnRows(Protocol):
         """Return the moments of all Gaussians by parameter and torch's names, on the CPU, at the process that writes.
 
         All processes call it together; the others get empty tensors.
+        """
+        ...
+
+    def whole(self, everywhere: bool) -> Rows:
+        """Return all rows of the parameters that are kept `apart`, at every process or at the one that writes.
+
+        All processes call it together; those without the rows get an empty dict.
         """
         ...
 
@@ -247,6 +270,7 @@ class FusedStepper:
         assert self.fused is not None
         if self._collected is not None and self._collected[1] != phase:
             self.synchronize()
+        self._leave_to_owners()
         start = time.perf_counter()
         try:
             self.fused.run(last, phase)
@@ -274,10 +298,27 @@ class FusedStepper:
             self.fused.synchronize()
             self._take_statistics(self.fused.statistics, *self._collected)
             self._collected = None
-            if isinstance(self.fused, OwnRows):
-                for key, found in self._of_adam().items():
-                    rows = self._params[key]
-                    found[ORIGINS] = torch.arange(1, len(rows) + 1, dtype=torch.int32, device=rows.device)
+        if isinstance(self.fused, OwnRows):
+            means = self._params["means"]
+            # of a type that a parameter may have, and exact up to 2^53
+            places = torch.arange(1, len(means) + 1, dtype=torch.float64, device=means.device)
+            for found in self._of_adam().values():
+                found[ORIGINS] = places.int()
+            for key in self.fused.apart:
+                self._params[key].data = places.clone()
+
+    def gather(self, everywhere: bool = False) -> None:
+        if isinstance(self.fused, OwnRows):
+            for key, rows in self.fused.whole(everywhere).items():
+                self._params[key].data = rows
+
+    def _leave_to_owners(self) -> None:
+        """Let go of the rows of parameters that are kept apart, and of the numbers of rows."""
+        if isinstance(self.fused, OwnRows):
+            for found in self._of_adam().values():
+                found.pop(ORIGINS, None)
+            for key in self.fused.apart:
+                self._params[key].data = torch.empty(0, device=self._params[key].device)
 
     def moments(self) -> dict[str, dict[str, Tensor]]:
         packed = pack_optimizers(self._optimizers)

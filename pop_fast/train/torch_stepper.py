@@ -127,6 +127,9 @@ class TorchStepper:
     def synchronize(self) -> None:
         """See `Stepper.synchronize`: every process takes whole steps, so that nothing is left to take over."""
 
+    def gather(self, everywhere: bool = False) -> None:
+        """See `Stepper.gather`: every process holds all rows."""
+
     def rebind(self, params: dict[str, Parameter], optimizers: Mapping[str, Adam], state: State) -> None:
         self._params, self._optimizers, self._state = params, optimizers, state
 

@@ -43,7 +43,15 @@ from pop_fast.train.model import KEYS, make_optimizers, require_usable
 from pop_fast.train.preflight import check_method, check_start, check_views, facts, find_warnings
 from pop_fast.train.ranks import ALONE, Ranks
 from pop_fast.train.results import ResultFolder, Segment, Times, record_of
-from pop_fast.train.schedule import ViewOrder, active_sh_degree, phase_at, reads_rows, segment_end, updates_of_strategy
+from pop_fast.train.schedule import (
+    ViewOrder,
+    active_sh_degree,
+    is_milestone,
+    phase_at,
+    reads_rows,
+    segment_end,
+    updates_of_strategy,
+)
 from pop_fast.train.signals import Abandoned, StopRequest, stop_requests
 from pop_fast.train.stepper import Engine, Stepper, Task
 from pop_fast.train.steps import Phase, StepStats
@@ -59,7 +67,8 @@ class TrainingRun:
 
     Attributes:
         config: the settings as the run uses them.
-        params: raw parameters by name.
+        params: raw parameters by name. Where processes share the Gaussians out, colours are here only for who reads
+            them; see `pop_fast.train.stepper.OwnRows`.
         optimizers: one Adam for each parameter.
         appearance: learned exposures and cameras.
         strategy: density control.
@@ -99,7 +108,7 @@ class TrainingRun:
             engine: takes the steps; None takes the one for `config.backend`.
             ranks: the processes that train together, of which this is one; the first one writes.
             watch: called with the run between steps; it must not change the run. With it, fewer steps are taken at a
-                time.
+                time. Of several processes the one that writes has it, which has all Gaussians then.
 
         Raises:
             PopError: the capture cannot be trained on, weights are missing, or the backend is not available or does
@@ -215,6 +224,8 @@ class TrainingRun:
                     self._log(segment, bar)
                     n, rate = len(self.params["means"]), pace.steps_a_second(self.step, self._times.train)
                     beat.say(so_far(self.step, config.max_steps, n, rate, self._latest))
+                    if self._unwritten is not None or self._watched or is_milestone(config, self.step):
+                        self.stepper.gather()
                     if self._unwritten is not None:
                         # a rate can be so high that the first step is the last; that is no reason to replace anything
                         self._require_finite()
@@ -267,12 +278,15 @@ class TrainingRun:
                 raise
             # the step that fails changes nothing, so that the parameters still say which entry it is
             self.step = stepper.step
+            stepper.gather(everywhere=True)
             self._require_finite()
             raise PopError(f"{error}; {self._what_is_left}") from error
         self.step = stepper.step
         bad = [step for step, found in enumerate(stats, first) if not math.isfinite(found.objective + found.pop)]
         if bad or self._watched or self._unwritten is not None or reads_rows(self.config, self.strategy, self.step):
             stepper.synchronize()
+        if bad:
+            stepper.gather(everywhere=True)
         for step, found in enumerate(stats, first):
             if step in bad:
                 self._require_finite()
@@ -283,6 +297,8 @@ class TrainingRun:
         """Let density control edit the Gaussians, if that is due."""
         if not self.strategy.changes_after(step):
             return None
+        if self.strategy.reads_colors(step):
+            self.stepper.gather(everywhere=True)
         passes = self._passes if self.strategy.needs_passes(step) else None
         given = (self.params, self.optimizers, self.state, step, self.draws)
         densification = self.strategy.change(*given, passes=passes, sh_degree=self.sh_degree(step))
@@ -391,8 +407,9 @@ class TrainingRun:
     def _save(self) -> None:
         """Write a checkpoint, if this is the process that writes and all hold the same."""
         self.stepper.synchronize()
-        self._require_finite()
         self._ranks.require_same(self._detached(), self.step)
+        self.stepper.gather()
+        self._require_finite()
         optimizers = self.stepper.moments()
         if not self._ranks.writes:
             return

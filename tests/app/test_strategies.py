@@ -367,6 +367,46 @@ def test_a_run_that_is_stopped_anywhere_goes_on_to_the_same_bits(method: str, ba
         assert all(torch.equal(again.params[key], whole.params[key]) for key in KEYS), f"after step {step}"
 
 
+# Taming-3DGS looks at the training views whenever it changes rows
+@pytest.mark.parametrize("method", sorted(set(METHODS) - {"taming"}))
+def test_a_change_that_does_not_read_colors_copies_whatever_stands_in_their_place(method, tmp_path, monkeypatch):
+    skip_without("compiled")
+    config, without = tiny_method(tmp_path / "whole", method, backend="compiled"), []
+    whole = TrainingRun(config, tiny_capture())
+    whole.run()
+    change = DensityControl.change
+
+    def changed(plan, params, optimizers, state, step, *given, **how):
+        if not plan.changes_after(step) or plan.reads_colors(step):
+            return change(plan, params, optimizers, state, step, *given, **how)
+        colors = {key: params[key].data for key in ("sh0", "shN")}
+        for key, rows in colors.items():
+            params[key].data = torch.arange(len(rows), dtype=torch.float64)
+        done = change(plan, params, optimizers, state, step, *given, **how)
+        for key, rows in colors.items():
+            params[key].data = rows[params[key].data.long()]
+        without.append(done)
+        return done
+
+    monkeypatch.setattr(DensityControl, "change", changed)
+    again = TrainingRun(replace(config, result_dir=str(tmp_path / "again")), tiny_capture())
+    again.run()
+    assert all(torch.equal(again.params[key], whole.params[key]) for key in KEYS)
+    for what in ("cloned", "split"):
+        assert any(getattr(done, what) for done in without), what
+
+
+def test_a_method_of_another_package_is_taken_to_read_colors_at_every_change() -> None:
+    class Paler(POPStrategy):
+        pass
+
+    class Quiet(POPStrategy):
+        def reads_colors(self, step: int) -> bool:
+            return False
+
+    assert [kind().reads_colors(600) for kind in (POPStrategy, Paler, Quiet)] == [False, True, False]
+
+
 def test_a_method_that_looks_at_the_views_sees_those_of_the_run_as_they_are_drawn(tmp_path, monkeypatch):
     # what each method makes of what it sees the laws of training say, and what a pass sees `tests/fast/test_passes.py`
     config = tiny_method(tmp_path, "mini-splatting")

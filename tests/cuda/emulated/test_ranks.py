@@ -20,11 +20,12 @@ from cuda_ext.render import lists
 from cuda_ext.training.batch_step import RETURNED, SENT, STRETCH, BatchTrainer, held_bytes, step_bytes, stretches
 from cuda_ext.training.step_buffers import Rows
 from pop_fast.cli import main
-from pop_fast.density import POPStrategy
+from pop_fast.density import MiniSplattingStrategy, POPStrategy
 from pop_fast.errors import PopError
 from pop_fast.train import TrainingRun
 from pop_fast.train import checkpoint as ckpt
 from pop_fast.train.ranks import ALONE, Ranks, join
+from pop_fast.train.stepper import FusedStepper
 from pop_fast.train.training_run import Watch
 from tests.app.conftest import launched
 from tests.app.test_resume import needs_gloo
@@ -33,7 +34,8 @@ from tests.cuda.conftest import FOLDER, emulated_engine
 from tests.cuda.gpu.test_device_training import masked, mixed_sizes, records
 
 SIZE = 4
-# all of density control, with resets; dominance by the window, its blur by the last view, regularizers, masks and sizes
+# all of density control, with resets; dominance by the window, its blur by the last view, regularizers, masks and
+# sizes; passes that set all Gaussians and their colours anew, draw some of them, and prune, and gradients that wait
 RUNS = {
     "pop": ({}, lambda capture: capture),
     "window": (
@@ -45,6 +47,22 @@ RUNS = {
         lambda capture: masked(mixed_sizes(capture)),
     ),
     "gsplat": ({}, lambda capture: capture),
+    "mini_splatting": (
+        {
+            "strategy": {
+                "reinit_iters": (9,),
+                "reinit_points": 400,
+                "sample_iter": 16,
+                "sampling_factor": 0.7,
+                "prune_iter": 22,
+                "prune_mass": 0.05,
+                "sh_start_iter": 16,
+                "means_rewind_iter": 0,
+                "sh_rest_every": 4,
+            },
+        },
+        lambda capture: capture,
+    ),
 }
 
 
@@ -52,9 +70,10 @@ def train(
     folder: Path, name: str, ranks: Ranks = ALONE, resume: bool = False, watch: Watch | None = None
 ) -> TrainingRun:
     changes, edit = RUNS[name]
-    method = "gsplat" if name == "gsplat" else "pop"
+    method = {"gsplat": "gsplat", "mini_splatting": "3dgs"}.get(name, "pop")
     own = tiny_config(folder / name, method).strategy
-    changes = {"batch_size": SIZE, **changes, "strategy": type(own)(**{**vars(own), **changes.get("strategy", {})})}
+    kind = MiniSplattingStrategy if name == "mini_splatting" else type(own)
+    changes = {"batch_size": SIZE, **changes, "strategy": kind(**{**vars(own), **changes.get("strategy", {})})}
     config = tiny_config(folder / name, method, **changes)
     run = TrainingRun(config, edit(tiny_capture()), engine=emulated_engine(), ranks=ranks, resume=resume, watch=watch)
     run.run()
@@ -69,14 +88,26 @@ def train_all(folder: Path) -> None:
     ranks = join()
     synchronize, exchanged = BatchTrainer.synchronize, []
     regroup, regrouped = BatchTrainer.regroup, []
+    whole, gathered = BatchTrainer.whole, []
+    steps, held_now = FusedStepper.steps, {}
 
     def noted(trainer: BatchTrainer) -> None:
         exchanged.append((trainer.step, trainer._bounds[-1]))
         synchronize(trainer)
 
     def changed(trainer: BatchTrainer, params: Rows, origins: Rows) -> None:
-        regrouped.append((trainer._bounds[-1], dict(origins)))
+        copied = {key: params[key].clone() for key in trainer.apart if params[key].dim() == 1}
+        regrouped.append((trainer._bounds[-1], dict(origins), copied))
         regroup(trainer, params, origins)
+
+    def collected(trainer: BatchTrainer, everywhere: bool) -> Rows:
+        gathered.append((trainer._bounds[-1], everywhere))
+        return whole(trainer, everywhere)
+
+    def stepped(stepper: FusedStepper, *given):
+        found = steps(stepper, *given)
+        held_now.update(held(stepper))
+        return found
 
     looked = []
 
@@ -85,24 +116,43 @@ def train_all(folder: Path) -> None:
 
     patch.setattr(BatchTrainer, "synchronize", noted)
     patch.setattr(BatchTrainer, "regroup", changed)
+    patch.setattr(BatchTrainer, "whole", collected)
+    patch.setattr(FusedStepper, "steps", stepped)
     for name in RUNS:
         exchanged.clear()
         regrouped.clear()
+        gathered.clear()
         # one of the processes shows its run, for which all take fewer steps at a time
         run = train(folder, name, ranks, watch=look if name == "gsplat" and ranks.writes else None)
         trainer = run.stepper.fused
-        told = trainer.received, len(trainer._of_place[0]), list(exchanged), list(regrouped), held(trainer)
+        told = trainer.received, len(trainer._of_place[0]), list(exchanged), list(regrouped), list(gathered), held_now
         torch.save(told, folder / f"{name}_{ranks.rank}.pt")
     torch.save(looked, folder / f"looked_{ranks.rank}.pt")
+    (folder / f"failed_{ranks.rank}.txt").write_text(failing(folder, ranks))
     ranks.leave()
 
 
-def held(trainer: BatchTrainer) -> dict[str, int]:
-    """Count the bytes of the tensors that a process holds for Gaussians, each memory once."""
+def failing(folder: Path, ranks: Ranks) -> str:
+    """Train until a colour of the second process is no longer a number, and return what is said of that."""
+    run = TrainingRun(
+        tiny_config(folder / "failed", batch_size=2), tiny_capture(), engine=emulated_engine(), ranks=ranks
+    )
+    run.take_steps(2)
+    if not ranks.writes:
+        run.stepper.fused._apart["sh0"][47 - run.stepper.fused._first, 0, 2] = float("nan")
+    with pytest.raises(PopError) as error:
+        run.take_steps(3)
+    return str(error.value)
+
+
+def held(stepper: FusedStepper) -> dict[str, int]:
+    """Count the bytes of the tensors that a process holds for Gaussians while steps are taken, each memory once."""
+    trainer, of_adam = stepper.fused, [dict(of.state) for of in stepper._optimizers.values()]
+    assert isinstance(trainer, BatchTrainer)
     found: dict[int, int] = {}
 
     def look(thing: object) -> None:
-        if isinstance(thing, torch.Tensor):
+        if isinstance(thing, torch.Tensor) and thing.dim() > 0:
             storage = thing.untyped_storage()
             found[storage.data_ptr()] = storage.nbytes()
         elif isinstance(thing, Mapping):
@@ -115,7 +165,7 @@ def held(trainer: BatchTrainer) -> dict[str, int]:
 
     counted = {}
     parts = {
-        "whole": (trainer._whole, trainer.statistics),
+        "whole": (trainer._whole, trainer.statistics, stepper._params, of_adam),
         "drawn": trainer._drawn,
         "own": (trainer._moments, trainer._gradients, trainer._counts, trainer._of_place),
     }
@@ -182,7 +232,7 @@ def test_two_gpus_train_to_the_bits_of_one(gpu, together: Path, alone, name: str
     # density control had something to decide, and both owned Gaussians
     assert len(last_checkpoint(together / name)[".splats.means"]) > 70
     for rank in (0, 1):
-        received, own, _, regrouped, _ = torch.load(together / f"{name}_{rank}.pt")
+        received, own, _, regrouped, *_ = torch.load(together / f"{name}_{rank}.pt")
         assert own >= STRETCH
         assert min(received[what] for what in ("splats", "sums", "rows")) > 0
         assert regrouped
@@ -213,8 +263,13 @@ def test_two_gpus_exchange_the_bytes_that_the_model_says(gpu, together: Path, al
     model = step_bytes(n, 2, SIZE, shown, 1, n_rest=run.params["shN"].shape[1])
     for what in ("splats", "sums"):
         assert sum(received[what] for received, *_ in told) == pytest.approx(2 * steps * model[what], rel=0.1), what
-    rows = sum(2 * step_bytes(n, 2, SIZE, shown, 1)["rows"] for _, n in exchanges)
+    rows = sum(2 * step_bytes(n, 2, SIZE, shown, 1)["rows"] + waiting(run) * n for _, n in exchanges)
     assert sum(received["rows"] for received, *_ in told) == pytest.approx(rows, rel=1e-9)
+
+
+def waiting(run: TrainingRun) -> int:
+    """Return the bytes of a Gaussian's gradients that wait for their update, which no model counts."""
+    return 4 * run.params["shN"][0].numel() if run.config.strategy.sh_rest_every > 1 else 0
 
 
 @pytest.mark.slow  # two processes that train
@@ -224,18 +279,51 @@ def test_moments_go_to_who_owns_their_rows_after_a_change(gpu, together: Path, a
     numbers = {key: value[0].numel() for key, value in alone(name).run.params.items()}
     told = [torch.load(together / f"{name}_{rank}.pt") for rank in (0, 1)]
     crossing = [0, 0]
-    for n, origins in told[0][3]:
-        former = stretches(n, 2)[1]
+    for n, origins, _ in told[0][3]:
         for key, rows in origins.items():
-            border = stretches(len(rows), 2)[1]
-            crossing[0] += 2 * 4 * numbers[key] * int((rows[:border] > former).sum())
-            crossing[1] += 2 * 4 * numbers[key] * int(((rows[border:] > 0) & (rows[border:] <= former)).sum())
+            for rank, count in enumerate(rows_that_cross(n, rows)):
+                crossing[rank] += 2 * 4 * numbers[key] * count
     assert [received["moments"] for received, *_ in told] == crossing
     # the model tells the most: every row goes to another process
-    most = sum(2 * step_bytes(len(origins["means"]), 2, SIZE, 1.0, 1)["moments"] for _, origins in told[0][3])
+    most = sum(2 * step_bytes(len(origins["means"]), 2, SIZE, 1.0, 1)["moments"] for _, origins, _ in told[0][3])
     assert sum(crossing) <= most
     if name == "gsplat":
         assert sum(crossing) > 0
+
+
+def rows_that_cross(n: int, rows: torch.Tensor) -> tuple[int, int]:
+    """Count the rows that either of two processes gets from the other, of `n` rows before, by their numbers."""
+    former, border = stretches(n, 2)[1], stretches(len(rows), 2)[1]
+    return int((rows[:border] > former).sum()), int(((rows[border:] > 0) & (rows[border:] <= former)).sum())
+
+
+@pytest.mark.slow  # two processes that train
+@needs_gloo
+@pytest.mark.parametrize("name", RUNS)
+def test_colors_go_to_who_owns_their_rows_or_writes_or_looks_at_views(gpu, together: Path, alone, name: str) -> None:
+    run = alone(name).run
+    told = [torch.load(together / f"{name}_{rank}.pt") for rank in (0, 1)]
+    # for a change that looks at the training views both have all colours, and none is sent after it
+    passes = [step for step in range(run.config.max_steps) if run.strategy.needs_passes(step)]
+    expected, most = [0, 0], 0.0
+    for n, origins, copied in told[0][3]:
+        most += 2 * step_bytes(len(origins["means"]), 2, SIZE, 1.0, 1)["colors"] if copied else 0.0
+        for key, rows in copied.items():
+            # every copy has its colours from somewhere
+            assert int(rows.min()) >= 1
+            assert torch.equal(rows[origins[key] > 0], origins[key][origins[key] > 0])
+            for rank, count in enumerate(rows_that_cross(n, rows)):
+                expected[rank] += 4 * run.params[key][0].numel() * count
+    assert sum(expected) <= most
+    assert sum(not copied for *_, copied in told[0][3]) == len(passes) == (3 if name == "mini_splatting" else 0)
+    gathered = told[0][4]
+    assert gathered == told[1][4]
+    assert sum(everywhere for _, everywhere in gathered) == len(passes)
+    for n, everywhere in gathered:
+        border, each = stretches(n, 2)[1], 4 * sum(run.params[key][0].numel() for key in ("sh0", "shN"))
+        expected[0] += each * (n - border)
+        expected[1] += each * border * everywhere
+    assert [received["colors"] for received, *_ in told] == expected
 
 
 @pytest.mark.slow  # two processes that train
@@ -316,6 +404,13 @@ def test_a_number_that_is_not_finite_is_found_in_a_step_of_several_views(gpu, tm
 
 @pytest.mark.slow  # two processes that train
 @needs_gloo
+def test_a_color_that_is_not_finite_is_found_by_its_owner_and_named_by_all(gpu, together: Path) -> None:
+    for rank in (0, 1):
+        assert "sh0[47, 0, 2] is nan after 2 steps" in (together / f"failed_{rank}.txt").read_text()
+
+
+@pytest.mark.slow  # two processes that train
+@needs_gloo
 @pytest.mark.parametrize("name", RUNS)
 def test_two_gpus_hold_the_bytes_that_the_model_says(gpu, together: Path, alone, name: str) -> None:
     run = alone(name).run
@@ -323,7 +418,7 @@ def test_two_gpus_hold_the_bytes_that_the_model_says(gpu, together: Path, alone,
     told = [torch.load(together / f"{name}_{rank}.pt")[-1] for rank in (0, 1)]
     model = held_bytes(n, 2, SIZE, 1.0, n_rest)
     for of in told:
-        assert of["whole"] == model["whole"]
+        assert of["whole"] == model["whole"] + waiting(run) * n
         assert 0 < of["drawn"] <= model["drawn"]
     # a block's sums of the regularizers are not in the model
     assert sum(of["own"] for of in told) == pytest.approx(2 * model["own"], rel=0.01)
@@ -342,6 +437,11 @@ class _ThreadRanks(Ranks):
     def __init__(self, rank: int, size: int, together: _Together) -> None:
         self.rank, self.size, self._together = rank, size, together
 
+    def share(self, whole: torch.Tensor, bounds: Sequence[int]) -> None:
+        own = whole[slice(*bounds[self.rank : self.rank + 2])].clone()
+        lengths = [last - first for first, last in itertools.pairwise(bounds)]
+        whole.copy_(torch.cat(self.exchange([own] * self.size, lengths)))
+
     def exchange(self, sent: Sequence[torch.Tensor], received: Sequence[int]) -> list[torch.Tensor]:
         self._together.sent[self.rank] = list(sent)
         self._together.barrier.wait()
@@ -356,23 +456,30 @@ class _ThreadRanks(Ranks):
 def test_moments_follow_their_rows_to_any_owner(size: int, n: int, after: int) -> None:
     generator = torch.Generator().manual_seed(after)
     tails = {"means": (3,), "opacities": (), "shN": (2, 3)}
+    colors = torch.rand((n, 2, 3), generator=generator)
     m, v = ({key: torch.rand((n, *tail), generator=generator) for key, tail in tails.items()} for _ in range(2))
     # rows in any order, some several times, some new; each parameter has its own, as after a reset of opacities
     origins = {key: torch.randint(0, n + 1, (after,), generator=generator, dtype=torch.int32) for key in tails}
-    together, found = _Together(size), [{} for _ in range(size)]
+    copied = torch.randint(1, n + 1, (after,), generator=generator).double() if n else torch.zeros(after).double()
+    together, found, wholes = _Together(size), [{} for _ in range(size)], [() for _ in range(size)]
 
     def play(rank: int) -> None:
         trainer = object.__new__(BatchTrainer)
         trainer._ranks, trainer._bounds = _ThreadRanks(rank, size, together), stretches(n, size)
-        trainer.received = {"moments": 0}
+        trainer.received = {"moments": 0, "colors": 0}
         own = slice(*trainer._bounds[rank : rank + 2])
         trainer._moments = tuple({key: rows[own].clone() for key, rows in of.items()} for of in (m, v))
-        moved = {key: trainer._moved(key, origins[key]) for key in tails}
+        trainer._apart = {"shN": colors[own].clone()}
+        moved = {
+            key: trainer._moved("moments", [of.pop(key) for of in trainer._moments], origins[key]) for key in tails
+        }
+        trainer._apart = {"shN": trainer._own_rows("shN", copied)}
         trainer._moments, trainer._bounds = (
             tuple({key: moved[key][i] for key in tails} for i in (0, 1)),
             stretches(after, size),
         )
         found[rank] = trainer.moments()
+        wholes[rank] = trainer.whole(everywhere=True), trainer.whole(everywhere=False)
 
     threads = [threading.Thread(target=play, args=(rank,)) for rank in range(size)]
     for thread in threads:
@@ -384,6 +491,10 @@ def test_moments_follow_their_rows_to_any_owner(size: int, n: int, after: int) -
             padded = torch.cat((of[key].new_zeros((1, *of[key].shape[1:])), of[key]))
             assert torch.equal(found[0][key][name], padded[origins[key].long()]), (key, name)
             assert all(len(other[key][name]) == 0 for other in found[1:])
+    padded = torch.cat((colors.new_zeros((1, 2, 3)), colors))[copied.long()]
+    assert all(torch.equal(everywhere["shN"], padded) for everywhere, _ in wholes)
+    assert torch.equal(wholes[0][1]["shN"], padded)
+    assert not any(at_first for _, at_first in wholes[1:])
 
 
 def test_a_warps_rows_have_one_owner() -> None:
