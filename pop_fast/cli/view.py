@@ -56,7 +56,10 @@ def run(argv: Sequence[str]) -> int:
             while True:
                 viewer.wait()
                 viewer.draw_due()
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as stop:
+            # SIGTERM and SIGHUP raise a kind of it, whose status is theirs
+            if type(stop) is not KeyboardInterrupt:
+                raise
             return 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import signal
 import socket
 import sys
 import time
@@ -272,6 +273,14 @@ def test_the_command_prints_its_address_serves_it_and_ends_with_ctrl_c(pop, shar
     assert ("note: no capture" in outcome.out) is lone
     assert b"<html" in served[0].lower()
     assert not [record for record in caplog.records if record.name.startswith("websockets")]
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 0), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_what_ends_the_viewer_says_its_exit_status(pop: Pop, shared_result: Path, monkeypatch, number, status) -> None:
+    monkeypatch.setattr("pop_fast.view.live.server.LiveViewer.wait", lambda viewer: signal.raise_signal(number))
+    outcome = pop("view", shared_result, "--port", 18_434)
+    assert outcome.status == status
+    assert ("pop: interrupted" in outcome.err) is (status > 0)
 
 
 class Viewer:
