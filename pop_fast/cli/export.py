@@ -18,7 +18,7 @@ from pop_fast.io.atomic import check_folder, check_place, write_file
 from pop_fast.io.heartbeat import Heartbeat
 from pop_fast.io.ply import Frame
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.load_result import Splat, frame_of_splat, load_splat, read_record
+from pop_fast.train.load_result import Splat, drawn_in_frame, frame_of_splat, load_splat, read_record
 from pop_fast.train.results import ResultFolder
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ class _Opened:
 
     def __init__(self, splat: Splat, options: CaptureArguments) -> None:
         self._splat, self._options, self._found = splat, options, None
-        self.config = replace(splat.config, normalize=frame_of_splat(splat, options) == "training")
+        self.config = drawn_in_frame(splat, options)
 
     @property
     def known(self) -> bool:

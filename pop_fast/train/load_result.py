@@ -243,12 +243,10 @@ def open_capture(
         raise PopError(f"{splat.path}: was trained on {data}, which is missing; give --capture DIR")
     asked = {"factor": options.factor, "test_every": options.test_every}
     changes: dict[str, Any] = {"data": data, **{name: value for name, value in asked.items() if value is not None}}
-    frame = frame_of_splat(splat, options)
-    changes["normalize"] = frame == "training"
-    if frame is None:
+    if frame_of_splat(splat, options) is None:
         taken = "does not state its frame, and is taken to be in the capture's own world"
         print(f"note: {splat.path}: {taken}; that of gsplat's trainer needs --training-frame", file=sys.stderr)
-    config = _in_frame(replace(splat.config, **changes), splat)
+    config = replace(drawn_in_frame(splat, options), **changes)
     source = record.source if options.capture is None else "auto"
     said = {"missing": options.missing or record.missing, "images": options.images or record.images, "source": source}
     fix = "give the capture as it was (--capture DIR where it lies elsewhere), or train again"
@@ -371,8 +369,15 @@ def _is_identity(transform: Any) -> bool:
     return bool(np.array_equal(np.array(transform), np.eye(4)))
 
 
-def _in_frame(config: TrainConfig, splat: Splat) -> TrainConfig:
-    """Give the near plane of the frame that a splat is looked at in, where that is not the one it was trained in."""
+def drawn_in_frame(splat: Splat, options: CaptureOptions) -> TrainConfig:
+    """Return the settings to draw a splat by in the world that it is in.
+
+    Their near plane is of that world, where that is not the one that the splat was trained in.
+
+    Raises:
+        PopError: see `frame_of_splat`.
+    """
+    config = replace(splat.config, normalize=frame_of_splat(splat, options) == "training")
     record, frame = read_record(splat.folder), splat.frame
     transform = None if frame is None else frame.transform
     if transform is None and frame is not None and record is not None and splat.config.normalize:

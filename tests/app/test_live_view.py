@@ -197,6 +197,15 @@ def test_a_result_whose_capture_is_missing_is_still_shown_in_the_frame_of_the_ca
         np.testing.assert_allclose(scene.world_transform, transform)
 
 
+def test_a_file_without_a_capture_is_shown_with_the_near_plane_of_its_run(
+    pop: Pop, shared_result: Path, shown: Shown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pop_fast.view.live.server.LiveViewer", lambda scene, *_: scene)
+    pop.done("export", shared_result, "--out", tmp_path / "a.ply")
+    scene: Any = make_viewer(Args(splat=tmp_path / "a.ply"), load_splat(tmp_path / "a.ply"))
+    assert scene.config.renderer.near_plane == pytest.approx(0.01 / shown[2].world_scale, rel=1e-12)
+
+
 def test_where_every_view_is_held_out_one_looks_from_all(shown: Shown) -> None:
     scene, _, capture = shown
     assert len(stands_of_capture(capture, 1, scene.params["means"])) == len(capture.views)
