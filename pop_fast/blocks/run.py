@@ -25,7 +25,7 @@ from pop_fast.blocks.jobs import Part, block_folder, core_of, result_of, round_f
 from pop_fast.blocks.plan import COARSE, FOLDER, Job, Partition, Plan, make_plan, read_job, read_plan, write_plan
 from pop_fast.blocks.rounds import own_of
 from pop_fast.data.capture import Capture, Listing, Progress, SfmOptions
-from pop_fast.data.load import Photographs, list_capture, load_capture, read_block
+from pop_fast.data.load import Photographs, list_capture, read_block
 from pop_fast.errors import PopError
 from pop_fast.io.atomic import write_atomically, write_json
 from pop_fast.io.ply import Frame, save_ply
@@ -35,7 +35,7 @@ from pop_fast.train.config import LearningRates, TrainConfig
 from pop_fast.train.engines import renderer
 from pop_fast.train.environment import peak_memory_bytes, reproducible, run_facts
 from pop_fast.train.evaluate import evaluate, population
-from pop_fast.train.load_result import CaptureRecord, how_to_load, load_splat
+from pop_fast.train.load_result import CaptureRecord, load_as_recorded, load_splat
 from pop_fast.train.lpips import load_nets
 from pop_fast.train.model import KEYS
 from pop_fast.train.presets import QUICK_BETA2, QUICK_DECAY, QUICK_RATES, QUICK_SCALER
@@ -226,8 +226,8 @@ def _load(
     progress: Progress | None,
     listing: Listing | None = None,
 ) -> Capture:
-    given = how_to_load(config, record)
-    return load_capture(config.data, **given, progress=progress, photographs=photographs, listing=listing)
+    fix = "put the capture back as it was, or train again with --overwrite"
+    return load_as_recorded(config, record, config.result_dir, fix, progress, photographs, listing)
 
 
 # of what a round has changed. On bonsai in 2x2, where all four cores stand in most views, a round of 300 steps that

@@ -63,7 +63,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Returns:
         0, or 1 where something is missing, or 2 for bad input and bad usage, or 130 after Ctrl-C, or 143 after SIGTERM,
-        or 129 after SIGHUP; a training that has stopped returns 130 after each of them.
+        or 129 after SIGHUP. A training that has stopped returns 130 after each of them, and a viewer 0 after Ctrl-C,
+        which is how it ends.
     """
     return guarded("pop", _run, argv, "interrupted")
 

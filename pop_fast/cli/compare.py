@@ -78,7 +78,7 @@ def _of_file(path: Path, runs: Sequence[Path], args: Args) -> dict[str, Any]:
 def _photographed_as(splat: Splat, runs: Sequence[Path]) -> Splat:
     """Return a file's splat with what all runs that it is compared with agree on about their photographs."""
     configs = [read_config(run) for run in runs]
-    records = [replace(read_record(run) or CaptureRecord(), chosen=[]) for run in runs]
+    records = [replace(read_record(run) or CaptureRecord(), chosen=[], cameras={}) for run in runs]
     agreed = {name: getattr(configs[0], name) for name in _PHOTOGRAPHS if configs}
     shared = {name: value for name, value in agreed.items() if all(getattr(c, name) == value for c in configs)}
     changed = replace(splat, config=replace(splat.config, **shared))

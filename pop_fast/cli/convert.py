@@ -15,7 +15,7 @@ from pop_fast.cli.export import HTML, check_file, file_format, note_lost_frame, 
 from pop_fast.cli.options import FormatName, LimitOptions, Output, Shown, limited
 from pop_fast.errors import PopError
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.load_result import drawn_as
+from pop_fast.train.load_result import CaptureOptions, Splat, drawn_as, drawn_in_frame
 
 if TYPE_CHECKING:
     from pop_fast.io.formats import Stored
@@ -63,6 +63,8 @@ def run(argv: Sequence[str]) -> int:
     stored = load_splat_file(args.source)
     note_lost_frame(args.out, name, stored.frame)
     config = drawn_as(TrainConfig(antialiased=stored.antialiased), stored.frame, args.source)
+    splat = Splat(path=args.source, params=stored.params, config=config, frame=stored.frame)
+    config = drawn_in_frame(splat, CaptureOptions())
     output = _output(args, name, stored, config)
     move = _training_frame(args.source, stored) if args.crop is not None else None
     shown = Shown(params=stored.params, sh_degree=_MOST_BANDS, config=config, world_transform=move, photographed=None)

@@ -37,7 +37,8 @@ class Args(CaptureArguments):
     """Measure a splat on the held-out views of a capture: PSNR, SSIM, LPIPS where weights are given.
 
     For a result folder the numbers also go into its stats and its report, unless it may not be written to, or an option
-    asks for another capture, other photographs or another frame than those of its training.
+    asks for another capture, other photographs or another frame than those of its training, or other views are held
+    out now. A capture whose cameras have changed since is refused.
     """
 
     splat: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT|CKPT|FILE")]
@@ -126,6 +127,12 @@ def _record(folder: Path, step: int, stats: dict[str, Any]) -> None:
     results = ResultFolder(folder)
     path = results.stats_path("val", step)
     before = read_stats(path) if path.is_file() else {"step": step}
+    views = before.get("per_view")
+    if isinstance(views, dict) and views.keys() != stats["per_view"].keys():
+        # those that are held out now may be views that it was trained on
+        why = "photographs were added or removed since its training, so that other views are held out"
+        print(f"note: {folder}: {why}; stats and report stay as they are", file=sys.stderr)
+        return
     results.write_stats("val", step, {**before, **stats})
     write_report(folder)
 

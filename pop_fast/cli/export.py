@@ -18,7 +18,7 @@ from pop_fast.io.atomic import check_folder, check_place, write_file
 from pop_fast.io.heartbeat import Heartbeat
 from pop_fast.io.ply import Frame
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.load_result import Splat, frame_of_splat, load_splat, read_record
+from pop_fast.train.load_result import Splat, drawn_in_frame, frame_of_splat, load_splat, read_record
 from pop_fast.train.results import ResultFolder
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ class _Opened:
 
     def __init__(self, splat: Splat, options: CaptureArguments) -> None:
         self._splat, self._options, self._found = splat, options, None
-        self.config = replace(splat.config, normalize=frame_of_splat(splat, options) == "training")
+        self.config = drawn_in_frame(splat, options)
 
     @property
     def known(self) -> bool:
@@ -149,12 +149,18 @@ def file_format(out: Path, to: str | None) -> str:
 
 
 def note_lost_frame(out: Path, name: str, frame: Frame | None) -> None:
-    """Say on stderr that a file does not say its world, where what is taken for it is another one."""
-    from pop_fast.io.formats import loses_frame
+    """Say on stderr that a file does not say its world, or how it is drawn, where what is taken for that is another."""
+    from pop_fast.io.formats import loses_frame, loses_settings
 
-    if name != HTML and loses_frame(name, frame):
+    if name == HTML or frame is None:
+        return
+    if loses_frame(name, frame):
         what = f"{name} cannot record that it is in the training frame"
         print(f"note: {out}: {what}; commands that read it need --training-frame", file=sys.stderr)
+    if loses_settings(name, frame):
+        settings = ", ".join(f"{setting} {value}" for setting, value in frame.drawn)
+        what = f"{name} cannot record that its run drew it with {settings}"
+        print(f"note: {out}: {what}; programs that read it draw it as usual", file=sys.stderr)
 
 
 def _note_coarse_places(out: Path, transform: np.ndarray) -> None:
@@ -315,7 +321,9 @@ def _finish(folder: Path, capture: Capture, options: FinishOptions, progress: bo
         output, left = page if name == HTML else Output(name, page.antialiased, frame, capture.world_transform), kept
         if options.target_mb is not None:
             left = limited(shown, options, output)
-        left.write(folder / EXPORTS / file_name(folder.resolve().name, name), output, progress)
+        out = folder / EXPORTS / file_name(folder.resolve().name, name)
+        note_lost_frame(out, name, frame)
+        left.write(out, output, progress)
     write_file(folder / VIEWER, page.write(kept.params))
     if not options.skip_sizes:
         with Heartbeat(progress) as beat:

@@ -19,7 +19,7 @@ from pop_fast.io.image_header import read_exif, read_size
 from pop_fast.train import automatic
 from pop_fast.train.choose import is_launched, on_gpu
 from pop_fast.train.config import TrainConfig
-from pop_fast.train.load_result import CaptureRecord, read_record
+from pop_fast.train.load_result import CaptureRecord, cameras_of, read_record
 from pop_fast.train.presets import ALIASES, METHODS, PRESETS
 from pop_fast.train.results import ResultFolder
 
@@ -240,6 +240,7 @@ def record_of(capture: Capture, options: Any, chosen: Sequence[str] = ()) -> Cap
         source=options.source,
         world_transform=capture.world_transform.tolist(),
         chosen=list(chosen),
+        cameras=cameras_of(capture),
     )
 
 

@@ -13,7 +13,7 @@ import tyro
 from pop_fast.cli import parse
 from pop_fast.cli.options import CaptureArguments, open_with_bars
 from pop_fast.errors import PopError
-from pop_fast.train.load_result import Splat, frame_of_splat, load_splat
+from pop_fast.train.load_result import Splat, drawn_in_frame, frame_of_splat, load_splat
 
 if TYPE_CHECKING:
     from pop_fast.data import Capture
@@ -56,7 +56,10 @@ def run(argv: Sequence[str]) -> int:
             while True:
                 viewer.wait()
                 viewer.draw_due()
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as stop:
+            # SIGTERM and SIGHUP raise a kind of it, whose status is theirs
+            if type(stop) is not KeyboardInterrupt:
+                raise
             return 0
 
 
@@ -75,7 +78,8 @@ def make_viewer(args: Args, splat: Splat) -> LiveViewer:
     if args.capture is None and (not data or not Path(data).is_dir()):
         print("note: no capture is known, so there are no training cameras; give --capture DIR")
         transform = known_transform(splat, args) if frame_of_splat(splat, args) == "training" else None
-        scene = SplatScene(splat.params, splat.config, splat.sh_degree, backend, transform)
+        config = drawn_in_frame(splat, args)
+        scene = SplatScene(splat.params, config, splat.sh_degree, backend, transform)
         stands = stands_of([camera_of_points(splat.params["means"])], [None], splat.params["means"])
     else:
         capture, config = open_with_bars(splat, args)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from threading import Timer
+from typing import Final
 
 import numpy as np
 
@@ -97,6 +100,27 @@ def write_stubs(folder: Path) -> int:
     return 0
 
 
+# after which a learner is told what takes so long
+_LONG_S: Final = 8.0
+
+
+@contextmanager
+def telling(what: str) -> Iterator[None]:
+    """Say on stderr what is being judged, if the block takes long: a loop that never ends looks like a slow machine."""
+
+    def tell() -> None:
+        text = f"judging {what} takes more than {_LONG_S:g} seconds; if that is a loop without an end, Ctrl-C stops it"
+        print(f"pop-learn: {text}", file=sys.stderr, flush=True)
+
+    timer = Timer(_LONG_S, tell)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
 def check(name: str, folder: Path, wants_answer: bool) -> int:
     """Judge a stage, draw its counterexample, and return 0 when it has passed, 1 when not yet.
 
@@ -108,7 +132,7 @@ def check(name: str, folder: Path, wants_answer: bool) -> int:
     from pop_ref.learn.drawing import drawn_counterexample
     from pop_ref.learn.judge import judge, told
 
-    verdict = judge(work, stage)
+    verdict = judge(work, stage, telling)
     print(told(stage, verdict))
     counterexample = _counterexample(folder, stage)
     image = drawn_counterexample(verdict)
@@ -141,7 +165,7 @@ def check_all(folder: Path, as_json: bool) -> int:
     needs_of_judging()
     from pop_ref.learn.grading import graded, told_in_lines
 
-    grade = graded(read_work(folder))
+    grade = graded(read_work(folder), telling)
     for name in grade["passed"]:
         note_passed(folder, BY_NAME[name])
         # of an earlier try

@@ -12,11 +12,12 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, Final
 
 from pop_ref.learn.course import BY_NAME, COURSE, Stage
-from pop_ref.learn.judge import Verdict, judge
+from pop_ref.learn.judge import Verdict, Watch, judge
 from pop_ref.learn.student import Work, read_work
 
 N_FUNCTIONS: Final = sum(len(stage.names) for stage in COURSE)
@@ -24,15 +25,15 @@ N_FUNCTIONS: Final = sum(len(stage.names) for stage in COURSE)
 _MARK: Final = "pop learn graded: "
 
 
-def graded(work: Work) -> dict[str, Any]:
-    """Judge every stage of a submission; what it prints goes nowhere.
+def graded(work: Work, watch: Watch = nullcontext) -> dict[str, Any]:
+    """Judge every stage of a submission; what it prints goes nowhere. `judge` says what `watch` is.
 
     Returns:
         "score", the functions that are right, "of" so many; "passed", the stages that have; and "stages", a list of
         name, passed, right, unwritten, laws (that hold), broken and sentence.
     """
     with contextlib.redirect_stdout(io.StringIO()):
-        stages = [_stage_graded(work, stage) for stage in COURSE]
+        stages = [_stage_graded(work, stage, watch) for stage in COURSE]
     return {
         "score": sum(len(each["right"]) for each in stages),
         "of": N_FUNCTIONS,
@@ -41,11 +42,11 @@ def graded(work: Work) -> dict[str, Any]:
     }
 
 
-def _stage_graded(work: Work, stage: Stage) -> dict[str, Any]:
+def _stage_graded(work: Work, stage: Stage, watch: Watch) -> dict[str, Any]:
     verdict = Verdict(unwritten=stage.names)
     if work.written[stage.name] or stage.name in work.unreadable:
         try:
-            verdict = judge(work, stage)
+            verdict = judge(work, stage, watch)
         except ValueError as error:
             verdict = Verdict(broken="the file runs", sentence=str(error))
     return {

@@ -13,8 +13,8 @@ import textwrap
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final
 
 import numpy as np
@@ -31,7 +31,7 @@ from pop_ref.learn.course import DENSITY_SETTINGS, NOT_TAUGHT, Stage
 from pop_ref.learn.diagnosis import diagnose, leaves, parts_named
 from pop_ref.learn.probes import oracle, probes
 from pop_ref.learn.stubs import formulas
-from pop_ref.learn.student import PACKAGE, STOPS, Borrowed, Call, Work, borrowing, said, same, tried_on, where
+from pop_ref.learn.student import PACKAGE, STOPS, Borrowed, Call, Work, borrowing, misspelt, said, same, tried_on, where
 from pop_ref.recipes import RECIPES
 
 EXAMPLES: Final = 12
@@ -54,6 +54,7 @@ class Verdict:
         call: the smallest call on which a function is wrong, if one is.
         drawn: what the broken law was tried on.
         unwritten: functions of the stage that are still stubs.
+        misspelt: functions of the file that are named nearly as these, by their names.
     """
 
     n_held: int = 0
@@ -64,6 +65,7 @@ class Verdict:
     call: Call | None = None
     drawn: dict[str, Any] | None = None
     unwritten: tuple[str, ...] = ()
+    misspelt: dict[str, str] = field(default_factory=dict)
 
     @property
     def passed(self) -> bool:
@@ -71,23 +73,36 @@ class Verdict:
         return not self.broken and not self.unwritten
 
 
-def judge(work: Work, stage: Stage) -> Verdict:
+# a block that may take long by a student's code, entered with the words that say what is judged in it
+Watch = Callable[[str], AbstractContextManager[object]]
+
+
+def judge(work: Work, stage: Stage, watch: Watch = nullcontext) -> Verdict:
     """Try a student's stage, with the oracle's functions for all others.
+
+    Args:
+        watch: surrounds the loading of the file, each function and each law.
 
     Raises:
         ValueError: the file is not Python or cannot be run.
     """
     written = work.written[stage.name]
-    with borrowing(work, (stage,)) as borrowed:
-        found = [_function_tried(work, stage, borrowed, name) for name in stage.names if name in written]
+    with ExitStack() as stack:
+        with watch(f"{stage.file}, as it is loaded"):
+            borrowed = stack.enter_context(borrowing(work, (stage,)))
+        found: list[Verdict | None] = []
+        for name in (name for name in stage.names if name in written):
+            with watch(f"{name} of {stage.file}"):
+                found.append(_function_tried(work, stage, borrowed, name))
         verdict = Verdict(
             right=tuple(name for name, wrong in zip(written, found, strict=True) if wrong is None),
             unwritten=tuple(name for name in stage.names if name not in written),
+            misspelt=misspelt(work, stage),
         )
         for wrong in found:
             if wrong is not None:
-                return replace(wrong, right=verdict.right, unwritten=verdict.unwritten)
-        return _laws_tried(work, stage, borrowed, verdict)
+                return replace(wrong, right=verdict.right, unwritten=verdict.unwritten, misspelt=verdict.misspelt)
+        return _laws_tried(work, stage, borrowed, verdict, watch)
 
 
 def _function_tried(work: Work, stage: Stage, borrowed: Borrowed, name: str) -> Verdict | None:
@@ -128,12 +143,13 @@ def _broken_example(borrowed: Borrowed, home: str, name: str) -> str:
     return ""
 
 
-def _laws_tried(work: Work, stage: Stage, borrowed: Borrowed, verdict: Verdict) -> Verdict:
+def _laws_tried(work: Work, stage: Stage, borrowed: Borrowed, verdict: Verdict, watch: Watch) -> Verdict:
     backend = _Judged(borrowed, stage, work.written[stage.name])
     laws = [law for law in _laws(stage) if not missing(backend, law.needs)]
     n_held = 0
     for law in laws:
-        failure, was_tried = _tried(law, backend)
+        with watch(f"{', '.join(verdict.right)} of {stage.file} by the law '{law.name.replace('_', ' ')}'"):
+            failure, was_tried = _tried(law, backend)
         if failure is not None:
             plain = replace(verdict, n_held=n_held, broken=law.name.replace("_", " "), drawn=failure.least)
             return _told(work, stage, borrowed, backend, law, failure, plain)
@@ -339,6 +355,9 @@ def told(stage: Stage, verdict: Verdict) -> str:
         lines += [f"{stage.name}: right so far. {_held(stage, verdict)}."]
     if verdict.unwritten:
         lines += [f"still to write in {stage.file}: {', '.join(verdict.unwritten)}"]
+        lines += [
+            f"{stage.file} has {near}: rename it if it is meant as {name}" for name, near in verdict.misspelt.items()
+        ]
     return "\n".join(textwrap.fill(line, 100) if line[:1].strip() else line for line in lines)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import copy
+import difflib
 import importlib
 import inspect
 import sys
@@ -29,6 +30,8 @@ from pop_ref.learn.course import COURSE, Stage
 PACKAGE: Final = "pop_yours"
 # with which a student's code may stop; one that ends Python has not passed
 STOPS: Final = (Exception, SystemExit)
+# what two names have in common that are taken for one, misspelt; of `difflib`
+_ALIKE: Final = 0.8
 _ORACLE: Final = Path(pop_ref.__file__).parent
 
 
@@ -152,6 +155,21 @@ def _written(stage: Stage, path: Path) -> tuple[str, ...]:
         return ()
     functions = {node.name: node for node in _parsed(path).body if isinstance(node, ast.FunctionDef)}
     return tuple(name for name in stage.names if name in functions and not _is_stub(functions[name]))
+
+
+def misspelt(work: Work, stage: Stage) -> dict[str, str]:
+    """Find functions in a stage's file that are named nearly as ones that are still to write, by the latter's names.
+
+    Raises:
+        ValueError: the file is not Python.
+    """
+    path = work.folder / stage.file
+    if not path.exists():
+        return {}
+    defined = [node.name for node in _parsed(path).body if isinstance(node, ast.FunctionDef)]
+    others = [name for name in defined if name not in stage.names]
+    missing = [name for name in stage.names if name not in work.written[stage.name]]
+    return {near[0]: name for name in others if (near := difflib.get_close_matches(name, missing, 1, _ALIKE))}
 
 
 def _is_stub(node: ast.FunctionDef) -> bool:

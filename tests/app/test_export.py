@@ -154,6 +154,10 @@ def test_a_file_says_how_it_is_drawn_where_not_as_usual(pop: Pop, psnr: Psnr, re
         assert psnr(f"{name}.ply") == pytest.approx(measured, abs=0.05), name
     pop.done("export", result, "--to", "ply", "--overwrite", "--frame", "training")
     assert psnr(f"{result.name}.ply") == pytest.approx(measured, abs=1e-3)
+    lost = "splat cannot record that its run drew it with profile inria, near_plane 0.4, eps2d 2.0; programs that read"
+    for words in (("export", result, "--out", "a.splat"), ("convert", f"{result.name}.ply", "b.splat", "--overwrite")):
+        assert lost in pop.done(*words).err
+    assert "draw" not in pop.done("export", own, "--out", "c.splat").err
     # splats that are drawn as usual say nothing of it
     assert b"pop-drawn" not in own.read_bytes()[:2000]
     damaged = Path(f"{result.name}.ply").read_bytes().replace(b'"inria"', b'"other"')

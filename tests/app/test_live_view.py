@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import signal
 import socket
 import sys
 import time
@@ -196,6 +197,15 @@ def test_a_result_whose_capture_is_missing_is_still_shown_in_the_frame_of_the_ca
         np.testing.assert_allclose(scene.world_transform, transform)
 
 
+def test_a_file_without_a_capture_is_shown_with_the_near_plane_of_its_run(
+    pop: Pop, shared_result: Path, shown: Shown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pop_fast.view.live.server.LiveViewer", lambda scene, *_: scene)
+    pop.done("export", shared_result, "--out", tmp_path / "a.ply")
+    scene: Any = make_viewer(Args(splat=tmp_path / "a.ply"), load_splat(tmp_path / "a.ply"))
+    assert scene.config.renderer.near_plane == pytest.approx(0.01 / shown[2].world_scale, rel=1e-12)
+
+
 def test_where_every_view_is_held_out_one_looks_from_all(shown: Shown) -> None:
     scene, _, capture = shown
     assert len(stands_of_capture(capture, 1, scene.params["means"])) == len(capture.views)
@@ -272,6 +282,14 @@ def test_the_command_prints_its_address_serves_it_and_ends_with_ctrl_c(pop, shar
     assert ("note: no capture" in outcome.out) is lone
     assert b"<html" in served[0].lower()
     assert not [record for record in caplog.records if record.name.startswith("websockets")]
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 0), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_what_ends_the_viewer_says_its_exit_status(pop: Pop, shared_result: Path, monkeypatch, number, status) -> None:
+    monkeypatch.setattr("pop_fast.view.live.server.LiveViewer.wait", lambda viewer: signal.raise_signal(number))
+    outcome = pop("view", shared_result, "--port", 18_434)
+    assert outcome.status == status
+    assert ("pop: interrupted" in outcome.err) is (status > 0)
 
 
 class Viewer:

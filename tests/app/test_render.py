@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,7 +26,7 @@ from pop_fast.data.capture import camera_centers, focus_point, look_at_one_point
 from pop_fast.data.unpack import take_frames
 from pop_fast.errors import PopError
 from pop_fast.train import TrainConfig, TrainingRun
-from pop_fast.train.load_result import CaptureOptions, load_splat, open_capture
+from pop_fast.train.load_result import CaptureOptions, drawn_in_frame, load_splat, open_capture
 from pop_fast.train.results import read_config
 from pop_fast.view import paths
 from pop_fast.view.frames import inside, picture_names, write_pictures
@@ -158,7 +159,7 @@ def test_renders_never_take_the_place_of_photographs_outside_the_capture(rendere
 
     edit_transforms(scene, lead_out)
     before = contents(tmp_path)
-    assert rendered("--capture", scene, "--test-every", "1", "--out", tmp_path / "r").status == 0
+    assert rendered("--capture", scene, "--own-frame", "--test-every", "1", "--out", tmp_path / "r").status == 0
     after = contents(tmp_path)
     assert {path: after.get(path) for path in before} == before
     new = sorted(path.relative_to(tmp_path).as_posix() for path in set(after) - set(before))
@@ -184,7 +185,7 @@ def test_every_view_has_a_file_of_its_own(rendered: Render, tmp_path: Path) -> N
     edit_transforms(
         scene, lambda d: [d["frames"][i].update(file_path=f"images/{name}") for i, name in enumerate(names)]
     )
-    outcome = rendered("--capture", scene, "--test-every", "1", "--out", tmp_path / "r")
+    outcome = rendered("--capture", scene, "--own-frame", "--test-every", "1", "--out", tmp_path / "r")
     assert "4 views" in outcome.out, outcome.err
     listed = json.loads((tmp_path / "r" / "renders.json").read_text())["renders"]
     assert listed == [{"view": f"images/{name}", "file": f"images/{name}.png"} for name in names]
@@ -197,7 +198,7 @@ def test_what_a_capture_does_not_allow_is_refused_with_a_way_out(rendered: Rende
     for i, lens in enumerate(lenses):
         write_photograph(tmp_path / "scene" / "images" / f"{i}.png", photograph(i, lens.width, lens.height))
     write_model(tmp_path / "scene" / "sparse" / "0", [f"{i}.png" for i in range(4)], turntable(4), lenses)
-    words = ["--capture", tmp_path / "scene", "--test-every", "1"]
+    words = ["--capture", tmp_path / "scene", "--own-frame", "--test-every", "1"]
     says(
         rendered(*words, "--video", tmp_path / "clip.webm"),
         "clip.webm: the views have 2 sizes (1.png is 30 x 40 px, 0.png is 40 x 30 px)",
@@ -207,7 +208,7 @@ def test_what_a_capture_does_not_allow_is_refused_with_a_way_out(rendered: Rende
     assert rendered(*words, "--out", tmp_path / "r").status == 0
     # a path through one training view
     scene = transforms_capture(tmp_path / "two", 2)
-    words = ["--capture", scene, "--test-every", "2", "--out", tmp_path / "one", "--path"]
+    words = ["--capture", scene, "--own-frame", "--test-every", "2", "--out", tmp_path / "one", "--path"]
     says(
         rendered(*words, "interpolate"),
         "two: --path interpolate needs 2 or more training views and there are 1",
@@ -306,6 +307,20 @@ def test_an_export_is_looked_at_with_the_near_plane_of_its_run(pop, shared_captu
         splat = load_splat(tmp_path / f"{frame}.ply")
         config = open_capture(splat, CaptureOptions(capture=shared_capture))[1]
         assert config.renderer.near_plane == pytest.approx(near, rel=1e-12)
+
+
+def test_a_file_without_a_capture_is_drawn_with_the_near_plane_of_its_run(pop, shared_capture, shared_result, tmp_path):
+    scale = load_capture(shared_capture).world_scale
+    for frame, near in {"capture": 0.01 / scale, "training": 0.01}.items():
+        file = tmp_path / f"{frame}.ply"
+        pop.done("export", shared_result, "--out", file, "--frame", frame)
+        assert drawn_in_frame(load_splat(file), CaptureOptions()).renderer.near_plane == pytest.approx(near, rel=1e-12)
+        for word in ("export", "convert"):
+            page = tmp_path / f"{frame}_{word}.html"
+            pop.done(word, file, *(["--out"] if word == "export" else []), page)
+            found = re.search(r'"near": ?([\d.e-]+)', page.read_text())
+            assert found is not None
+            assert float(found[1]) == pytest.approx(near, rel=1e-6)
 
 
 def test_blocks_are_trained_with_the_near_plane_of_the_whole(pop, shared_capture, tmp_path, monkeypatch):

@@ -49,7 +49,16 @@ def default_name(stem: str, name: str) -> str:
 
 def loses_frame(name: str, frame: Frame | None) -> bool:
     """Tell whether a file in a format does not say its world, and what is taken for it is another one."""
-    return frame is not None and frame.name != "capture" and name != PLY and not FORMATS[name].has_frame
+    return frame is not None and frame.name != "capture" and not _has_frame(name)
+
+
+def loses_settings(name: str, frame: Frame | None) -> bool:
+    """Tell whether a file in a format does not say by which settings it is drawn, and these are not the usual ones."""
+    return frame is not None and bool(frame.drawn) and not _has_frame(name)
+
+
+def _has_frame(name: str) -> bool:
+    return name == PLY or FORMATS[name].has_frame
 
 
 def named_format(path: Path, to: str | None = None) -> str:
