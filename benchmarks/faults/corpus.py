@@ -35,9 +35,9 @@ from pop_fast.data.load import load_capture
 from pop_fast.data.sfm import UPRIGHT, write_list
 from pop_fast.io.formats import FORMATS, encoded
 from pop_fast.io.image_header import can_read_heif
-from pop_fast.io.ply import save_ply
+from pop_fast.io.ply import Frame, save_ply
 from pop_fast.train import TrainConfig, TrainingRun
-from pop_fast.train.load_result import RECORD, CaptureRecord, record_text
+from pop_fast.train.load_result import RECORD, CaptureRecord, cameras_of, record_text
 from pop_fast.view.live.draw import KeyCamera, path_of
 from pop_fast.view.report.checks import Checks
 from pop_ref.conformance.scenes import save_scene
@@ -161,7 +161,12 @@ def _write_result(folder: Path, capture: Path) -> None:
     for name in ("viewer.html", "renders"):
         shutil.rmtree(folder / name, ignore_errors=True)
     record = CaptureRecord(
-        images="images", missing="error", masks=True, source="auto", world_transform=np.eye(4).tolist()
+        images="images",
+        missing="error",
+        masks=True,
+        source="auto",
+        world_transform=np.eye(4).tolist(),
+        cameras=cameras_of(load_capture(str(capture))),
     )
     (folder / RECORD).write_text(record_text(record))
     # where it was made is nobody's business
@@ -178,7 +183,8 @@ def _few_gaussians() -> dict[str, torch.Tensor]:
 def _write_splats(folder: Path) -> None:
     folder.mkdir(exist_ok=True)
     params = _few_gaussians()
-    save_ply(folder / "splat.ply", params)
+    turned = ((0.0, -2.0, 0.0, 1.0), (2.0, 0.0, 0.0, 0.0), (0.0, 0.0, 2.0, 0.5), (0.0, 0.0, 0.0, 1.0))
+    save_ply(folder / "splat.ply", params, frame=Frame("training", turned, (("profile", "inria"), ("eps2d", 0.1))))
     for name, format in FORMATS.items():
         if name != "ply":
             (folder / f"{name}{format.suffix}").write_bytes(encoded(name, params))
