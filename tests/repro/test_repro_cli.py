@@ -41,16 +41,14 @@ def test_help_names_every_command_and_is_the_answer_to_nothing(capsys):
 
 
 @pytest.mark.parametrize("command", [*COMMANDS, ""])
-def test_help_is_quick_and_loads_nothing_heavy(command):
+def test_help_loads_nothing_heavy(command):
     script = (
         "import sys; from paper_repro.cli import main; status = main(sys.argv[1:])\n"
         f"loaded = [name for name in {HEAVY!r} if name in sys.modules]; assert not loaded, loaded; sys.exit(status)"
     )
-    start, words = os.times().children_user, [sys.executable, "-c", script, *command.split(), "--help"]
+    words = [sys.executable, "-c", script, *command.split(), "--help"]
     done = subprocess.run(words, capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
-    # of the processor, since the machine may be busy
-    assert os.times().children_user - start < 0.5
     assert "usage: pop-repro" in done.stdout
 
 
