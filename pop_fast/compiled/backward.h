@@ -11,7 +11,7 @@
 namespace pop {
 
 // A chunk of a tile's list that is blended again from the light before it. What it finds lies close together in the
-// order in which it is made, a half of what a place for every pair would fill, so that the nearest cache holds it.
+// order in which it is made, so that more of it stays in the nearest cache than with a place for every pair.
 template <class Real> struct Again {
   // a strip in which an entry blends, and where its alphas and weights begin among the pairs
   struct Found {
